@@ -1,0 +1,37 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+
+# The Python that .venv is made with; empty: the first of python3, python3.13 ... python3.10 that is 3.10 to 3.13.
+PYTHON ?=
+# More arguments for the command that runs, for example: make test ARGS="-k solver"
+ARGS ?=
+
+RUN := .venv/bin/python
+CHECKED := ba_node tests tools setup.py $(wildcard launch/*.py)
+
+.PHONY: help setup demo test lint format clean
+
+help: ## list the commands
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+
+setup: ## make .venv with ROS 2 Jazzy, ba_msgs and ba_node; the commands below do it by themselves
+	@PYTHON="$(PYTHON)" sh tools/setup.sh
+
+demo: setup ## play a recording into the node over DDS, compare with ground truth, write out/demo/
+	@$(RUN) -m ba_node.cli.main demo --out out/demo $(ARGS)
+
+test: setup ## run the tests
+	@$(RUN) -m pytest $(ARGS)
+
+lint: setup ## check style and types
+	@$(RUN) -m ruff check $(CHECKED)
+	@$(RUN) -m ruff format --check $(CHECKED)
+	@$(RUN) -m mypy $(CHECKED)
+
+format: setup ## put all Python files into the agreed style
+	@$(RUN) -m ruff check --fix $(CHECKED)
+	@$(RUN) -m ruff format $(CHECKED)
+
+clean: ## remove .venv and everything else that commands have made
+	@rm -rf .venv build install log out *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	@find ba_node tests tools launch -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,93 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Install ba_node with colcon (ament_python) or pip.
+
+The C++ kernels are built where pybind11 and a C++17 compiler are found; the package works without them, more slowly.
+BA_NODE_PORTABLE=1 builds kernels that run on other processors than this one.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+from setuptools import Extension, find_packages, setup
+
+NAME = "ba_node"
+
+
+def extensions() -> list[Extension]:
+    """Return the C++ kernels, or nothing where pybind11 is missing."""
+    try:
+        import pybind11  # noqa: PLC0415 (only building needs it)
+    except ImportError:
+        print(
+            "ba_node: no pybind11, so the C++ kernels are not built; the numpy kernels take their place",
+            file=sys.stderr,
+        )
+        return []
+    sources = Path(NAME) / "native" / "src"
+    # Without -ffast-math, which would remove the tests for numbers that are not finite.
+    flags = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-Wno-psabi"]
+    if os.environ.get("BA_NODE_PORTABLE", "0") in ("", "0"):
+        flags.append("-march=native")
+    kernels = Extension(
+        f"{NAME}.native._kernels",
+        sources=[str(sources / "module.cpp")],
+        depends=[str(path) for path in sorted(sources.glob("*.hpp"))],
+        include_dirs=[pybind11.get_include()],
+        extra_compile_args=flags,
+        language="c++",
+        # A compiler that fails leaves a package without kernels.
+        optional=True,
+    )
+    return [kernels]
+
+
+def shared(folder: str) -> list[tuple[str, list[str]]]:
+    """List the files below a folder as data files of the package share, keeping its subfolders."""
+    files = sorted(path for path in Path(folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    folders = sorted({path.parent for path in files})
+    return [(f"share/{NAME}/{parent}", [str(path) for path in files if path.parent == parent]) for parent in folders]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Bundle-adjustment back-end for ROS 2",
+    maintainer="The ba_node Authors",
+    maintainer_email="maintainers@example.com",
+    license="Apache-2.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    # The definitions of ba_msgs, with which bags are read and written where ROS is not installed.
+    package_data={f"{NAME}.io": ["ba_msgs/*.msg"]},
+    ext_modules=extensions(),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *shared("launch"),
+        *shared("config"),
+    ],
+    python_requires=">=3.10",
+    install_requires=[
+        "matplotlib",
+        "mcap",
+        "numpy",
+        "pyyaml",
+        "rosbags",
+        "scipy",
+        "tqdm",
+    ],
+    # The extra named "test" with pytest in it is what makes `colcon test` run pytest.
+    # Exact versions for development are in requirements/.
+    extras_require={
+        "test": ["hypothesis", "mcap-ros2-support", "pytest", "pytest-timeout"],
+        "lint": ["mypy", "ruff", "types-PyYAML", "types-tqdm"],
+    },
+    entry_points={
+        "console_scripts": [
+            "ba = ba_node.cli.main:main",
+            "ba_node = ba_node.ros.main:main",
+        ],
+    },
+    zip_safe=False,
+)

@@ -1,0 +1,128 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+import ast
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+import ba_node
+
+ROOT = Path(__file__).resolve().parent.parent
+HEADER = ("Copyright 2026 The ba_node Authors", "SPDX-License-Identifier: Apache-2.0")
+SOURCE_NAMES = {"Makefile", "CMakeLists.txt"}
+SOURCE_SUFFIXES = {".py", ".sh", ".toml", ".cfg", ".xml", ".cpp", ".hpp", ".h"}
+MADE = {".git", ".venv", "build", "install", "log", "out"}
+
+
+def setup_keywords() -> dict[str, ast.expr]:
+    tree = ast.parse((ROOT / "setup.py").read_text())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "setup"]
+    return {keyword.arg: keyword.value for keyword in calls[0].keywords if keyword.arg}
+
+
+def console_scripts() -> list[str]:
+    scripts: list[str] = ast.literal_eval(setup_keywords()["entry_points"])["console_scripts"]
+    return scripts
+
+
+def source_files() -> list[Path]:
+    """List the files under version control, or all files where there is none (an unpacked archive)."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    names = (
+        listed.stdout.splitlines() if listed.returncode == 0 else [str(p.relative_to(ROOT)) for p in ROOT.rglob("*")]
+    )
+    paths = [ROOT / name for name in names if not MADE & set(Path(name).parts)]
+    return [path for path in paths if path.is_file() and (path.suffix in SOURCE_SUFFIXES or path.name in SOURCE_NAMES)]
+
+
+@pytest.mark.parametrize(
+    ("folder", "name", "build_type"), [(".", "ba_node", "ament_python"), ("msg_defs", "ba_msgs", "ament_cmake")]
+)
+def test_manifest_is_valid(folder: str, name: str, build_type: str) -> None:
+    catkin_package = pytest.importorskip("catkin_pkg.package")
+    package = catkin_package.parse_package(str(ROOT / folder))
+    package.validate()
+    assert (package.name, package.package_format) == (name, 3)
+    assert [export.content for export in package.exports if export.tagname == "build_type"] == [build_type]
+
+
+def test_versions_agree() -> None:
+    manifests = [ElementTree.parse(ROOT / folder / "package.xml").findtext("version") for folder in (".", "msg_defs")]
+    versions = {*manifests, ast.literal_eval(setup_keywords()["version"]), ba_node.__version__}
+    assert len(versions) == 1, f"package.xml, msg_defs/package.xml, setup.py and ba_node differ: {versions}"
+
+
+@pytest.mark.parametrize("script", console_scripts())
+def test_console_script_exists(script: str) -> None:
+    module, function = script.split(" = ")[1].split(":")
+    if module == "ba_node.ros.main":
+        pytest.importorskip("rclpy")
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_files_carry_the_licence() -> None:
+    files = source_files()
+    assert len(files) > 10, f"only {len(files)} source files found"
+    missing = [
+        str(path.relative_to(ROOT)) for path in files if not all(line in path.read_text()[:500] for line in HEADER)
+    ]
+    assert not missing, f"without copyright and SPDX lines: {missing}"
+
+
+@pytest.mark.parametrize("verb", ["build", "test", "list"])
+def test_colcon_finds_both_packages(verb: str) -> None:
+    paths = yaml.safe_load((ROOT / "colcon_defaults.yaml").read_text())[verb]["base-paths"]
+    names = {ElementTree.parse(ROOT / path / "package.xml").findtext("name") for path in paths}
+    assert names == {"ba_node", "ba_msgs"}
+
+
+def test_cmake_lists_every_message() -> None:
+    listed = re.findall(
+        r'"((?:msg|srv|action)/\w+\.(?:msg|srv|action))"', (ROOT / "msg_defs/CMakeLists.txt").read_text()
+    )
+    present = sorted(f"{path.parent.name}/{path.name}" for path in (ROOT / "msg_defs").glob("*/*.*"))
+    assert sorted(listed) == present
+
+
+def test_make_help_lists_every_command() -> None:
+    text = (ROOT / "Makefile").read_text()
+    commands = set(re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE)[1].split())  # type: ignore[index]
+    assert set(re.findall(r"^(\w+):.*## ", text, re.MULTILINE)) == commands
+
+
+@pytest.mark.slow
+def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
+    pytest.importorskip("wheel")
+    source = tmp_path / "source"
+    for name in ("ba_node", "config", "launch", "msg_defs", "resource"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("LICENSE", "package.xml", "setup.cfg", "setup.py"):
+        shutil.copy(ROOT / name, source)
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", ".", "."]
+    built = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    with zipfile.ZipFile(next(source.glob("*.whl"))) as wheel:
+        names = wheel.namelist()
+
+    messages = {path.name for path in (ROOT / "msg_defs/msg").glob("*.msg")}
+    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "ba_node").rglob("*.py")}
+    shared = {f"share/ba_node/{name}" for name in ("package.xml", "config/ba_node.yaml", "launch/ba_node.launch.py")}
+    shared.add("share/ament_index/resource_index/packages/ba_node")
+    data = f"ba_node-{ba_node.__version__}.data/data/"
+    assert messages == {Path(name).name for name in names if name.startswith("ba_node/io/ba_msgs/")}
+    assert modules <= set(names), f"not in the wheel: {modules - set(names)}"
+    assert shared <= {name.removeprefix(data) for name in names}
