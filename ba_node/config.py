@@ -1,0 +1,319 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Declare every parameter once: name, default, unit, range, choices, meaning, live or read-only.
+
+The YAML file, the table in docs/parameters.md, the descriptors of the ROS node and ``--set`` on the
+command line are loops over :func:`declarations`; nothing repeats a default.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, cast, get_type_hints
+
+Value = bool | int | float | str
+
+
+class ConfigError(ValueError):
+    """A parameter that is unknown, of the wrong type, out of range, or in conflict with another."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One declared parameter.
+
+    Attributes:
+        name: full name, for example ``window.max_keyframes``.
+        kind: bool, int, float or str.
+        default: value when nothing is set.
+        doc: what it does, one sentence.
+        unit: physical unit, empty if it has none.
+        minimum: smallest allowed number, None if unbounded.
+        maximum: largest allowed number, None if unbounded.
+        choices: allowed strings, empty if any.
+        live: True if a change takes effect at the next solve, False if only at start.
+    """
+
+    name: str
+    kind: type
+    default: Value
+    doc: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = True
+
+    def check(self, value: object) -> Value:
+        """Return the value in the declared type, or raise ConfigError. An int is accepted for a float."""
+        if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.kind:
+            raise ConfigError(
+                f"parameter {self.name} = {value!r}: expected {self.kind.__name__},"
+                f" got {type(value).__name__} (default {self.default!r})"
+            )
+        if self.choices and value not in self.choices:
+            raise ConfigError(f"parameter {self.name} = {value!r}: choose one of {', '.join(self.choices)}")
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            self._check_range(value)
+        assert isinstance(value, (bool, int, float, str))
+        return value
+
+    def _check_range(self, value: float) -> None:
+        low = -math.inf if self.minimum is None else self.minimum
+        high = math.inf if self.maximum is None else self.maximum
+        if not math.isfinite(value) or not low <= value <= high:
+            raise ConfigError(
+                f"parameter {self.name} = {value!r}: expected a number in [{low:g}, {high:g}]"
+                f"{' ' + self.unit if self.unit else ''}"
+            )
+
+
+def _param(default: Value, doc: str, **details: Any) -> Any:
+    """Declare a field of one of the groups below as a parameter."""
+    return field(default=default, metadata={"doc": doc, **details})
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """Which keyframes and tracks take part in a solve."""
+
+    max_keyframes: int = _param(
+        20, "Newest keyframes whose poses are refined in each solve.", minimum=2, maximum=100_000
+    )
+    max_fixed_keyframes: int = _param(
+        20,
+        "Older keyframes that see the window's points and take part with fixed poses; most shared tracks first.",
+        minimum=0,
+        maximum=100_000,
+    )
+    max_landmarks: int = _param(
+        5000,
+        "Points in a solve; beyond it those with the fewest observations are left out.",
+        minimum=10,
+        maximum=10_000_000,
+    )
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What is remembered."""
+
+    max_keyframes: int = _param(
+        5000, "Keyframes kept; beyond it the oldest are forgotten.", minimum=10, maximum=10_000_000
+    )
+    max_landmarks: int = _param(
+        500_000,
+        "Tracks kept; beyond it those seen longest ago are forgotten.",
+        minimum=100,
+        maximum=100_000_000,
+    )
+    max_pending: int = _param(
+        200,
+        "Track and guess messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",
+        minimum=1,
+        maximum=100_000,
+    )
+
+
+@dataclass(frozen=True)
+class TracksConfig:
+    """How tracks become points, and when an observation is not believed."""
+
+    min_parallax_deg: float = _param(
+        1.0,
+        "Smallest angle between two viewing rays of a track for it to be triangulated.",
+        unit="deg",
+        minimum=0.0,
+        maximum=90.0,
+    )
+    max_triangulation_px: float = _param(
+        12.0,
+        "Largest reprojection error, in units of the observation's sigma, of a newly triangulated point or of a guess.",
+        unit="px",
+        minimum=0.1,
+        maximum=1e6,
+    )
+    outlier_px: float = _param(
+        6.0,
+        "After a solve, observations with a residual above this many sigmas are left out of the next one; 0 keeps all.",
+        unit="px",
+        minimum=0.0,
+        maximum=1e6,
+    )
+    depth_sigma_ratio: float = _param(
+        0.02,
+        "Standard deviation of a measured depth, as a share of the depth.",
+        minimum=1e-6,
+        maximum=10.0,
+    )
+
+
+@dataclass(frozen=True)
+class SolverConfig:
+    """How a window is solved."""
+
+    method: str = _param(
+        "auto",
+        "Named method; auto takes dense Cholesky for windows and PCG for large maps. See docs/methods.md.",
+        choices=("auto", "local_dinm", "irls_huber"),
+    )
+    backend: str = _param(
+        "auto",
+        "Kernels: native (C++), numpy, or auto, which takes native where it is built.",
+        choices=("auto", "native", "numpy"),
+    )
+    loss: str = _param("huber", "Robust loss on each residual.", choices=("squared", "huber"))
+    loss_scale_px: float = _param(
+        1.0,
+        "Residual, in units of sigma, where the robust loss leaves the square.",
+        unit="px",
+        minimum=1e-6,
+        maximum=1e6,
+    )
+    max_iterations: int = _param(12, "Cap on outer iterations of a solve.", minimum=1, maximum=100_000)
+    max_linear_iterations: int = _param(500, "Cap on PCG steps in one outer iteration.", minimum=1, maximum=1_000_000)
+    function_tolerance: float = _param(
+        1e-4,
+        "Stop when an accepted step lowers the objective by less than this share.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    gradient_tolerance: float = _param(
+        1e-9,
+        "Stop when the norm of the gradient falls below this.",
+        minimum=0.0,
+        maximum=1e12,
+    )
+    cheirality: str = _param(
+        "constant",
+        "Points on or behind the camera plane: keep their plain residual, give them a constant cost, or drop them.",
+        choices=("keep", "constant", "drop"),
+    )
+
+
+@dataclass(frozen=True)
+class OutputConfig:
+    """What is published."""
+
+    path_max_poses: int = _param(1000, "Poses in ~/path; the newest are kept.", minimum=1, maximum=1_000_000)
+    points_max: int = _param(
+        200_000, "Points in ~/points; beyond it they are thinned evenly.", minimum=1, maximum=50_000_000
+    )
+
+
+@dataclass(frozen=True)
+class NodeConfig:
+    """How the node runs. Not used offline, except for names."""
+
+    inbox_size: int = _param(
+        500,
+        "Messages that wait for the solver; beyond it the oldest tracks are dropped and counted.",
+        minimum=10,
+        maximum=100_000,
+        live=False,
+    )
+    queue_depth: int = _param(100, "QoS depth of the input subscriptions.", minimum=1, maximum=100_000, live=False)
+    settle_time_s: float = _param(
+        0.5,
+        "With no new message for this long, the newest keyframe is solved with what has arrived.",
+        unit="s",
+        minimum=0.01,
+        maximum=3600.0,
+        live=False,
+    )
+
+
+@dataclass(frozen=True)
+class Config:
+    """All parameters, in groups. Immutable; a change makes a new one with :meth:`with_values`."""
+
+    window: WindowConfig = field(default_factory=WindowConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    tracks: TracksConfig = field(default_factory=TracksConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    output: OutputConfig = field(default_factory=OutputConfig)
+    node: NodeConfig = field(default_factory=NodeConfig)
+
+    def values(self) -> dict[str, Value]:
+        """Return every parameter by its full name, in declaration order."""
+        return {p.name: _get(self, p.name) for p in declarations()}
+
+    def with_values(self, changes: Mapping[str, object]) -> Config:
+        """Return a copy with the named parameters changed, or raise ConfigError and change nothing."""
+        declared = {p.name: p for p in declarations()}
+        groups: dict[str, dict[str, Value]] = {}
+        for name, value in changes.items():
+            if name not in declared:
+                raise ConfigError(_unknown(name, list(declared)))
+            group, key = name.split(".")
+            groups.setdefault(group, {})[key] = declared[name].check(value)
+        replaced = {group: dataclasses.replace(getattr(self, group), **keys) for group, keys in groups.items()}
+        return dataclasses.replace(self, **replaced)
+
+
+def _get(config: Config, name: str) -> Value:
+    group, key = name.split(".")
+    value: Value = getattr(getattr(config, group), key)
+    return value
+
+
+def _unknown(name: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+    return f"parameter {name!r} does not exist; did you mean {near[0]!r}?"
+
+
+def _parameters() -> Iterator[Parameter]:
+    for group in fields(Config):
+        cls = get_type_hints(Config)[group.name]
+        kinds = get_type_hints(cls)
+        for item in fields(cls):
+            yield Parameter(
+                name=f"{group.name}.{item.name}",
+                kind=kinds[item.name],
+                default=cast("Value", item.default),
+                **item.metadata,
+            )
+
+
+_DECLARATIONS = tuple(_parameters())
+
+
+def declarations() -> tuple[Parameter, ...]:
+    """Return every parameter, in the order of the file."""
+    return _DECLARATIONS
+
+
+def parse_assignment(text: str) -> tuple[str, Value]:
+    """Read ``name=value`` as given on a command line, in the type of the parameter.
+
+    Raises:
+        ConfigError: there is no ``=``, no such parameter, or the value cannot be read.
+    """
+    name, separator, raw = text.partition("=")
+    if not separator:
+        raise ConfigError(f"{text!r}: expected name=value, for example window.max_keyframes=10")
+    known = {p.name: p for p in declarations()}
+    if name not in known:
+        raise ConfigError(_unknown(name, list(known)))
+    parameter = known[name]
+    return name, parameter.check(_read(raw, parameter))
+
+
+def _read(raw: str, parameter: Parameter) -> Value:
+    if parameter.kind is bool:
+        if raw.lower() not in ("true", "false"):
+            raise ConfigError(f"parameter {parameter.name} = {raw!r}: expected true or false")
+        return raw.lower() == "true"
+    if parameter.kind is str:
+        return raw
+    try:
+        value: Value = parameter.kind(raw)
+    except ValueError:
+        raise ConfigError(f"parameter {parameter.name} = {raw!r}: expected {parameter.kind.__name__}") from None
+    return value

@@ -1,0 +1,119 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Hold what a solve gives back, as arrays: the neutral form of the output messages."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core.result import Status
+
+__all__ = ["Cloud", "Estimate", "Poses", "SolveReport", "Status"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of keyframes, oldest first.
+
+    Attributes:
+        keyframe_id: (n,) uint64.
+        stamp_ns: (n,) int64, ns.
+        position: (n, 3) body in the fixed frame, m.
+        orientation: (n, 4) fixed frame from body, unit quaternion x y z w.
+    """
+
+    keyframe_id: NDArray[np.uint64]
+    stamp_ns: NDArray[np.int64]
+    position: FloatArray
+    orientation: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.keyframe_id)
+
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Poses:
+        """Return some of the poses."""
+        return Poses(self.keyframe_id[rows], self.stamp_ns[rows], self.position[rows], self.orientation[rows])
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of the map.
+
+    Attributes:
+        track_id: (n,) uint64.
+        position: (n, 3) in the fixed frame, m.
+        rms_px: (n,) root mean square reprojection error per coordinate, px.
+        views: (n,) number of observations.
+    """
+
+    track_id: NDArray[np.uint64]
+    position: FloatArray
+    rms_px: NDArray[np.float32]
+    views: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.track_id)
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """How a solve went (message ``ba_msgs/SolverReport``, which documents every field)."""
+
+    session_id: int = 0
+    solve_count: int = 0
+    newest_keyframe_id: int = 0
+    status: Status = Status.SKIPPED
+    reason: str = ""
+    method: str = ""
+    iterations: int = 0
+    accepted_iterations: int = 0
+    linear_iterations: int = 0
+    objective_before: float = 0.0
+    objective_after: float = 0.0
+    gradient_norm: float = 0.0
+    rms_px_before: float = 0.0
+    rms_px_after: float = 0.0
+    keyframes: int = 0
+    fixed_keyframes: int = 0
+    landmarks: int = 0
+    observations: int = 0
+    outliers: int = 0
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    solve_time_s: float = 0.0
+    queue_wait_s: float = 0.0
+    dropped: int = 0
+    coalesced: int = 0
+
+    def without_times(self) -> SolveReport:
+        """Return a copy that does not depend on the machine, for reproducible files."""
+        return dataclasses.replace(self, solve_time_s=0.0, queue_wait_s=0.0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is published after a solve.
+
+    Attributes:
+        stamp_ns: stamp of the newest keyframe, ns.
+        frame_id: name of the fixed frame.
+        refined: poses of the keyframes in the solve, free and fixed, oldest first.
+        trajectory: poses of all keyframes that are kept, oldest first, the newest estimate of each.
+        cloud: all points that are kept.
+        report: how the solve went.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    refined: Poses
+    trajectory: Poses
+    cloud: Cloud
+    report: SolveReport
