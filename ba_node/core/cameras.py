@@ -1,0 +1,255 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Camera models of ``sensor_msgs/CameraInfo``: projection, derivatives, and the way back.
+
+With ``a = X/Z``, ``b = Y/Z``, ``s = a^2 + b^2``:
+
+- rational (``rational_polynomial``; ``plumb_bob`` is the case k4 = k5 = k6 = 0, OpenCV's model)::
+
+      g  = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
+      a' = g a + 2 p1 a b + p2 (s + 2 a^2)
+      b' = g b + p1 (s + 2 b^2) + 2 p2 a b
+
+- equidistant (Kannala-Brandt, as in OpenCV's fisheye module), ``th = atan(sqrt(s))``::
+
+      g  = th (1 + k1 th^2 + k2 th^4 + k3 th^6 + k4 th^8) / sqrt(s);   a' = g a;  b' = g b
+
+then ``u = fx a' + cx`` and ``v = fy b' + cy``. The Snavely camera of the BAL data sets (2.17-2.21) is plumb_bob
+with fx = fy = f and k1, k2 alone, after ``diag(1, -1, -1)``.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+ModelArray = NDArray[np.uint8]
+
+# Columns of a row of camera parameters.
+FX, FY, CX, CY = range(4)
+DISTORTION = slice(4, 12)
+N_PARAMS = 12
+
+# For th below this the ratios of the equidistant model are taken from their series.
+_SMALL_RADIUS2 = 1e-12
+
+
+class CameraError(ValueError):
+    """A camera that cannot be used: unknown model, wrong number of coefficients, numbers out of range."""
+
+
+class Model(enum.IntEnum):
+    """The two families of distortion."""
+
+    RATIONAL = 0
+    EQUIDISTANT = 1
+
+
+# Names in CameraInfo.distortion_model -> family and the numbers of coefficients it may come with.
+_NAMES: dict[str, tuple[Model, tuple[int, ...]]] = {
+    "plumb_bob": (Model.RATIONAL, (0, 4, 5)),
+    "rational_polynomial": (Model.RATIONAL, (0, 8)),
+    "equidistant": (Model.EQUIDISTANT, (0, 4)),
+}
+
+
+def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> tuple[Model, FloatArray]:
+    """Return model and parameter row of a camera given as in ``sensor_msgs/CameraInfo``.
+
+    Args:
+        name: distortion_model.
+        intrinsics: (4,) fx fy cx cy, px.
+        coefficients: d; all missing means no distortion.
+
+    Returns:
+        The model and (12,) parameters.
+
+    Raises:
+        CameraError: the model is unknown, or the numbers do not fit it.
+    """
+    if name not in _NAMES:
+        known = ", ".join(_NAMES)
+        raise CameraError(f"distortion model {name!r} is not supported: rectify the images or use one of {known}")
+    model, counts = _NAMES[name]
+    if len(coefficients) not in counts:
+        expected = " or ".join(str(c) for c in counts)
+        raise CameraError(f"{name} has {len(coefficients)} coefficients, expected {expected}")
+    if not (np.isfinite(intrinsics).all() and np.isfinite(coefficients).all()):
+        raise CameraError(f"camera parameters are not finite: k = {intrinsics}, d = {coefficients}")
+    if intrinsics[FX] <= 0 or intrinsics[FY] <= 0:
+        raise CameraError(f"focal lengths fx = {intrinsics[FX]:g}, fy = {intrinsics[FY]:g} px: expected > 0")
+    params = np.zeros(N_PARAMS)
+    params[:4] = intrinsics
+    params[4 : 4 + len(coefficients)] = coefficients
+    return model, params
+
+
+def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
+    """Project points in camera frames to pixels.
+
+    Args:
+        x_cam: (n, 3) in the optical frame of each row's camera, m. Z = 0 gives infinities: callers sort these out.
+        model: (n,) Model of each row.
+        params: (n, 12) parameters of each row.
+
+    Returns:
+        (n, 2) u, v, px.
+    """
+    normalised = x_cam[:, :2] / x_cam[:, 2:]
+    distorted = _distort(normalised, model, params)
+    return params[:, FX : FY + 1] * distorted + params[:, CX : CY + 1]
+
+
+def project_jacobian(
+    x_cam: FloatArray, model: ModelArray, params: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Project points, with derivatives.
+
+    Args:
+        x_cam: (n, 3), m.
+        model: (n,).
+        params: (n, 12).
+
+    Returns:
+        uv: (n, 2) px; d uv / d x_cam: (n, 2, 3) px/m; d uv / d (f, k1, k2): (n, 2, 3) where f scales fx and fy
+        alike (fx = fy = f when the camera's own fx and fy are 1).
+    """
+    inverse_z = 1.0 / x_cam[:, 2]
+    normalised = x_cam[:, :2] * inverse_z[:, None]
+    distorted, jacobian, d_k12 = _distort_jacobian(normalised, model, params)
+    focal = params[:, FX : FY + 1]
+    uv = focal * distorted + params[:, CX : CY + 1]
+    scaled = jacobian * (focal * inverse_z[:, None])[:, :, None]
+    d_x = np.empty((len(x_cam), 2, 3))
+    d_x[:, :, :2] = scaled
+    d_x[:, :, 2] = -(scaled[:, :, 0] * normalised[:, :1] + scaled[:, :, 1] * normalised[:, 1:])
+    d_intrinsics = np.empty((len(x_cam), 2, 3))
+    d_intrinsics[:, :, 0] = distorted
+    d_intrinsics[:, :, 1:] = d_k12 * focal[:, :, None]
+    return uv, d_x, d_intrinsics
+
+
+def normalise(uv: FloatArray, model: ModelArray, params: FloatArray, iterations: int = 20) -> FloatArray:
+    """Return the undistorted ray of pixels, the inverse of :func:`project`, by Newton's method.
+
+    Args:
+        uv: (n, 2) px.
+        model: (n,).
+        params: (n, 12).
+        iterations: cap on Newton steps.
+
+    Returns:
+        (n, 2) X/Z, Y/Z; NaN where no ray projects to the pixel (outside the model's domain).
+    """
+    target = (uv - params[:, CX : CY + 1]) / params[:, FX : FY + 1]
+    if not params[:, DISTORTION].any() and not (model == Model.EQUIDISTANT).any():
+        return target
+    ray = _first_ray(target, model)
+    with np.errstate(all="ignore"):
+        for _ in range(iterations):
+            distorted, jacobian, _ = _distort_jacobian(ray, model, params)
+            step = _solve2(jacobian, target - distorted)
+            # Limited steps: far out in a strong distortion the full Newton step overshoots the domain.
+            limit = 0.5 * (1.0 + np.linalg.norm(ray, axis=1, keepdims=True))
+            size = np.linalg.norm(step, axis=1, keepdims=True)
+            ray = ray + step * np.minimum(1.0, limit / np.maximum(size, 1e-300))
+            if not np.any(size > 1e-13 * limit):
+                break
+        error = np.abs(_distort(ray, model, params) - target).max(axis=1, initial=0.0)
+    return np.where((error < 1e-7)[:, None], ray, np.nan)
+
+
+def _first_ray(target: FloatArray, model: ModelArray) -> FloatArray:
+    """Return a start for Newton: the pixel itself, or the undistorted fisheye angle."""
+    radius = np.linalg.norm(target, axis=1)
+    angle = np.minimum(radius, 1.5)
+    stretch = np.where(radius > 1e-9, np.tan(angle) / np.maximum(radius, 1e-9), 1.0)
+    result: FloatArray = np.where((model == Model.EQUIDISTANT)[:, None], target * stretch[:, None], target)
+    return result
+
+
+def _solve2(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Solve (n, 2, 2) systems by Cramer's rule."""
+    a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
+    determinant = a * d - b * c
+    return np.stack(
+        [(d * rhs[:, 0] - b * rhs[:, 1]) / determinant, (a * rhs[:, 1] - c * rhs[:, 0]) / determinant], axis=1
+    )
+
+
+def _distort(ray: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
+    """Return the distorted rays (n, 2)."""
+    if not params[:, DISTORTION].any() and not (model == Model.EQUIDISTANT).any():
+        return ray
+    distorted, _, _ = _distort_jacobian(ray, model, params)
+    return distorted
+
+
+def _distort_jacobian(
+    ray: FloatArray, model: ModelArray, params: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return distorted rays (n, 2), their derivatives by the ray (n, 2, 2) and by k1, k2 (n, 2, 2)."""
+    fisheye = model == Model.EQUIDISTANT
+    if not fisheye.any():
+        return _rational(ray, params[:, DISTORTION])
+    distorted, jacobian, d_k12 = np.empty_like(ray), np.empty((len(ray), 2, 2)), np.empty((len(ray), 2, 2))
+    for rows, distort in ((~fisheye, _rational), (fisheye, _equidistant)):
+        distorted[rows], jacobian[rows], d_k12[rows] = distort(ray[rows], params[rows, DISTORTION])
+    return distorted, jacobian, d_k12
+
+
+def _rational(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distort by the rational model; ``k`` is (n, 8) k1 k2 p1 p2 k3 k4 k5 k6."""
+    a, b = ray[:, 0], ray[:, 1]
+    s = a * a + b * b
+    k1, k2 = k[:, 0], k[:, 1]
+    if not k[:, 2:].any():
+        return _radial(ray, s, 1.0 + s * (k1 + s * k2), k1 + 2.0 * s * k2, 1.0)
+    p1, p2, k3, k4, k5, k6 = (k[:, i] for i in range(2, 8))
+    over = 1.0 / (1.0 + s * (k4 + s * (k5 + s * k6)))
+    g = (1.0 + s * (k1 + s * (k2 + s * k3))) * over
+    dg = (k1 + s * (2 * k2 + 3 * s * k3) - g * (k4 + s * (2 * k5 + 3 * s * k6))) * over
+    distorted, jacobian, d_k12 = _radial(ray, s, g, dg, over)
+    distorted[:, 0] += 2 * p1 * a * b + p2 * (s + 2 * a * a)
+    distorted[:, 1] += p1 * (s + 2 * b * b) + 2 * p2 * a * b
+    cross = 2 * (p1 * a + p2 * b)
+    jacobian[:, 0, 0] += 2 * p1 * b + 6 * p2 * a
+    jacobian[:, 0, 1] += cross
+    jacobian[:, 1, 0] += cross
+    jacobian[:, 1, 1] += 6 * p1 * b + 2 * p2 * a
+    return distorted, jacobian, d_k12
+
+
+def _radial(
+    ray: FloatArray, s: FloatArray, g: FloatArray, dg: FloatArray, over: FloatArray | float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``g ray`` and its derivatives, for a factor g(s) with derivative dg and numerator share ``over``."""
+    jacobian = 2.0 * dg[:, None, None] * (ray[:, :, None] * ray[:, None, :])
+    jacobian[:, 0, 0] += g
+    jacobian[:, 1, 1] += g
+    d_k12 = np.empty((len(ray), 2, 2))
+    d_k12[:, :, 0] = ray * (s * over)[:, None]
+    d_k12[:, :, 1] = d_k12[:, :, 0] * s[:, None]
+    return g[:, None] * ray, jacobian, d_k12
+
+
+def _equidistant(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distort by the equidistant model; ``k`` is (n, 8) k1 k2 k3 k4 and zeros."""
+    s = np.sum(ray * ray, axis=1)
+    small = s < _SMALL_RADIUS2
+    r = np.sqrt(np.where(small, 1.0, s))
+    th = np.arctan(r)
+    t2 = th * th
+    poly = 1.0 + t2 * (k[:, 0] + t2 * (k[:, 1] + t2 * (k[:, 2] + t2 * k[:, 3])))
+    slope = 1.0 + t2 * (3 * k[:, 0] + t2 * (5 * k[:, 1] + t2 * (7 * k[:, 2] + 9 * t2 * k[:, 3])))
+    # g = th poly / r;  dg/ds = (slope / (1 + s) - g) / (2 s).
+    g = np.where(small, 1.0, th * poly / r)
+    dg = np.where(small, k[:, 0] - 1.0 / 3.0, (slope / (1.0 + s) - g) / (2.0 * np.where(small, 1.0, s)))
+    distorted, jacobian, d_k12 = _radial(ray, s, g, dg, 0.0)
+    factor = np.where(small, s, th * t2 / r)
+    d_k12[:, :, 0] = ray * factor[:, None]
+    d_k12[:, :, 1] = d_k12[:, :, 0] * np.where(small, s, t2)[:, None]
+    return distorted, jacobian, d_k12

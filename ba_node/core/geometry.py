@@ -1,0 +1,142 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations and rigid transforms, over arrays of them.
+
+Tangent order of a pose everywhere in this package: rotation (3), then translation (3), then, where
+they are free, f, k1, k2. Equation numbers are those of Qu, *Efficient Optimization for Robust Bundle
+Adjustment* (TU Munich, 2018). Quaternions are x y z w, as in ROS.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Below this angle (rad) the closed forms lose digits to cancellation and their series are used.
+_SMALL = 1e-4
+
+
+def hat(v: FloatArray) -> FloatArray:
+    """Return the matrix ``[v]x`` with ``[v]x w = v x w``: (..., 3) -> (..., 3, 3)."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1] = -v[..., 2]
+    out[..., 0, 2] = v[..., 1]
+    out[..., 1, 0] = v[..., 2]
+    out[..., 1, 2] = -v[..., 0]
+    out[..., 2, 0] = -v[..., 1]
+    out[..., 2, 1] = v[..., 0]
+    return out
+
+
+def so3_exp(phi: FloatArray) -> FloatArray:
+    """Return the rotation of a rotation vector by Rodrigues' formula: (..., 3) rad -> (..., 3, 3)."""
+    angle2 = np.sum(phi * phi, axis=-1)
+    a, b, _ = _sinc_terms(angle2)
+    k = hat(phi)
+    return np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
+
+
+def so3_log(rotation: FloatArray) -> FloatArray:
+    """Return the rotation vector of a rotation, angle in [0, pi]: (..., 3, 3) -> (..., 3) rad.
+
+    Goes through the quaternion, whose vector part is exact near 0 and near pi alike.
+    """
+    q = quaternion_from_matrix(rotation)
+    vector, w = q[..., :3], q[..., 3]
+    norm = np.linalg.norm(vector, axis=-1)
+    angle = 2.0 * np.arctan2(norm, w)
+    small = norm < _SMALL
+    # 2 atan2(n, w) / n = 2/w (1 - (n/w)^2 / 3 + ...) near the identity, where w is near 1.
+    series = 2.0 / np.where(small, w, 1.0) * (1.0 - (norm / np.where(small, w, 1.0)) ** 2 / 3.0)
+    scale = np.where(small, series, angle / np.where(small, 1.0, norm))
+    return np.asarray(vector * scale[..., None])
+
+
+def right_jacobian(phi: FloatArray) -> FloatArray:
+    """Return ``Jr`` with ``Exp(phi + d) = Exp(phi) Exp(Jr d) + O(d^2)`` (3.28): (..., 3) -> (..., 3, 3)."""
+    angle2 = np.sum(phi * phi, axis=-1)
+    _, b, c = _sinc_terms(angle2)
+    k = hat(phi)
+    return np.eye(3) - b[..., None, None] * k + c[..., None, None] * (k @ k)
+
+
+def _sinc_terms(angle2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``sin(t)/t``, ``(1 - cos t)/t^2`` and ``(t - sin t)/t^3`` for ``angle2 = t^2``."""
+    small = angle2 < _SMALL**2
+    t2 = np.where(small, 1.0, angle2)
+    t = np.sqrt(t2)
+    half = np.sin(0.5 * t)
+    a = np.where(small, 1.0 - angle2 / 6.0, np.sin(t) / t)
+    # 2 sin^2(t/2) instead of 1 - cos t: no cancellation.
+    b = np.where(small, 0.5 - angle2 / 24.0, 2.0 * half * half / t2)
+    c = np.where(small, 1.0 / 6.0 - angle2 / 120.0, _third_term(t, t2))
+    return a, b, c
+
+
+def _third_term(t: FloatArray, t2: FloatArray) -> FloatArray:
+    """Return ``(t - sin t) / t^3``; by its series where the difference would cancel."""
+    series = 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0 - t2 * t2 * t2 / 362880.0
+    result: FloatArray = np.where(t < 0.3, series, (t - np.sin(t)) / (t2 * t))
+    return result
+
+
+def matrix_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """Return the rotation of a quaternion x y z w, which need not be normalised: (..., 4) -> (..., 3, 3)."""
+    q = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    x, y, z, w = (q[..., i] for i in range(4))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
+    """Return the unit quaternion x y z w (w >= 0) of a rotation: (..., 3, 3) -> (..., 4).
+
+    Shepperd's method: of the four equivalent formulas it takes, per matrix, the one with the largest
+    divisor, so that no half turn loses digits.
+    """
+    r = rotation
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
+    candidates = np.stack(
+        [
+            np.stack([1 + xx - yy - zz, d, e, a], axis=-1),
+            np.stack([d, 1 - xx + yy - zz, f, b], axis=-1),
+            np.stack([e, f, 1 - xx - yy + zz, c], axis=-1),
+            np.stack([a, b, c, 1 + xx + yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    squares = np.stack([candidates[..., i, i] for i in range(4)], axis=-1)
+    best = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    result: FloatArray = np.where(q[..., 3:] < 0, -q, q)
+    return result
+
+
+def nearest_rotation(matrix: FloatArray) -> FloatArray:
+    """Return the rotation nearest to a matrix in the Frobenius norm: (..., 3, 3) -> (..., 3, 3)."""
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.linalg.det(u @ vt)
+    u[..., :, 2] *= sign[..., None]
+    return np.asarray(u @ vt)
+
+
+def inverse(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the inverse of rigid transforms: (..., 3, 3) and (..., 3) -> the same."""
+    back = np.swapaxes(rotation, -1, -2)
+    return back, -(back @ translation[..., None])[..., 0]
+
+
+def compose(
+    rotation_a: FloatArray, translation_a: FloatArray, rotation_b: FloatArray, translation_b: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the transform that applies ``b`` first, then ``a``."""
+    return rotation_a @ rotation_b, (rotation_a @ translation_b[..., None])[..., 0] + translation_a

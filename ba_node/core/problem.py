@@ -1,0 +1,172 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Hold one bundle-adjustment problem as arrays: poses, points, cameras and observations.
+
+A keyframe is the pose of a body; cameras sit on the body with fixed extrinsics. The chain of an
+observation of point ``x`` is, with ``R, t = body_from_world`` and ``Rc, tc = camera_from_body``::
+
+    X_body = R x + t            (2.17)
+    X_cam  = Rc X_body + tc     (camera optical frame: x right, y down, z forward)
+    (u, v) = K distort(X_cam / Z_cam)
+
+A Snavely (BAL) camera is a body that looks down -z with one camera at ``Rc = diag(1, -1, -1)``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+
+class ProblemError(ValueError):
+    """A problem that cannot be posed: wrong shapes, indices out of range, numbers that are not finite."""
+
+
+@dataclass(frozen=True)
+class State:
+    """The unknowns.
+
+    Attributes:
+        rotation: (n_kf, 3, 3) body from world.
+        translation: (n_kf, 3) body from world, m.
+        points: (n_pt, 3) in the world, m.
+        intrinsics: (n_kf, 3) f, k1, k2 of each keyframe's camera (f in px), or (0, 3) when the cameras' own are used.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    points: FloatArray
+    intrinsics: FloatArray
+
+    def is_finite(self) -> bool:
+        """Return True if no number is NaN or infinite."""
+        return all(np.isfinite(getattr(self, f.name)).all() for f in dataclasses.fields(self))
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The cameras of the rig.
+
+    Attributes:
+        rotation: (n_cam, 3, 3) camera optical frame from body.
+        translation: (n_cam, 3) camera optical frame from body, m.
+        model: (n_cam,) see ``cameras.Model``.
+        params: (n_cam, 12) fx fy cx cy in px, then eight distortion coefficients in CameraInfo's order, zero-padded.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    model: NDArray[np.uint8]
+    params: FloatArray
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Who saw what where. Rows are sorted by point (stable), which every sum over a point's rows relies on.
+
+    Attributes:
+        keyframe: (n_obs,) index into the poses.
+        camera: (n_obs,) index into the cameras.
+        point: (n_obs,) index into the points, ascending.
+        uv: (n_obs, 2) raw image coordinates, px.
+        sigma_px: (n_obs,) standard deviation of u and of v, px.
+        depth_m: (n_obs,) measured distance along the optical axis, m; NaN for none; (0,) if none has one.
+        depth_sigma_m: (n_obs,) its standard deviation, m; or (0,).
+    """
+
+    keyframe: IntArray
+    camera: IntArray
+    point: IntArray
+    uv: FloatArray
+    sigma_px: FloatArray
+    depth_m: FloatArray
+    depth_sigma_m: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of observations."""
+        return len(self.keyframe)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem: start values, what is held fixed, cameras and observations.
+
+    Attributes:
+        start: where the solver begins.
+        fixed: (n_kf,) True where the pose (and intrinsics) of a keyframe is held.
+        cameras: the rig.
+        observations: sorted by point.
+    """
+
+    start: State
+    fixed: BoolArray
+    cameras: Cameras
+    observations: Observations
+
+    @property
+    def n_keyframes(self) -> int:
+        """Return the number of poses, free and fixed."""
+        return len(self.start.translation)
+
+    @property
+    def n_points(self) -> int:
+        """Return the number of points."""
+        return len(self.start.points)
+
+    @property
+    def free_intrinsics(self) -> bool:
+        """Return True if each keyframe has its own f, k1, k2 (9 parameters a keyframe instead of 6)."""
+        return len(self.start.intrinsics) > 0
+
+    def check(self) -> None:
+        """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
+        obs = self.observations
+        n_obs = len(obs)
+        _check_shapes(self, n_obs)
+        limits = ((obs.keyframe, self.n_keyframes), (obs.camera, len(self.cameras.model)), (obs.point, self.n_points))
+        for (index, limit), name in zip(limits, ("keyframe", "camera", "point"), strict=True):
+            bad = np.flatnonzero((index < 0) | (index >= limit))
+            if len(bad):
+                raise ProblemError(f"observation {bad[0]}: {name} index {index[bad[0]]} is out of range [0, {limit})")
+        if np.any(np.diff(obs.point) < 0):
+            raise ProblemError("observations are not sorted by point: sort them (stable) first")
+        for name, array in (("uv", obs.uv), ("sigma_px", obs.sigma_px), ("camera params", self.cameras.params)):
+            if not np.isfinite(array).all():
+                row = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
+                raise ProblemError(f"{name} of row {row} is not finite: {array[row]}")
+        if np.any(obs.sigma_px <= 0):
+            row = int(np.argmax(obs.sigma_px <= 0))
+            raise ProblemError(f"sigma_px of observation {row} is {obs.sigma_px[row]}: expected > 0")
+        if not self.start.is_finite():
+            raise ProblemError("the start values hold a number that is not finite")
+
+
+def _check_shapes(problem: Problem, n_obs: int) -> None:
+    start, obs, cams = problem.start, problem.observations, problem.cameras
+    n_kf, n_cam = problem.n_keyframes, len(cams.model)
+    expected: dict[str, tuple[NDArray[np.generic], tuple[int, ...]]] = {
+        "rotation": (start.rotation, (n_kf, 3, 3)),
+        "translation": (start.translation, (n_kf, 3)),
+        "points": (start.points, (problem.n_points, 3)),
+        "intrinsics": (start.intrinsics, (n_kf if problem.free_intrinsics else 0, 3)),
+        "fixed": (problem.fixed, (n_kf,)),
+        "camera rotation": (cams.rotation, (n_cam, 3, 3)),
+        "camera translation": (cams.translation, (n_cam, 3)),
+        "camera params": (cams.params, (n_cam, 12)),
+        "observation camera": (obs.camera, (n_obs,)),
+        "observation point": (obs.point, (n_obs,)),
+        "uv": (obs.uv, (n_obs, 2)),
+        "sigma_px": (obs.sigma_px, (n_obs,)),
+        "depth_m": (obs.depth_m, (n_obs if len(obs.depth_m) else 0,)),
+        "depth_sigma_m": (obs.depth_sigma_m, (len(obs.depth_m),)),
+    }
+    for name, (array, shape) in expected.items():
+        if array.shape != shape:
+            raise ProblemError(f"{name} has shape {array.shape}, expected {shape}")

@@ -1,0 +1,86 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Hold what a solve returns: the state, a trace of its iterations, and why it stopped."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from ba_node.core.problem import State
+
+
+class Status(enum.IntEnum):
+    """Why a solve stopped; the values are those of ``ba_msgs/SolverReport``."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    STALLED = 2
+    SKIPPED = 3
+    FAILED = 4
+
+    @property
+    def usable(self) -> bool:
+        """Return True if the estimate may replace what was known."""
+        return self in (Status.CONVERGED, Status.MAX_ITERATIONS, Status.STALLED)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One row of the trace. Row 0 is the start.
+
+    Attributes:
+        iteration: number of the outer iteration.
+        time_s: seconds since the solve began, by the caller's clock.
+        objective: robust objective after the iteration (dimensionless, px^2 / sigma^2).
+        gradient_norm: Euclidean norm of its gradient.
+        linear_iterations: PCG steps; 0 with a direct solver.
+        accepted: True if the step was taken.
+        damping: mu during the iteration.
+        radius: radius of the trust region during the iteration, inf without one.
+    """
+
+    iteration: int
+    time_s: float
+    objective: float
+    gradient_norm: float
+    linear_iterations: int
+    accepted: bool
+    damping: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start."""
+
+    state: State
+    status: Status
+    reason: str
+    method: str
+    trace: tuple[Iteration, ...]
+
+    @property
+    def objective_before(self) -> float:
+        """Return the objective at the start."""
+        return self.trace[0].objective if self.trace else 0.0
+
+    @property
+    def objective_after(self) -> float:
+        """Return the objective at the end."""
+        return self.trace[-1].objective if self.trace else 0.0
+
+    @property
+    def gradient_norm(self) -> float:
+        """Return the norm of the gradient at the end."""
+        return self.trace[-1].gradient_norm if self.trace else 0.0
+
+    @property
+    def linear_iterations(self) -> int:
+        """Return the number of PCG steps in all."""
+        return sum(row.linear_iterations for row in self.trace)
+
+    @property
+    def accepted_iterations(self) -> int:
+        """Return the number of steps that were taken."""
+        return sum(row.accepted for row in self.trace[1:])

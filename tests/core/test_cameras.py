@@ -1,0 +1,107 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Projection against its definition, derivatives against differences, and the way back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ba_node.core import cameras
+
+K = np.array([500.0, 510.0, 320.0, 240.0])
+COEFFICIENTS = {
+    "plumb_bob": np.array([-0.3, 0.1, 1e-3, -2e-3, 0.01]),
+    "rational_polynomial": np.array([0.3, 0.1, 1e-3, -2e-3, 0.01, 0.2, 0.05, 0.01]),
+    "equidistant": np.array([0.01, -0.02, 3e-3, 1e-3]),
+}
+MODELS = list(COEFFICIENTS)
+
+
+def rows(name: str, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return model and parameters of n equal cameras."""
+    model, params = cameras.parameters(name, K, COEFFICIENTS[name])
+    return np.full(n, model, np.uint8), np.tile(params, (n, 1))
+
+
+def points(n: int, seed: int = 0) -> np.ndarray:
+    """Return points in front of a camera."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.normal(0.0, 0.6, (n, 2)), rng.uniform(1.5, 4.0, n)])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_derivatives_agree_with_central_differences(name: str) -> None:
+    x, h = points(60), 1e-6
+    model, params = rows(name, 60)
+    uv, d_x, d_i = cameras.project_jacobian(x, model, params)
+    np.testing.assert_allclose(uv, cameras.project(x, model, params), atol=1e-12)
+    for j, axis in enumerate(np.eye(3)):
+        numeric = (cameras.project(x + h * axis, model, params) - cameras.project(x - h * axis, model, params)) / (
+            2 * h
+        )
+        np.testing.assert_allclose(d_x[:, :, j], numeric, atol=1e-6)
+    for j, column in enumerate((4, 5), start=1):
+        step = h * np.eye(cameras.N_PARAMS)[column]
+        numeric = (cameras.project(x, model, params + step) - cameras.project(x, model, params - step)) / (2 * h)
+        np.testing.assert_allclose(d_i[:, :, j], numeric, atol=1e-6)
+
+
+def test_focal_derivative_is_the_distorted_ray() -> None:
+    x = points(10)
+    model, params = rows("plumb_bob", 10)
+    _, _, d_i = cameras.project_jacobian(x, model, params)
+    uv = cameras.project(x, model, params)
+    np.testing.assert_allclose(d_i[:, :, 0] * K[:2] + K[2:], uv, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(st.integers(0, 10_000))
+def test_normalise_inverts_project(name: str, seed: int) -> None:
+    x = points(8, seed)
+    x[:, :2] = np.clip(x[:, :2], -1.0, 1.0)
+    model, params = rows(name, 8)
+    ray = cameras.normalise(cameras.project(x, model, params), model, params)
+    np.testing.assert_allclose(ray, x[:, :2] / x[:, 2:], atol=1e-8)
+
+
+def test_equidistant_is_smooth_at_the_optical_axis() -> None:
+    x = np.array([[0.0, 0.0, 1.0], [1e-9, 0.0, 1.0], [1e-5, 0.0, 1.0]])
+    model, params = rows("equidistant", 3)
+    uv, d_x, _ = cameras.project_jacobian(x, model, params)
+    np.testing.assert_allclose(uv[:, 0], K[2] + K[0] * x[:, 0], atol=1e-9)
+    np.testing.assert_allclose(d_x[:, 0, 0], K[0], rtol=1e-9)
+
+
+def test_models_can_be_mixed() -> None:
+    x = points(2)
+    pairs = [rows(name, 2) for name in ("plumb_bob", "equidistant")]
+    model = np.array([pairs[0][0][0], pairs[1][0][1]])
+    params = np.stack([pairs[0][1][0], pairs[1][1][1]])
+    mixed = cameras.project(x, model, params)
+    np.testing.assert_array_equal(mixed[0], cameras.project(x, *pairs[0])[0])
+    np.testing.assert_array_equal(mixed[1], cameras.project(x, *pairs[1])[1])
+
+
+def test_pixels_without_a_ray_are_nan() -> None:
+    """A strong barrel distortion folds over: beyond its largest radius nothing projects."""
+    model, params = cameras.parameters("plumb_bob", K, np.array([-0.3, 0.0, 0.0, 0.0]))
+    far = cameras.normalise(np.array([[5000.0, 240.0]]), np.array([model], np.uint8), params[None])
+    assert np.isnan(far).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "k", "d", "words"),
+    [
+        ("thin_prism", K, [], "thin_prism"),
+        ("plumb_bob", K, [0.1, 0.2, 0.3], "3 coefficients"),
+        ("plumb_bob", [0.0, 500.0, 1.0, 1.0], [], "focal"),
+        ("plumb_bob", [np.nan, 500.0, 1.0, 1.0], [], "not finite"),
+        ("equidistant", K, [0.1, 0.2, np.inf, 0.0], "not finite"),
+    ],
+)
+def test_bad_cameras_are_refused_by_name(name: str, k: list[float], d: list[float], words: str) -> None:
+    with pytest.raises(cameras.CameraError, match=words):
+        cameras.parameters(name, np.asarray(k), np.asarray(d))
