@@ -1,0 +1,62 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the solver asks of the heavy arithmetic of one problem; numpy_kernels.py and native_kernels.py do it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import scipy.sparse
+from numpy import float64
+from numpy.typing import NDArray
+
+from ba_node.core.problem import State
+
+FloatArray = NDArray[float64]
+
+# Up to this many unknowns S is stored densely.
+DENSE_LIMIT = 3000
+
+
+class System(Protocol):
+    """A damped system after elimination of the points: ``S pc = rhs`` (see schur.py)."""
+
+    rhs: FloatArray
+
+    def dense(self) -> FloatArray:
+        """Return S, (n, n)."""
+
+    def sparse(self) -> scipy.sparse.bsr_matrix:
+        """Return S, block-sparse."""
+
+    def product(self, x: FloatArray) -> FloatArray:
+        """Return S x without forming S."""
+
+    def diagonal_blocks(self) -> FloatArray:
+        """Return the diagonal blocks of S, (n_free, d, d)."""
+
+    def back_substitute(self, step_c: FloatArray) -> tuple[FloatArray, float]:
+        """Return the points' step (n_points, 3) and the reduction ``-g'p - 1/2 |J p|^2`` of the undamped model."""
+
+
+class Kernels(Protocol):
+    """What the solver's loop asks of a problem."""
+
+    n_free: int
+    size: int
+    gradient_norm: float
+
+    def linearise(self, state: State) -> float:
+        """Linearise at a state and keep the normal equations; return the objective there."""
+
+    def diagonals(self) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
+
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+        """Add damping to the diagonals and eliminate the points."""
+
+    def objective(self, state: State) -> float:
+        """Return the robust objective."""
+
+    def polish_points(self, state: State, steps: int) -> tuple[float, State]:
+        """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""

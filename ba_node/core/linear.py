@@ -1,0 +1,122 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Solve the reduced system: Cholesky, and conjugate gradients inside a trust region.
+
+Both take a symmetric positive semi-definite operator and give a finite vector or say that they could not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Product = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a linear solver found.
+
+    Attributes:
+        x: (n,) the solution, None if there is none that is finite.
+        iterations: PCG steps; 0 with a direct solver.
+        on_boundary: True if it ends on the boundary of the trust region.
+    """
+
+    x: FloatArray | None
+    iterations: int = 0
+    on_boundary: bool = False
+
+
+def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Solution:
+    """Solve ``A x = b`` for a symmetric positive definite A; no solution if A is not.
+
+    Args:
+        matrix: (n, n), dense (written over) or sparse.
+        rhs: (n,).
+    """
+    try:
+        if scipy.sparse.issparse(matrix):
+            factor = scipy.sparse.linalg.splu(
+                scipy.sparse.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+            )
+            x = factor.solve(rhs)
+        else:
+            # The transpose of a symmetric matrix in C order is the same matrix in LAPACK's order: no copy.
+            factor = scipy.linalg.cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+            x = scipy.linalg.cho_solve(factor, rhs, check_finite=False)
+    except (np.linalg.LinAlgError, RuntimeError):
+        return Solution(None)
+    return Solution(x if np.isfinite(x).all() else None)
+
+
+@dataclass(frozen=True)
+class PcgLimits:
+    """When conjugate gradients stop: |r| <= min(t_eps, |b|) |b|, a cap on steps, the radius of the region."""
+
+    t_eps: float = 0.1
+    max_iterations: int = 500
+    radius: float = np.inf
+
+
+def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limits: PcgLimits) -> Solution:
+    """Solve ``A x = b`` inside ``|x| <= radius`` (Algorithms 1, 3 and 4).
+
+    Stops when the residual is small, after the cap, on leaving the region (then on its boundary, along the current
+    direction, 3.93), or on a direction without curvature: there the model falls without end, so it goes to the
+    boundary, or without a region stays where it is.
+
+    Args:
+        product: x -> A x.
+        rhs: (n,) b.
+        precondition: r -> M^-1 r.
+        limits: see PcgLimits.
+
+    Returns:
+        The solution; never NaN.
+    """
+    x = np.zeros_like(rhs)
+    norm_b = float(np.linalg.norm(rhs))
+    if norm_b == 0.0 or not np.isfinite(norm_b):
+        return Solution(x if norm_b == 0.0 else None)
+    target = min(limits.t_eps, norm_b) * norm_b
+    r = rhs.copy()
+    z = precondition(r)
+    d = z.copy()
+    rz = float(r @ z)
+    for j in range(limits.max_iterations):
+        ad = product(d)
+        curvature = float(d @ ad)
+        if not np.isfinite(curvature) or not np.isfinite(rz):
+            return Solution(x if j else None, j)
+        if curvature <= 0.0:
+            return Solution(_to_boundary(x, d, limits.radius) if np.isfinite(limits.radius) else x, j, True)
+        alpha = rz / curvature
+        x_next = x + alpha * d
+        if float(np.linalg.norm(x_next)) >= limits.radius:
+            return Solution(_to_boundary(x, d, limits.radius), j + 1, True)
+        x = x_next
+        r = r - alpha * ad
+        if float(np.linalg.norm(r)) <= target:
+            return Solution(x, j + 1)
+        z = precondition(r)
+        rz_next = float(r @ z)
+        d = z + (rz_next / rz) * d
+        rz = rz_next
+    return Solution(x, limits.max_iterations)
+
+
+def _to_boundary(x: FloatArray, d: FloatArray, radius: float) -> FloatArray:
+    """Return ``x + tau d`` with tau >= 0 and norm ``radius`` (3.93), free of cancellation."""
+    a, b, c = float(d @ d), float(x @ d), float(x @ x) - radius * radius
+    root = np.sqrt(max(b * b - a * c, 0.0))
+    tau = -c / (b + root) if b > 0 else (root - b) / a
+    result: FloatArray = x + tau * d
+    return result * (radius / float(np.linalg.norm(result)))

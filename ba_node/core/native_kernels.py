@@ -1,0 +1,132 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The kernels in C++ (ba_node/native), and the choice between them and numpy's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from ba_node import native
+from ba_node.core.kernels import Kernels, System
+from ba_node.core.numpy_kernels import NumpyKernels
+from ba_node.core.objective import CHEIRALITY, Rules
+from ba_node.core.problem import Problem, State
+
+FloatArray = NDArray[np.float64]
+
+BACKENDS = ("auto", "native", "numpy")
+
+# As in enum Loss of kernel.hpp.
+_LOSSES = ("squared", "huber")
+
+
+def make(problem: Problem, rules: Rules, backend: str = "auto") -> Kernels:
+    """Return the kernels of a problem.
+
+    Raises:
+        ValueError: native is asked for and is not built, or does not have what the rules ask for.
+    """
+    reason = native.missing(rules.parameterisation, rules.loss)
+    if backend == "native" and reason:
+        raise ValueError(f"backend native: {reason}; take numpy or auto")
+    if backend == "numpy" or reason:
+        return NumpyKernels(problem, rules)
+    return NativeKernels(problem, rules)
+
+
+class NativeKernels:
+    """The kernels in C++."""
+
+    def __init__(self, problem: Problem, rules: Rules) -> None:
+        """Hand the problem over; it is copied and sorted once."""
+        obs, cams = problem.observations, problem.cameras
+        self.size = 9 if problem.free_intrinsics else 6
+        make_kernel = native.kernels.Kernel9 if problem.free_intrinsics else native.kernels.Kernel6
+        self._kernel: Any = make_kernel(
+            keyframe=obs.keyframe,
+            camera=obs.camera,
+            point=obs.point,
+            uv=obs.uv,
+            sigma_px=obs.sigma_px,
+            depth_m=obs.depth_m,
+            depth_sigma_m=obs.depth_sigma_m,
+            camera_rotation=cams.rotation,
+            camera_translation=cams.translation,
+            camera_model=cams.model,
+            camera_params=cams.params,
+            fixed=problem.fixed,
+            loss=_LOSSES.index(rules.loss),
+            loss_scale=rules.loss_scale,
+            cheirality=CHEIRALITY.index(rules.cheirality),
+            start=_arrays(problem.start),
+        )
+        self.n_free: int = self._kernel.n_free
+        self.gradient_norm = np.inf
+        # S is written to the same memory in every iteration.
+        self._dense = np.empty((0, 0))
+
+    def linearise(self, state: State) -> float:
+        """Linearise at a state and keep the normal equations; return the objective there."""
+        value: float = self._kernel.linearise(_arrays(state))
+        self.gradient_norm = self._kernel.gradient_norm
+        return value
+
+    def diagonals(self) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
+        d_c, d_p = self._kernel.diagonals()
+        return d_c, d_p
+
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+        """Add damping to the diagonals and eliminate the points."""
+        self._kernel.factor(damping_c, damping_p)
+        return _NativeSystem(self._kernel, self.size, self._matrix)
+
+    def _matrix(self) -> FloatArray:
+        n = self.n_free * self.size
+        if len(self._dense) != n:
+            self._dense = np.empty((n, n))
+        return self._dense
+
+    def objective(self, state: State) -> float:
+        """Return the robust objective."""
+        value: float = self._kernel.objective(_arrays(state))
+        return value
+
+    def polish_points(self, state: State, steps: int) -> tuple[float, State]:
+        """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
+        value, points = self._kernel.polish_points(_arrays(state), steps)
+        return value, State(state.rotation, state.translation, points, state.intrinsics)
+
+
+def _arrays(state: State) -> tuple[FloatArray, ...]:
+    return state.rotation, state.translation, state.points, state.intrinsics
+
+
+class _NativeSystem:
+    """The kernel's current reduced system; valid until the next linearisation or reduction."""
+
+    def __init__(self, kernel: Any, size: int, memory: Callable[[], FloatArray]) -> None:
+        self._kernel, self._size, self._memory = kernel, size, memory
+        self.rhs: FloatArray = kernel.rhs()
+        self.product = kernel.product
+        self.diagonal_blocks = kernel.diagonal_blocks
+        self.back_substitute = kernel.back_substitute
+
+    def dense(self) -> FloatArray:
+        """Return S, (n, n); the next call writes over it."""
+        matrix = self._memory()
+        self._kernel.dense(matrix)
+        return matrix
+
+    def sparse(self) -> scipy.sparse.bsr_matrix:
+        """Return S, block-sparse."""
+        blocks, rows, columns = self._kernel.sparse()
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(len(self.rhs) // self._size + 1))
+        n = len(self.rhs)
+        return scipy.sparse.bsr_matrix((blocks[order], columns[order], starts), shape=(n, n))

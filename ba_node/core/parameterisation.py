@@ -1,0 +1,69 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Two ways to step a pose: local (on the rotation matrix) and global (on the rotation vector).
+
+Local (4.1-4.19): ``R <- R Exp(dphi)``, ``t <- t + R dt``. With ``G = d residual / d x`` of a point x, the derivative is
+``-G [x]x = rows x x G`` for dphi and ``G`` for dt: no trigonometry, and G is needed for the point anyway.
+
+Global (3.26-3.28): ``phi <- phi + dphi``, ``t <- t + dt``; ``-G [x]x Jr(phi)`` and ``G R'``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core import geometry
+
+FloatArray = NDArray[np.float64]
+
+PARAMETERISATIONS = ("local", "global")
+
+
+def pose_jacobian(
+    kind: str, d_point: FloatArray, point: FloatArray, rotation: FloatArray, row_pose: NDArray[np.intp]
+) -> FloatArray:
+    """Return the derivative of residuals by the step of their keyframe's pose.
+
+    Args:
+        kind: local or global.
+        d_point: (n, d, 3) derivative by the point in the world.
+        point: (n, 3) point in the world, m.
+        rotation: (n_kf, 3, 3) body from world.
+        row_pose: (n,) keyframe of each row.
+
+    Returns:
+        (n, d, 6): rotation, then translation.
+    """
+    out = np.empty((*d_point.shape[:2], 6))
+    x, g = point[:, None, :], d_point
+    out[..., 0] = x[..., 1] * g[..., 2] - x[..., 2] * g[..., 1]
+    out[..., 1] = x[..., 2] * g[..., 0] - x[..., 0] * g[..., 2]
+    out[..., 2] = x[..., 0] * g[..., 1] - x[..., 1] * g[..., 0]
+    if kind == "local":
+        out[..., 3:] = g
+    else:
+        jr = geometry.right_jacobian(geometry.so3_log(rotation))
+        out[..., :3] = out[..., :3] @ jr[row_pose]
+        out[..., 3:] = g @ np.swapaxes(rotation, 1, 2)[row_pose]
+    return out
+
+
+def retract(
+    kind: str, rotation: FloatArray, translation: FloatArray, step: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return poses after a step.
+
+    Args:
+        kind: local or global.
+        rotation: (n, 3, 3).
+        translation: (n, 3), m.
+        step: (n, 6): rotation (rad), then translation (m).
+
+    Returns:
+        Rotations (n, 3, 3) and translations (n, 3).
+    """
+    if kind == "local":
+        moved = translation + (rotation @ step[:, 3:, None])[..., 0]
+        return rotation @ geometry.so3_exp(step[:, :3]), moved
+    return geometry.so3_exp(geometry.so3_log(rotation) + step[:, :3]), translation + step[:, 3:]

@@ -1,0 +1,286 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""One loop for every method: damped, trust-region, inexact Newton steps on the reduced system (Algorithms 5, 8, 9, 11).
+
+Each outer iteration linearises, damps (``H + mu D``), eliminates the points, solves for the keyframes by Cholesky or
+by PCG inside ``|D pc| <= radius``, substitutes back, and judges the step by the gain ratio
+
+    rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2)          (3.90, 3.104)
+
+in which F is the true robust objective and the denominator is the undamped model at the step that was really taken,
+so that it holds for inexact steps too (for an exact step of the points it equals (3.102)). rho > 0: the step is taken.
+Radius (Algorithm 2): rho < 1/4: radius / 4; rho > 3/4 on the boundary: radius * 2.
+Damping: ``nielsen`` (Algorithm 6): rho > 0: mu *= max(1/3, 1 - (2 rho - 1)^3), nu = 2, else mu *= nu, nu *= 2;
+``fast``: the same, but mu / 5 where rho > 1/2.
+
+With ``polish_steps`` > 0 each step of the keyframes is followed by that many damped Newton steps of every point alone
+(inner iterations); a step that was bad only because the points had not followed it is saved by them.
+
+A step that is not finite, or that could not be computed, counts as a rejected one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core import linear, native_kernels, parameterisation, scaling
+from ba_node.core.kernels import DENSE_LIMIT, System
+from ba_node.core.objective import Rules
+from ba_node.core.problem import Problem, State
+from ba_node.core.result import Iteration, Result, Status
+
+FloatArray = NDArray[np.float64]
+
+# The gain ratio of a step that only the polished points made good: taken, but not much trusted.
+_SAVED_RHO = 0.3
+# A loop that has rejected this many steps in a row has nothing left to gain.
+_MAX_REJECTED = 25
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """The parts of a method. See docs/methods.md for the named ones.
+
+    Attributes:
+        method: name for the report.
+        rules: parameterisation, loss, cheirality.
+        damping: D of the damping: none, identity, diag, inc.
+        damping_policy: nielsen or fast.
+        initial_damping: first mu.
+        trust_region: D of the region: none, identity, diag, inc.
+        initial_radius: first radius, in units of the scaled step.
+        linear_solver: cholesky, pcg, or auto (by size).
+        polish_steps: Newton steps of every point alone after each step of the keyframes; 0 for none.
+        backend: auto, native or numpy.
+        preconditioner: none or schur_block (diagonal blocks of S), for pcg.
+        t_eps: PCG stops at |r| <= min(t_eps, |b|) |b|.
+        max_linear_iterations: cap on PCG steps in one outer iteration.
+        max_iterations: cap on outer iterations, rejected ones included.
+        function_tolerance: stop when an accepted step lowers the objective by less than this share.
+        gradient_tolerance: stop when |g| falls below this (xi1).
+        objective_tolerance: stop when the objective falls below this (xi2).
+    """
+
+    method: str = "auto"
+    rules: Rules = field(default_factory=Rules)
+    damping: str = "diag"
+    damping_policy: str = "fast"
+    initial_damping: float = 1e-4
+    trust_region: str = "none"
+    initial_radius: float = 1e4
+    linear_solver: str = "auto"
+    preconditioner: str = "schur_block"
+    polish_steps: int = 3
+    backend: str = "auto"
+    t_eps: float = 0.1
+    max_linear_iterations: int = 500
+    max_iterations: int = 50
+    function_tolerance: float = 1e-6
+    gradient_tolerance: float = 1e-9
+    objective_tolerance: float = 0.0
+
+
+def _no_clock() -> float:
+    return 0.0
+
+
+def solve(
+    problem: Problem,
+    options: SolverOptions,
+    *,
+    clock: Callable[[], float] = _no_clock,
+    on_iteration: Callable[[Iteration], bool] | None = None,
+) -> Result:
+    """Minimise the robust objective of a problem.
+
+    Args:
+        problem: must pass :meth:`Problem.check`.
+        options: the parts of the method.
+        clock: seconds, for the trace alone; nothing depends on it.
+        on_iteration: called with each row of the trace; returning False stops the solve.
+
+    Returns:
+        The best state found, with a trace and the reason for stopping; finite always.
+
+    Raises:
+        ProblemError: the problem is not well formed.
+    """
+    problem.check()
+    if len(problem.observations) == 0 or (problem.fixed.all() and problem.n_points == 0):
+        return Result(problem.start, Status.SKIPPED, "no observations: nothing to solve", options.method, ())
+    with np.errstate(all="ignore"):
+        return _Run(problem, options, clock, on_iteration).run()
+
+
+class _Run:
+    """The state of one solve between its iterations."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        options: SolverOptions,
+        clock: Callable[[], float],
+        on_iteration: Callable[[Iteration], bool] | None,
+    ) -> None:
+        self.options = options
+        self.clock, self.began = clock, clock()
+        self.on_iteration = on_iteration
+        self.kernels = native_kernels.make(problem, options.rules, options.backend)
+        self.free = np.flatnonzero(~problem.fixed)
+        self.state = problem.start
+        self.value = np.inf
+        self.mu, self.nu = options.initial_damping, 2.0
+        self.radius = options.initial_radius if options.trust_region != "none" else np.inf
+        self.rejected = 0
+        self.stopped = False
+        self.trace: list[Iteration] = []
+        n = self.kernels.n_free * self.kernels.size
+        self.dense = n <= DENSE_LIMIT
+        self.linear_solver = options.linear_solver
+        if self.linear_solver == "auto":
+            self.linear_solver = "cholesky" if self.dense else "pcg"
+
+    def run(self) -> Result:
+        self.value = self.kernels.linearise(self.state)
+        if not (np.isfinite(self.value) and np.isfinite(self.kernels.gradient_norm)):
+            return self._result(Status.FAILED, "the objective or its derivatives are not finite at the start")
+        self._record(0, 0, True)
+        for iteration in range(1, self.options.max_iterations + 1):
+            reason = self._converged()
+            if reason:
+                return self._result(Status.CONVERGED, reason)
+            if self.stopped:
+                return self._result(Status.MAX_ITERATIONS, f"stopped by the caller after {iteration - 1} iterations")
+            before = self.value
+            accepted, solution = self._step()
+            if accepted:
+                self.kernels.linearise(self.state)
+            self._record(iteration, solution.iterations, accepted)
+            if accepted and before - self.value <= self.options.function_tolerance * before:
+                share = (before - self.value) / before if before > 0 else 0.0
+                return self._result(Status.CONVERGED, f"the last step lowered the objective by {share:.1e} of it")
+            if self.rejected >= _MAX_REJECTED:
+                return self._result(Status.STALLED, f"{self.rejected} steps in a row did not lower the objective")
+        return self._result(Status.MAX_ITERATIONS, f"stopped at the cap of {self.options.max_iterations} iterations")
+
+    def _converged(self) -> str:
+        if self.kernels.gradient_norm <= self.options.gradient_tolerance:
+            return f"the norm of the gradient is {self.kernels.gradient_norm:.1e}"
+        if self.value <= self.options.objective_tolerance:
+            return f"the objective is {self.value:.1e}"
+        return ""
+
+    def _step(self) -> tuple[bool, linear.Solution]:
+        """Try one step; update state, damping and radius. Return whether it was taken."""
+        hessian = self.kernels.diagonals()
+        d_c, d_p = scaling.diagonals(self.options.damping, hessian)
+        system = self.kernels.reduce(self.mu * d_c, self.mu * d_p)
+        solution = self._solve_reduced(system, hessian)
+        if solution.x is None:
+            return self._judge(-1.0, solution), solution
+        step_p, predicted = system.back_substitute(solution.x)
+        candidate = self._retract(solution.x, step_p)
+        if not candidate.is_finite():
+            return self._judge(-1.0, solution), solution
+        value = self.kernels.objective(candidate)
+        rho = (self.value - value) / predicted if np.isfinite(value) and predicted > 0 else -1.0
+        if self.options.polish_steps:
+            polished, moved = self.kernels.polish_points(candidate, self.options.polish_steps)
+            if np.isfinite(polished) and polished < min(value, self.value) and moved.is_finite():
+                rho = max(rho, (self.value - polished) / predicted) if rho > 0 else _SAVED_RHO
+                candidate, value = moved, polished
+        accepted = self._judge(rho, solution)
+        if accepted:
+            self.state, self.value = candidate, value
+        return accepted, solution
+
+    def _retract(self, step_c: FloatArray, step_p: FloatArray) -> State:
+        """Return the state after a step."""
+        state, free = self.state, self.free
+        blocks = step_c.reshape(-1, self.kernels.size)
+        rotation, translation = state.rotation.copy(), state.translation.copy()
+        rotation[free], translation[free] = parameterisation.retract(
+            self.options.rules.parameterisation, rotation[free], translation[free], blocks[:, :6]
+        )
+        intrinsics = state.intrinsics
+        if len(intrinsics):
+            intrinsics = intrinsics.copy()
+            intrinsics[free] += blocks[:, 6:]
+        return State(rotation, translation, state.points + step_p, intrinsics)
+
+    def _solve_reduced(self, system: System, hessian: tuple[FloatArray, FloatArray]) -> linear.Solution:
+        options = self.options
+        n = len(system.rhs)
+        if n == 0:
+            return linear.Solution(np.zeros(0))
+        if self.linear_solver == "cholesky":
+            return linear.cholesky(system.dense() if self.dense else system.sparse(), system.rhs)
+        scale = np.ones(n)
+        if options.trust_region != "none":
+            d_c, _ = scaling.diagonals(options.trust_region, hessian)
+            scale = 1.0 / (np.sqrt(d_c) if options.trust_region == "diag" else d_c).ravel()
+        limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, self.radius)
+        found = linear.pcg_steihaug(
+            self._scaled_product(system, scale), scale * system.rhs, self._preconditioner(system, scale), limits
+        )
+        x = None if found.x is None else scale * found.x
+        return linear.Solution(x, found.iterations, found.on_boundary)
+
+    def _scaled_product(self, system: System, scale: FloatArray) -> linear.Product:
+        """Return x -> D^-1 S D^-1 x."""
+        if self.dense:
+            matrix = system.dense()
+            matrix *= scale[:, None]
+            matrix *= scale
+            return lambda x: np.asarray(matrix @ x)
+        return lambda x: scale * system.product(scale * x)
+
+    def _preconditioner(self, system: System, scale: FloatArray) -> linear.Product:
+        if self.options.preconditioner == "none":
+            return lambda r: r
+        size = self.kernels.size
+        s = scale.reshape(-1, size)
+        blocks = system.diagonal_blocks() * s[:, :, None] * s[:, None, :]
+        try:
+            inverse = np.linalg.inv(blocks)
+        except np.linalg.LinAlgError:
+            inverse = np.linalg.pinv(blocks, hermitian=True)
+        return lambda r: (inverse @ r.reshape(-1, size, 1)).ravel()
+
+    def _judge(self, rho: float, solution: linear.Solution) -> bool:
+        """Update damping and radius from the gain ratio; return whether the step is taken."""
+        accepted = rho > 0.0
+        if accepted:
+            shrink = max(1.0 / 3.0, 1.0 - (2.0 * rho - 1.0) ** 3)
+            fast = self.options.damping_policy == "fast" and rho > 0.5
+            self.mu, self.nu = self.mu * (0.2 if fast else shrink), 2.0
+        else:
+            self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
+        if rho < 0.25:
+            self.radius *= 0.25
+        elif rho > 0.75 and solution.on_boundary:
+            self.radius *= 2.0
+        self.rejected = 0 if accepted else self.rejected + 1
+        return accepted
+
+    def _record(self, iteration: int, linear_iterations: int, accepted: bool) -> None:
+        row = Iteration(
+            iteration=iteration,
+            time_s=self.clock() - self.began,
+            objective=self.value,
+            gradient_norm=self.kernels.gradient_norm,
+            linear_iterations=linear_iterations,
+            accepted=accepted,
+            damping=self.mu if self.options.damping != "none" else 0.0,
+            radius=self.radius,
+        )
+        self.trace.append(row)
+        if self.on_iteration is not None and not self.on_iteration(row):
+            self.stopped = True
+
+    def _result(self, status: Status, reason: str) -> Result:
+        return Result(self.state, status, reason, self.options.method, tuple(self.trace))

@@ -1,0 +1,175 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The Python module ba_node.native._kernels. core/native_kernels.py checks shapes; every call frees the GIL.
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "kernel.hpp"
+
+namespace py = pybind11;
+
+namespace {
+
+template <class T>
+using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
+using Doubles = Array<double>;
+using Ints = Array<std::int64_t>;
+using StateArrays = std::tuple<Doubles, Doubles, Doubles, Doubles>;  // rotation, translation, points, intrinsics
+
+ba::StateView view(const StateArrays& s) {
+  const Doubles& own = std::get<3>(s);
+  return {std::get<0>(s).data(), std::get<1>(s).data(), std::get<2>(s).data(), own.size() ? own.data() : nullptr};
+}
+
+Doubles empty(std::vector<py::ssize_t> shape) { return Doubles(std::move(shape)); }
+
+template <class T>
+py::array_t<T> copy(const std::vector<T>& values, std::vector<py::ssize_t> shape) {
+  py::array_t<T> out(std::move(shape));
+  std::copy(values.begin(), values.end(), out.mutable_data());
+  return out;
+}
+
+template <int D>
+ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point, const Doubles& uv, const Doubles& sigma,
+                    const Doubles& depth, const Doubles& depth_sigma, const Doubles& camera_rotation,
+                    const Doubles& camera_translation, const Array<std::uint8_t>& model, const Doubles& params,
+                    const Array<bool>& fixed, int loss, double loss_scale, int cheirality, const StateArrays& start) {
+  const ba::ProblemView problem{fixed.size(),
+                                std::get<2>(start).shape(0),
+                                keyframe.size(),
+                                model.size(),
+                                keyframe.data(),
+                                camera.data(),
+                                point.data(),
+                                uv.data(),
+                                sigma.data(),
+                                depth.size() ? depth.data() : nullptr,
+                                depth_sigma.data(),
+                                camera_rotation.data(),
+                                camera_translation.data(),
+                                params.data(),
+                                model.data(),
+                                fixed.data()};
+  const ba::Rules rules{static_cast<ba::Loss>(loss), loss_scale, static_cast<ba::Cheirality>(cheirality)};
+  const ba::StateView state = view(start);
+  py::gil_scoped_release release;
+  return new ba::Kernel<D>(problem, rules, state);
+}
+
+template <int D>
+py::tuple sparse(ba::Kernel<D>& kernel) {
+  std::vector<double> blocks;
+  std::vector<std::int64_t> rows, columns;
+  {
+    py::gil_scoped_release release;
+    kernel.sparse(blocks, rows, columns);
+  }
+  const auto n = static_cast<py::ssize_t>(rows.size());
+  return py::make_tuple(copy(blocks, {n, D, D}), copy(rows, {n}), copy(columns, {n}));
+}
+
+template <int D>
+void bind(py::module_& m, const char* name) {
+  using K = ba::Kernel<D>;
+  py::class_<K>(m, name)
+      .def(py::init(&make<D>), py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"), py::arg("uv"),
+           py::arg("sigma_px"), py::arg("depth_m"), py::arg("depth_sigma_m"), py::arg("camera_rotation"),
+           py::arg("camera_translation"), py::arg("camera_model"), py::arg("camera_params"), py::arg("fixed"),
+           py::arg("loss"), py::arg("loss_scale"), py::arg("cheirality"), py::arg("start"))
+      .def_property_readonly("n_free", &K::n_free)
+      .def_property_readonly("gradient_norm", &K::gradient_norm)
+      .def("linearise",
+           [](K& k, const StateArrays& s) {
+             py::gil_scoped_release release;
+             return k.linearise(view(s));
+           })
+      .def("objective",
+           [](K& k, const StateArrays& s) {
+             py::gil_scoped_release release;
+             return k.objective(view(s));
+           })
+      .def("polish_points",
+           [](K& k, const StateArrays& s, int steps) {
+             const Doubles& start = std::get<2>(s);
+             Doubles points = empty({start.shape(0), 3});
+             double* out = points.mutable_data();
+             std::copy_n(start.data(), start.size(), out);
+             double value = 0;
+             {
+               py::gil_scoped_release release;
+               value = k.polish_points(view(s), out, steps);
+             }
+             return py::make_tuple(value, points);
+           })
+      .def("diagonals",
+           [](const K& k) {
+             Doubles d_c = empty({k.n_free(), D}), d_p = empty({k.n_points(), 3});
+             k.diagonals(d_c.mutable_data(), d_p.mutable_data());
+             return py::make_tuple(d_c, d_p);
+           })
+      .def("factor",
+           [](K& k, const Doubles& damping_c, const Doubles& damping_p) {
+             const double *c = damping_c.data(), *p = damping_p.data();
+             py::gil_scoped_release release;
+             k.factor(c, p);
+           })
+      .def("rhs",
+           [](const K& k) {
+             Doubles out = empty({k.n_free() * D});
+             k.rhs(out.mutable_data());
+             return out;
+           })
+      .def("dense",
+           [](K& k, py::array_t<double, py::array::c_style> out) {
+             double* s = out.mutable_data();
+             py::gil_scoped_release release;
+             k.dense(s);
+           })
+      .def("sparse", &sparse<D>)
+      .def("product",
+           [](K& k, const Doubles& x) {
+             Doubles out = empty({k.n_free() * D});
+             const double* in = x.data();
+             double* y = out.mutable_data();
+             {
+               py::gil_scoped_release release;
+               k.product(in, y);
+             }
+             return out;
+           })
+      .def("diagonal_blocks",
+           [](K& k) {
+             Doubles out = empty({k.n_free(), D, D});
+             double* blocks = out.mutable_data();
+             {
+               py::gil_scoped_release release;
+               k.diagonal_blocks(blocks);
+             }
+             return out;
+           })
+      .def("back_substitute", [](K& k, const Doubles& step_c) {
+        Doubles step_p = empty({k.n_points(), 3});
+        const double* in = step_c.data();
+        double* out = step_p.mutable_data();
+        double reduction = 0;
+        {
+          py::gil_scoped_release release;
+          reduction = k.back_substitute(in, out);
+        }
+        return py::make_tuple(step_p, reduction);
+      });
+}
+
+}  // namespace
+
+PYBIND11_MODULE(_kernels, m) {
+  m.doc() = "Kernels of bundle adjustment in C++; see ba_node/core/kernels.py.";
+  bind<6>(m, "Kernel6");
+  bind<9>(m, "Kernel9");
+}

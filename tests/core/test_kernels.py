@@ -1,0 +1,155 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The kernels in C++ against those in numpy, on every quantity; and the polishing of points."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ba_node import native
+from ba_node.core import cameras, native_kernels, solver
+from ba_node.core.kernels import Kernels
+from ba_node.core.objective import Objective, Rules
+from ba_node.core.problem import Problem, State
+
+Make = Callable[..., tuple[Problem, State]]
+SHAPES = {
+    "pinhole": {"distorted": False},
+    "distorted": {},
+    "stereo": {"stereo": True},
+    "depth": {"depth": True, "stereo": True},
+    "own intrinsics": {"free_intrinsics": True},
+    "nothing fixed": {"fixed": 0},
+    "most fixed": {"fixed": 4},
+}
+RULES = [
+    Rules(),
+    Rules(loss="huber", loss_scale=1.5),
+    Rules(loss="huber", cheirality="constant"),
+    Rules(cheirality="drop"),
+]
+built = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
+
+
+def some_behind(problem: Problem) -> Problem:
+    """Turn every seventh point to the other side of the cameras."""
+    points = problem.start.points.copy()
+    points[::7, 2] *= -1.0
+    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
+
+
+def pair(problem: Problem, rules: Rules) -> tuple[Kernels, Kernels]:
+    """Return the kernels of a problem in numpy and in C++, linearised at the start."""
+    both = native_kernels.make(problem, rules, "numpy"), native_kernels.make(problem, rules, "native")
+    values = [kernels.linearise(problem.start) for kernels in both]
+    assert values[0] == pytest.approx(values[1], rel=1e-12)
+    return both
+
+
+def near(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-11) -> None:
+    """Assert that two arrays agree relative to their largest entry."""
+    assert a.shape == b.shape
+    scale = max(float(np.abs(a).max(initial=0.0)), 1e-300)
+    assert float(np.abs(a - b).max(initial=0.0)) <= tolerance * scale
+
+
+@built
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_native_agrees_with_numpy(shape: dict[str, object], rules: Rules, make_problem: Make) -> None:
+    problem = some_behind(make_problem(start_error=0.02, **shape)[0])
+    oracle, kernels = pair(problem, rules)
+    assert kernels.gradient_norm == pytest.approx(oracle.gradient_norm, rel=1e-11)
+    assert kernels.objective(problem.start) == pytest.approx(oracle.objective(problem.start), rel=1e-12)
+    d_c, d_p = oracle.diagonals()
+    near(d_c, kernels.diagonals()[0])
+    near(d_p, kernels.diagonals()[1])
+    a, b = (k.reduce(1e-3 * d_c + 1e-3, 1e-3 * d_p + 1e-3) for k in (oracle, kernels))
+    near(a.rhs, b.rhs)
+    near(a.dense(), b.dense())
+    near(a.sparse().toarray(), b.sparse().toarray())
+    near(a.diagonal_blocks(), b.diagonal_blocks())
+    x = np.random.default_rng(0).normal(size=len(a.rhs))
+    near(a.product(x), b.product(x))
+    step = np.asarray(np.linalg.solve(a.dense(), a.rhs), dtype=np.float64)
+    (points_a, gain_a), (points_b, gain_b) = a.back_substitute(step), b.back_substitute(step)
+    near(points_a, points_b, 1e-8)
+    assert gain_b == pytest.approx(gain_a, rel=1e-8)
+
+
+@built
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_native_polishes_as_numpy_does(shape: dict[str, object], rules: Rules, make_problem: Make) -> None:
+    problem, _ = make_problem(start_error=0.02, **shape)
+    oracle, kernels = pair(problem, rules)
+    (value_a, state_a), (value_b, state_b) = (k.polish_points(problem.start, 3) for k in (oracle, kernels))
+    assert value_b == pytest.approx(value_a, rel=1e-9)
+    near(state_a.points, state_b.points, 1e-7)
+
+
+@built
+@pytest.mark.parametrize("name", ["rational_polynomial", "equidistant"])
+def test_native_has_every_camera_model(name: str, make_problem: Make) -> None:
+    """One camera of the given model and one plumb_bob, in one rig."""
+    problem, _ = make_problem(stereo=True)
+    coefficients = np.array(
+        [0.1, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.02, 0.01] if "rational" in name else [0.02, -0.01, 3e-3, 1e-3]
+    )
+    model, params = cameras.parameters(name, np.array([400.0, 410.0, 320.0, 240.0]), coefficients)
+    cams = problem.cameras
+    both = dataclasses.replace(cams, model=np.array([model, 0], np.uint8), params=np.stack([params, cams.params[1]]))
+    oracle, kernels = pair(dataclasses.replace(problem, cameras=both), Rules(loss="huber"))
+    systems = [kernel.reduce(*kernel.diagonals()).dense() for kernel in (oracle, kernels)]
+    near(systems[0], systems[1])
+
+
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
+def test_polishing_moves_points_only_and_never_makes_one_worse(backend: str, make_problem: Make) -> None:
+    problem, _ = make_problem(start_error=0.05)
+    kernels = native_kernels.make(problem, Rules(loss="huber"), backend)
+    value, state = kernels.polish_points(problem.start, 3)
+    objective = Objective(problem, Rules(loss="huber"))
+    assert value == pytest.approx(objective.value(state), rel=1e-12)
+    before, after = (
+        np.bincount(problem.observations.point, objective.point_rows(s).cost) for s in (problem.start, state)
+    )
+    assert np.all(after <= before)
+    assert value < 0.5 * objective.value(problem.start)
+    np.testing.assert_array_equal(state.rotation, problem.start.rotation)
+
+
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
+@pytest.mark.parametrize("linear_solver", ["cholesky", "pcg"])
+def test_large_systems_are_solved_without_a_dense_s(
+    backend: str, linear_solver: str, make_problem: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the limit for dense S at zero the solve takes the sparse and the matrix-free way to the same minimum."""
+    problem, _ = make_problem(stereo=True, points=60)
+    options = dataclasses.replace(
+        solver.SolverOptions(), backend=backend, linear_solver=linear_solver, t_eps=1e-6, function_tolerance=1e-14
+    )
+    dense = solver.solve(problem, options)
+    monkeypatch.setattr(solver, "DENSE_LIMIT", 0)
+    other = solver.solve(problem, options)
+    assert other.objective_after == pytest.approx(dense.objective_after, rel=1e-9)
+
+
+@built
+def test_native_solves_end_where_numpy_ends(make_problem: Make) -> None:
+    problem, _ = make_problem(stereo=True, depth=True)
+    ends = [
+        solver.solve(problem, dataclasses.replace(solver.SolverOptions(), backend=b, function_tolerance=1e-14))
+        for b in ("numpy", "native")
+    ]
+    assert ends[1].objective_after == pytest.approx(ends[0].objective_after, rel=1e-10)
+
+
+def test_native_is_refused_where_it_lacks_something(make_problem: Make) -> None:
+    problem, _ = make_problem()
+    with pytest.raises(ValueError, match="native"):
+        native_kernels.make(problem, Rules(parameterisation="global"), "native")
