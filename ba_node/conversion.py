@@ -1,0 +1,239 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Turn messages into arrays and arrays into messages, whatever library the messages come from.
+
+Everything here works on attributes with the names of the ROS fields, so the classes of rclpy and the
+dataclasses of rosbags are both served; how a message is made is left to a :class:`MessageFactory`.
+Arrays are copied out of a message whole: no loop over tracks or points, and nothing that is kept
+holds on to the buffer of a message or of a file.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.message_factory import (
+    ConversionError,
+    MessageFactory,
+    float32,
+    header_message,
+    pose_message,
+    stamp_ns_from_message,
+)
+from ba_node.output_messages import OUTPUT_TYPES, output_messages
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+__all__ = [
+    "INPUT_TYPES",
+    "OUTPUT_TYPES",
+    "ConversionError",
+    "MessageFactory",
+    "guesses_message",
+    "keyframe_message",
+    "measurement_from_message",
+    "output_messages",
+    "rig_message",
+    "stamp_ns_from_message",
+    "tracks_message",
+]
+
+INPUT_TYPES = {
+    "keyframes": "ba_msgs/msg/Keyframe",
+    "feature_tracks": "ba_msgs/msg/FeatureTracks",
+    "landmark_guesses": "ba_msgs/msg/LandmarkGuesses",
+    "camera_rig": "ba_msgs/msg/CameraRig",
+    "camera_info": "sensor_msgs/msg/CameraInfo",
+}
+
+
+def measurement_from_message(type_name: str, msg: Any) -> Measurement:
+    """Return what an input message says.
+
+    Arrays of a message that do not fit together are not an error here: the measurement says so in
+    ``malformed``, and the scene counts it.
+
+    Raises:
+        ConversionError: the type is not an input, or a camera rig cannot be read.
+    """
+    if type_name == INPUT_TYPES["keyframes"]:
+        return _keyframe(msg)
+    if type_name == INPUT_TYPES["feature_tracks"]:
+        return _tracks(msg)
+    if type_name == INPUT_TYPES["landmark_guesses"]:
+        return _guesses(msg)
+    if type_name == INPUT_TYPES["camera_rig"]:
+        return _rig(str(msg.header.frame_id), msg.cameras, msg.body_from_camera)
+    if type_name == INPUT_TYPES["camera_info"]:
+        return _rig(str(msg.header.frame_id), [msg], None)
+    raise ConversionError(f"type {type_name!r} is not an input: expected one of {', '.join(INPUT_TYPES.values())}")
+
+
+def _array(values: Any, dtype: Any) -> NDArray[Any]:
+    return np.array(values, dtype=dtype).reshape(-1)
+
+
+def _keyframe(msg: Any) -> Keyframe:
+    pose = msg.pose.pose
+    return Keyframe(
+        session_id=int(msg.session_id),
+        keyframe_id=int(msg.keyframe_id),
+        stamp_ns=stamp_ns_from_message(msg.header.stamp),
+        frame_id=str(msg.header.frame_id),
+        position=_xyz(pose.position),
+        orientation=_xyzw(pose.orientation),
+    )
+
+
+def _tracks(msg: Any) -> FeatureTracks:
+    track_id = _array(msg.track_id, np.uint64)
+    n = len(track_id)
+    columns = {name: _array(getattr(msg, name), np.float64) for name in ("u", "v", "sigma_px", "depth_m")}
+    wrong = [
+        f"{name} has {len(column)} entries, track_id {n}"
+        for name, column in columns.items()
+        if len(column) != n and not (name in ("sigma_px", "depth_m") and len(column) == 0)
+    ]
+    if wrong:
+        track_id = track_id[:0]
+        columns = {name: np.empty(0) for name in columns}
+    return FeatureTracks(
+        session_id=int(msg.session_id),
+        keyframe_id=int(msg.keyframe_id),
+        camera_index=int(msg.camera_index),
+        track_id=track_id,
+        uv=np.stack([columns["u"], columns["v"]], axis=1),
+        sigma_px=columns["sigma_px"],
+        depth_m=columns["depth_m"],
+        malformed="; ".join(wrong),
+    )
+
+
+def _guesses(msg: Any) -> LandmarkGuesses:
+    track_id = _array(msg.track_id, np.uint64)
+    position = _array(msg.position, np.float64)
+    malformed = ""
+    if len(position) != 3 * len(track_id):
+        malformed = (
+            f"position has {len(position)} entries, track_id {len(track_id)}: expected three coordinates for each track"
+        )
+        track_id, position = track_id[:0], position[:0]
+    return LandmarkGuesses(int(msg.session_id), track_id, position.reshape(-1, 3), malformed)
+
+
+def _rig(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
+    """Return the rig; without poses the cameras sit at the origin of the body."""
+    n = len(cameras)
+    if poses is not None and len(poses) != n:
+        raise ConversionError(
+            f"camera rig {frame_id!r}: cameras has {n} entries, body_from_camera {len(poses)}:"
+            " expected one pose for each camera"
+        )
+    if n == 0:
+        raise ConversionError(f"camera rig {frame_id!r}: no cameras")
+    matrices = np.array([_array(info.k, np.float64) for info in cameras])
+    skewed = np.flatnonzero(matrices[:, 1] != 0.0)
+    if len(skewed):
+        raise ConversionError(
+            f"camera rig {frame_id!r}: camera {skewed[0]}: skew k[1] = {matrices[skewed[0], 1]:g}: expected 0"
+        )
+    if poses is None:
+        position, orientation = np.zeros((n, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    else:
+        position = np.array([_xyz(pose.position) for pose in poses])
+        orientation = np.array([_xyzw(pose.orientation) for pose in poses])
+    return CameraRig(
+        frame_id=frame_id,
+        names=tuple(str(info.header.frame_id) for info in cameras),
+        models=tuple(str(info.distortion_model) for info in cameras),
+        intrinsics=matrices[:, [0, 4, 2, 5]],
+        distortion=tuple(_array(info.d, np.float64) for info in cameras),
+        image_size=np.array([[info.width, info.height] for info in cameras], dtype=np.int64),
+        position=position,
+        orientation=orientation,
+    )
+
+
+def _xyz(vector: Any) -> NDArray[np.float64]:
+    return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
+
+
+def _xyzw(quaternion: Any) -> NDArray[np.float64]:
+    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
+
+
+def keyframe_message(factory: MessageFactory, keyframe: Keyframe) -> Any:
+    """Return a ``ba_msgs/Keyframe``, covariance unknown."""
+    pose = factory.make(
+        "geometry_msgs/msg/PoseWithCovariance",
+        pose=pose_message(factory, keyframe.position, keyframe.orientation),
+        covariance=factory.fixed(np.zeros(36)),
+    )
+    return factory.make(
+        INPUT_TYPES["keyframes"],
+        header=header_message(factory, keyframe.stamp_ns, keyframe.frame_id),
+        session_id=keyframe.session_id,
+        keyframe_id=keyframe.keyframe_id,
+        pose=pose,
+    )
+
+
+def tracks_message(factory: MessageFactory, tracks: FeatureTracks, stamp_ns: int, frame_id: str) -> Any:
+    """Return a ``ba_msgs/FeatureTracks``; ``frame_id`` is the optical frame of the camera."""
+    columns = {"u": tracks.uv[:, 0], "v": tracks.uv[:, 1], "sigma_px": tracks.sigma_px, "depth_m": tracks.depth_m}
+    return factory.make(
+        INPUT_TYPES["feature_tracks"],
+        header=header_message(factory, stamp_ns, frame_id),
+        session_id=tracks.session_id,
+        keyframe_id=tracks.keyframe_id,
+        camera_index=tracks.camera_index,
+        track_id=factory.array(tracks.track_id),
+        **{name: factory.array(float32(column)) for name, column in columns.items()},
+    )
+
+
+def guesses_message(factory: MessageFactory, guesses: LandmarkGuesses, stamp_ns: int, frame_id: str) -> Any:
+    """Return a ``ba_msgs/LandmarkGuesses``; ``frame_id`` is the fixed frame."""
+    return factory.make(
+        INPUT_TYPES["landmark_guesses"],
+        header=header_message(factory, stamp_ns, frame_id),
+        session_id=guesses.session_id,
+        track_id=factory.array(guesses.track_id),
+        position=factory.array(guesses.position.reshape(-1)),
+    )
+
+
+def rig_message(factory: MessageFactory, rig: CameraRig, stamp_ns: int) -> Any:
+    """Return a ``ba_msgs/CameraRig``."""
+    return factory.make(
+        INPUT_TYPES["camera_rig"],
+        header=header_message(factory, stamp_ns, rig.frame_id),
+        cameras=[_camera_info(factory, rig, index, stamp_ns) for index in range(len(rig))],
+        body_from_camera=[pose_message(factory, p, q) for p, q in zip(rig.position, rig.orientation, strict=True)],
+    )
+
+
+def _camera_info(factory: MessageFactory, rig: CameraRig, index: int, stamp_ns: int) -> Any:
+    fx, fy, cx, cy = rig.intrinsics[index]
+    width, height = rig.image_size[index]
+    region = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    return factory.make(
+        INPUT_TYPES["camera_info"],
+        header=header_message(factory, stamp_ns, rig.names[index]),
+        height=int(height),
+        width=int(width),
+        distortion_model=rig.models[index],
+        d=factory.array(rig.distortion[index]),
+        k=factory.fixed(np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])),
+        r=factory.fixed(np.eye(3).reshape(-1)),
+        p=factory.fixed(np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0])),
+        binning_x=0,
+        binning_y=0,
+        roi=factory.make("sensor_msgs/msg/RegionOfInterest", **region),
+    )

@@ -1,0 +1,230 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read and write problems of "Bundle Adjustment in the Large" (BAL), and turn them into ours and back.
+
+The projection of a BAL camera (Agarwal et al., ECCV 2010; thesis 2.17-2.21) is::
+
+    X' = R x + t,   p = -(X', Y') / Z',   u = f (1 + k1 |p|^2 + k2 |p|^4) p
+
+It looks down -z with v upwards. With the camera at ``diag(1, -1, -1)`` on the body, z points forward and y down:
+``x_cam / z_cam = p_x`` and ``y_cam / z_cam = -p_y``, so the image coordinates of the same picture are ``(u, -v)``.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import warnings
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core.cameras import Model
+from ba_node.core.geometry import so3_exp, so3_log
+from ba_node.core.problem import Cameras, Observations, Problem, State
+from ba_node.io.files import whole_file
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
+
+
+class BalError(ValueError):
+    """A BAL file that cannot be read."""
+
+
+@dataclass(frozen=True)
+class BalProblem:
+    """A problem as the file has it.
+
+    Attributes:
+        cameras: (n, 9) rotation vector, translation, f (px), k1, k2.
+        points: (m, 3) in the world.
+        camera_index: (l,) camera of each observation.
+        point_index: (l,) point of each observation.
+        observations: (l, 2) u to the right, v upwards, px, from the centre of the image.
+    """
+
+    cameras: FloatArray
+    points: FloatArray
+    camera_index: IntArray
+    point_index: IntArray
+    observations: FloatArray
+
+
+def read_bal(path: Path | str) -> BalProblem:
+    """Read ``*.txt``, ``*.bz2`` or ``*.gz``.
+
+    Raises:
+        BalError: the file cannot be opened or unpacked, is truncated, or holds something that is no finite number or an
+            index out of range; names the line.
+    """
+    path = Path(path)
+    text = _unpack(path)
+    values = _numbers(path, text)
+    n_cameras, n_points, n_obs = _header(path, text, values)
+    ends = 3 + np.cumsum([4 * n_obs, 9 * n_cameras, 3 * n_points])
+    _check_count(path, text, values, (n_cameras, n_points, n_obs), int(ends[-1]))
+    rows = values[3 : ends[0]].reshape(n_obs, 4)
+    problem = BalProblem(
+        cameras=values[ends[0] : ends[1]].reshape(n_cameras, 9).copy(),
+        points=values[ends[1] : ends[2]].reshape(n_points, 3).copy(),
+        camera_index=rows[:, 0].astype(np.intp),
+        point_index=rows[:, 1].astype(np.intp),
+        observations=rows[:, 2:].copy(),
+    )
+    for column, (name, limit) in enumerate((("camera", n_cameras), ("point", n_points))):
+        index = rows[:, column]
+        bad = np.flatnonzero((index != np.floor(index)) | (index < 0) | (index >= limit))
+        if len(bad):
+            line = _line_of(text, 3 + 4 * int(bad[0]) + column)
+            raise BalError(f"{path}: line {line}: {name} index {index[bad[0]]:g} out of range [0, {limit})")
+    return problem
+
+
+def write_bal(path: Path | str, problem: BalProblem) -> None:
+    """Write ``*.txt``, ``*.bz2`` or ``*.gz``; every number reads back as the same float64."""
+    path = Path(path)
+    head = f"{len(problem.cameras)} {len(problem.points)} {len(problem.observations)}"
+    columns = (problem.camera_index, problem.point_index, problem.observations[:, 0], problem.observations[:, 1])
+    rows = map("{} {} {!r} {!r}".format, *(column.tolist() for column in columns))
+    numbers = map(repr, [*problem.cameras.ravel().tolist(), *problem.points.ravel().tolist()])
+    data = ("\n".join([head, *rows, *numbers]) + "\n").encode()
+    if path.suffix == ".bz2":
+        data = bz2.compress(data)
+    elif path.suffix == ".gz":
+        data = gzip.compress(data, mtime=0)
+    with whole_file(path) as stream:
+        stream.write(data)
+
+
+def to_problem(bal: BalProblem) -> Problem:
+    """Return the problem in our terms: a keyframe for each camera with its own f, k1, k2, and nothing fixed.
+
+    The one camera of the rig has unit focal length, as the focal lengths are in ``State.intrinsics``.
+    """
+    n = len(bal.observations)
+    order = np.argsort(bal.point_index, kind="stable")
+    params = np.zeros((1, 12))
+    params[0, :2] = 1.0
+    return Problem(
+        start=State(
+            so3_exp(bal.cameras[:, :3]), bal.cameras[:, 3:6].copy(), bal.points.copy(), bal.cameras[:, 6:].copy()
+        ),
+        fixed=np.zeros(len(bal.cameras), dtype=bool),
+        cameras=Cameras(
+            rotation=np.diag([1.0, -1.0, -1.0])[None],
+            translation=np.zeros((1, 3)),
+            model=np.array([Model.RATIONAL], dtype=np.uint8),
+            params=params,
+        ),
+        observations=Observations(
+            keyframe=bal.camera_index[order],
+            camera=np.zeros(n, dtype=np.intp),
+            point=bal.point_index[order],
+            uv=bal.observations[order] * [1.0, -1.0],
+            sigma_px=np.ones(n),
+            depth_m=np.empty(0),
+            depth_sigma_m=np.empty(0),
+        ),
+    )
+
+
+def from_state(bal: BalProblem, state: State) -> BalProblem:
+    """Return the problem with cameras and points of a solution of :func:`to_problem`."""
+    cameras = np.hstack([so3_log(state.rotation), state.translation, state.intrinsics])
+    return replace(bal, cameras=cameras, points=state.points.copy())
+
+
+def _unpack(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise BalError(f"{path}: cannot be opened: {error.strerror}") from error
+    try:
+        if path.suffix == ".bz2":
+            return bz2.decompress(data)
+        if path.suffix == ".gz":
+            return gzip.decompress(data)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
+        raise BalError(f"{path}: cannot be unpacked, it is truncated or damaged: {error}") from error
+    return data
+
+
+def _numbers(path: Path, text: bytes) -> FloatArray:
+    """Return all numbers of the text, finite; numpy reads them 20 times as fast as a split would."""
+    if not text.strip():
+        raise BalError(f"{path}: the file is empty: expected a line with the numbers of cameras, points, observations")
+    try:
+        with warnings.catch_warnings():
+            # What numpy 2.2 warns of is an error from 2.3 on.
+            warnings.simplefilter("error", DeprecationWarning)
+            values: FloatArray = np.fromstring(text, dtype=np.float64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        _raise_not_a_number(path, text)
+        values = np.array(text.split(), dtype=np.float64)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        line = _line_of(text, int(bad[0]))
+        raise BalError(f"{path}: line {line}: {values[bad[0]]}: expected a finite number")
+    return values
+
+
+def _raise_not_a_number(path: Path, text: bytes) -> None:
+    for line, words in enumerate(text.splitlines(), start=1):
+        for word in words.split():
+            if not _is_number(word):
+                shown = word[:40].decode("ascii", errors="replace")
+                raise BalError(f"{path}: line {line}: {shown!r} is not a number")
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _header(path: Path, text: bytes, values: FloatArray) -> tuple[int, int, int]:
+    counts = values[:3]
+    if len(counts) < 3 or np.any(counts != np.floor(counts)) or np.any(counts < 0) or np.any(counts > 2**53):
+        line = text.strip().splitlines()[0][:80].decode("ascii", errors="replace")
+        raise BalError(
+            f"{path}: line {_line_of(text, 0)}: {line!r}: expected the numbers of cameras, points, observations"
+        )
+    return int(counts[0]), int(counts[1]), int(counts[2])
+
+
+def _check_count(path: Path, text: bytes, values: FloatArray, counts: tuple[int, int, int], expected: int) -> None:
+    if len(values) == expected:
+        return
+    promised = f"{counts[0]} cameras, {counts[1]} points and {counts[2]} observations make {expected} numbers"
+    if len(values) < expected:
+        where = _place(len(values) - 3, counts)
+        raise BalError(f"{path}: truncated: {promised}, the file holds {len(values)} and ends in {where}")
+    raise BalError(f"{path}: line {_line_of(text, expected)}: {promised}, the file holds {len(values)}")
+
+
+def _place(index: int, counts: tuple[int, int, int]) -> str:
+    """Return in words what the number after the header at an index belongs to."""
+    n_cameras, _, n_obs = counts
+    if index < 4 * n_obs:
+        return f"observation {index // 4}"
+    index -= 4 * n_obs
+    if index < 9 * n_cameras:
+        return f"camera {index // 9} ({_CAMERA[index % 9]})"
+    return f"point {(index - 9 * n_cameras) // 3}"
+
+
+def _line_of(text: bytes, index: int) -> int:
+    """Return the line, counted from one, of a number; only called when an error is certain."""
+    for line, words in enumerate(text.splitlines(), start=1):
+        index -= len(words.split())
+        if index < 0:
+            return line
+    return len(text.splitlines())

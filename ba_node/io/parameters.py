@@ -1,0 +1,153 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read parameters from YAML, and write them as YAML for ROS and as Markdown for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ba_node.config import Config, ConfigError, Parameter, Value, declarations
+
+NODE_NAME = "ba_node"
+_ROS_KEY = "ros__parameters"
+# Parameters of every ROS node, which a file for the node may hold and which mean nothing here.
+_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides")
+
+
+def read_parameters(path: Path | str) -> dict[str, object]:
+    """Return the parameters in a YAML file by their full names.
+
+    Both forms are understood: that of ROS (``/**:``, ``ros__parameters:``) and plain names; both nested or dotted.
+
+    Raises:
+        ConfigError: the file cannot be read, is not YAML, or holds no mapping of parameters.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be opened: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected a mapping of parameters, got {type(content).__name__}")
+    kinds = {parameter.name: parameter.kind for parameter in declarations()}
+    found: dict[str, object] = {}
+    for name, value in _flatten(_of_this_node(path, content)):
+        if name.split(".")[0] not in _OF_EVERY_NODE:
+            found[name] = _as_float(value) if kinds.get(name) is float else value
+    return found
+
+
+def configure(path: Path | str | None, changes: Mapping[str, object]) -> Config:
+    """Return the defaults with what a file says (None for no file), and then with single changes.
+
+    Raises:
+        ConfigError: a parameter does not exist or has a wrong value; names the file if it stands there.
+    """
+    config = Config()
+    if path is not None:
+        try:
+            config = config.with_values(read_parameters(path))
+        except ConfigError as error:
+            text = str(error)
+            raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    return config.with_values(changes)
+
+
+def parameters_yaml(config: Config, *, comments: bool = True) -> str:
+    """Return all parameters as a file that ``--ros-args --params-file`` and :func:`read_parameters` take."""
+    lines = ["/**:", f"  {_ROS_KEY}:"]
+    values = config.values()
+    for group, parameters in groupby(declarations(), key=lambda p: p.name.split(".")[0]):
+        lines.append(f"    {group}:")
+        for parameter in parameters:
+            if comments:
+                lines += [f"      # {parameter.doc}", f"      # {_facts(parameter)}"]
+            lines.append(f"      {parameter.name.split('.')[1]}: {_scalar(values[parameter.name])}")
+    return "\n".join(lines) + "\n"
+
+
+def parameters_markdown() -> str:
+    """Return a table of all parameters."""
+    lines = ["| parameter | default | unit | allowed | change | meaning |", "|---|---|---|---|---|---|"]
+    for p in declarations():
+        change = "next solve" if p.live else "restart"
+        lines.append(f"| `{p.name}` | {_scalar(p.default)} | {p.unit} | {_allowed(p)} | {change} | {p.doc} |")
+    return "\n".join(lines) + "\n"
+
+
+def _of_this_node(path: Path | str, content: dict[Any, Any]) -> dict[Any, Any]:
+    """Return the parameters that ROS would give to this node, those for all nodes first."""
+    by_node = {str(key): value for key, value in content.items() if isinstance(value, dict) and _ROS_KEY in value}
+    if not by_node:
+        return content
+    ours = [name for name in by_node if name.rsplit("/", 1)[-1] in ("**", "*", NODE_NAME)]
+    if not ours:
+        raise ConfigError(f"{path}: parameters of {', '.join(by_node)} only: expected /** or {NODE_NAME}")
+    merged: dict[Any, Any] = {}
+    for name in sorted(ours, key=lambda name: name.endswith(NODE_NAME)):
+        merged.update(dict(_flatten(by_node[name][_ROS_KEY] or {})))
+    return merged
+
+
+def _flatten(tree: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def _as_float(value: object) -> object:
+    """Return the number that ROS sees in a text such as 1e-4, which YAML 1.1 takes for a string."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return value
+
+
+def _scalar(value: Value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        text = repr(value)
+        # YAML 1.1 wants a point in a number with an exponent.
+        return text.replace("e", ".0e") if "e" in text and "." not in text else text
+    if isinstance(value, str) and yaml.safe_load(value) != value:
+        return f"'{value}'"
+    return str(value)
+
+
+def _facts(parameter: Parameter) -> str:
+    facts = [f"[{parameter.unit}]"] if parameter.unit else []
+    facts.append(f"{_allowed(parameter)};")
+    facts.append(f"default {_scalar(parameter.default)};")
+    facts.append("takes effect at the next solve" if parameter.live else "takes effect at start only")
+    return " ".join(facts)
+
+
+def _allowed(parameter: Parameter) -> str:
+    if parameter.choices:
+        return ", ".join(parameter.choices)
+    if parameter.kind is bool:
+        return "true, false"
+    low, high = (_limit(parameter, bound) for bound in (parameter.minimum, parameter.maximum))
+    if low and high:
+        return f"{low} to {high}"
+    return f"at least {low}" if low else f"at most {high}" if high else "any"
+
+
+def _limit(parameter: Parameter, bound: float | None) -> str:
+    if bound is None:
+        return ""
+    return str(int(bound)) if parameter.kind is int else f"{bound:g}"

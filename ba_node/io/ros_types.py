@@ -1,0 +1,148 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Know the ROS 2 message types without a ROS installation: make, encode and decode messages.
+
+Types of Jazzy come with rosbags, those of ``ba_msgs`` from the definitions in this package. A bag brings its own
+definitions, and is decoded by them: fields that a later version adds do no harm, fields that are missing are named.
+"""
+
+from __future__ import annotations
+
+import functools
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+# Fields of the inputs that nothing here reads, so that a recording may have them otherwise.
+_UNREAD = frozenset({"covariance", "r", "p", "binning_x", "binning_y", "roi"})
+
+
+class TypeMismatchError(ValueError):
+    """A message definition that cannot be used for what it claims to be."""
+
+
+class RosbagsFactory:
+    """Make messages as dataclasses of rosbags (a :class:`~ba_node.conversion.MessageFactory`)."""
+
+    def make(self, type_name: str, **fields: Any) -> Any:
+        """Return a message with all its fields."""
+        return typestore().types[type_name](**fields)
+
+    def array(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the array itself."""
+        return np.ascontiguousarray(values)
+
+    def fixed(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the array itself."""
+        return np.ascontiguousarray(values)
+
+
+ROSBAGS_FACTORY = RosbagsFactory()
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Return the message types of Jazzy and ``ba_msgs``."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    definitions = resources.files(__package__) / "ba_msgs"
+    for file in sorted(definitions.iterdir(), key=lambda entry: entry.name):
+        if file.name.endswith(".msg"):
+            name = f"ba_msgs/msg/{file.name.removesuffix('.msg')}"
+            store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))
+    return store
+
+
+def schema_text(type_name: str) -> str:
+    """Return the definition of a type and of all types in it, in the form ``ros2msg``."""
+    text, _ = typestore().generate_msgdef(type_name, ros_version=2)
+    return text
+
+
+def type_hash(type_name: str) -> str:
+    """Return the hash of a type as REP-2016 defines it (``RIHS01_...``)."""
+    return typestore().hash_rihs01(type_name)
+
+
+def encode(type_name: str, message: Any) -> bytes:
+    """Return a message as little-endian CDR."""
+    return bytes(typestore().serialize_cdr(message, type_name, little_endian=True))
+
+
+def decode(type_name: str, data: bytes) -> Any:
+    """Return the message in CDR bytes, by our own definition of the type."""
+    return typestore().deserialize_cdr(data, type_name)
+
+
+def full_name(type_name: str) -> str:
+    """Return ``package/msg/Type`` of ``package/Type``, as some recorders write it."""
+    package, _, rest = type_name.partition("/")
+    return type_name if "/" in rest or not rest else f"{package}/msg/{rest}"
+
+
+def decoder(type_name: str, text: str) -> Callable[[bytes], Any]:
+    """Return a function that decodes messages of a definition that came with a recording.
+
+    Raises:
+        TypeMismatchError: the definition cannot be read.
+    """
+    return functools.partial(_decode, _store_of(type_name, text), type_name)
+
+
+def check_definition(type_name: str, text: str) -> None:
+    """Raise TypeMismatchError if a recording's definition of an input lacks a field or has it of another type."""
+    wrong = list(_differences(type_name, _store_of(type_name, text)))
+    if wrong:
+        raise TypeMismatchError(f"{'; '.join(wrong)}: record it with the current message definitions")
+
+
+@functools.lru_cache(maxsize=64)
+def _store_of(type_name: str, text: str) -> Typestore:
+    store = Typestore()
+    try:
+        store.register(get_types_from_msg(text, type_name))
+        store.get_msgdef(type_name)
+    except Exception as error:  # the parser and the code generator raise whatever a strange text leads them to
+        raise TypeMismatchError(f"the definition of {type_name!r} cannot be read: {error!r}") from error
+    return store
+
+
+def _decode(store: Typestore, type_name: str, data: bytes) -> Any:
+    return store.deserialize_cdr(data, type_name)
+
+
+def _differences(type_name: str, theirs: Typestore) -> Iterator[str]:
+    """Yield what a definition has otherwise than ours, nested types included."""
+    if type_name not in theirs.fielddefs:
+        yield f"{type_name} is not defined"
+        return
+    found = dict(theirs.fielddefs[type_name][1])
+    for name, expected in typestore().fielddefs[type_name][1]:
+        if name in _UNREAD:
+            continue
+        if name not in found:
+            yield f"{type_name} has no field {name} (expected {_show(expected)})"
+        elif found[name] != expected:
+            yield f"{type_name}: field {name} is {_show(found[name])}, expected {_show(expected)}"
+        else:
+            inner = expected[1][0] if expected[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else expected
+            if inner[0] == Nodetype.NAME:
+                yield from _differences(inner[1], theirs)
+
+
+def _show(description: Any) -> str:
+    kind, value = description
+    if kind == Nodetype.BASE:
+        return str(value[0])
+    if kind == Nodetype.NAME:
+        return str(value)
+    inner, count = value
+    return f"{_show(inner)}[{count or ''}]"

@@ -1,0 +1,137 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read and write trajectories in the format of the TUM RGB-D benchmark: ``stamp x y z qx qy qz qw`` a line.
+
+Stamps are seconds with nine decimals, made from and read to integer nanoseconds without a float in between; the
+other numbers are written so that they read back as the same float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation, localcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.io.files import whole_file
+
+if TYPE_CHECKING:
+    from ba_node.estimate import Poses
+
+FloatArray = NDArray[np.float64]
+
+_NS = 1_000_000_000
+_COLUMNS = "stamp x y z qx qy qz qw"
+
+
+class TrajectoryError(ValueError):
+    """A trajectory file that cannot be read."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Stamped poses, in the order of the file.
+
+    Attributes:
+        stamp_ns: (n,) int64, ns.
+        position: (n, 3) body in the fixed frame, m.
+        orientation: (n, 4) fixed frame from body, quaternion x y z w as the file has it.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    position: FloatArray
+    orientation: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.stamp_ns)
+
+
+def write_tum(path: Path | str, poses: Poses | Trajectory) -> None:
+    """Write stamped poses; keyframe ids have no place in the format."""
+    rows = np.hstack([poses.position, poses.orientation]).tolist()
+    lines = [
+        f"{format_stamp(stamp)} {' '.join(map(repr, row))}\n"
+        for stamp, row in zip(poses.stamp_ns.tolist(), rows, strict=True)
+    ]
+    with whole_file(path) as stream:
+        stream.write("".join([f"# {_COLUMNS}\n", *lines]).encode())
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """Read stamped poses; lines that are empty or begin with # are passed over.
+
+    Raises:
+        TrajectoryError: the file cannot be opened or holds no pose; a line has not eight finite numbers, a stamp beyond
+            int64 nanoseconds, or a quaternion of zeros. Names the line.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path}: not a text file: {error}") from error
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamps.append(parse_stamp(words[0]))
+            rows.append(_parse_pose(words))
+        except ValueError as error:
+            raise TrajectoryError(f"{path}:{number}: {error}") from None
+    if not rows:
+        raise TrajectoryError(f"{path}: no pose in it: expected lines with {_COLUMNS}")
+    values = np.array(rows)
+    return Trajectory(np.array(stamps, dtype=np.int64), values[:, :3], values[:, 3:])
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Return seconds with nine decimals."""
+    seconds, rest = divmod(abs(stamp_ns), _NS)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{rest:09d}"
+
+
+def parse_stamp(text: str) -> int:
+    """Return seconds in decimal notation as integer ns, rounded if there are more than nine decimals.
+
+    Raises:
+        ValueError: not a finite number, or beyond int64.
+    """
+    with localcontext() as context:
+        context.prec = 60
+        try:
+            stamp = Decimal(text)
+            if not stamp.is_finite() or abs(stamp) > 2**63:
+                raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
+            stamp_ns = int((stamp * _NS).to_integral_value(rounding=ROUND_HALF_EVEN))
+        except InvalidOperation:
+            raise ValueError(f"stamp {text!r} is not a number") from None
+    if not -(2**63) <= stamp_ns < 2**63:
+        raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
+    return stamp_ns
+
+
+def _parse_pose(words: list[str]) -> list[float]:
+    if len(words) != 8:
+        raise ValueError(f"{len(words)} values: expected 8 ({_COLUMNS})")
+    values = [_parse_number(word, name) for word, name in zip(words[1:], _COLUMNS.split()[1:], strict=True)]
+    if not any(values[3:]):
+        raise ValueError("the quaternion is zero: expected a unit quaternion")
+    return values
+
+
+def _parse_number(word: str, name: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        raise ValueError(f"{name} = {word!r} is not a number") from None
+    if not np.isfinite(value):
+        raise ValueError(f"{name} = {word}: expected a finite number")
+    return value

@@ -1,0 +1,67 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Say what a library of messages must offer, and make the parts that many messages share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_NS = 1_000_000_000
+
+
+class ConversionError(ValueError):
+    """A message or a value that has no counterpart on the other side."""
+
+
+class MessageFactory(Protocol):
+    """Make messages of one library (rclpy or rosbags)."""
+
+    def make(self, type_name: str, **fields: Any) -> Any:
+        """Return a message of a type such as ``std_msgs/msg/Header`` with all its fields."""
+        ...
+
+    def array(self, values: NDArray[Any]) -> Any:
+        """Return a flat array in the form that the library takes for a sequence of numbers."""
+        ...
+
+    def fixed(self, values: NDArray[Any]) -> Any:
+        """Return a flat array in the form that the library takes for an array of fixed size."""
+        ...
+
+
+def stamp_ns_from_message(stamp: Any) -> int:
+    """Return a ``builtin_interfaces/Time`` in ns."""
+    return int(stamp.sec) * _NS + int(stamp.nanosec)
+
+
+def header_message(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any:
+    """Return a ``std_msgs/Header``; raise ConversionError if the stamp exceeds it."""
+    # Floor division keeps nanosec in [0, 1e9) for times before the epoch too.
+    sec, nanosec = divmod(int(stamp_ns), _NS)
+    if not -(2**31) <= sec < 2**31:
+        raise ConversionError(f"stamp {stamp_ns} ns does not fit into a message: its seconds ({sec}) exceed 32 bits")
+    stamp = factory.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return factory.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def pose_message(factory: MessageFactory, position: NDArray[np.float64], orientation: NDArray[np.float64]) -> Any:
+    """Return a ``geometry_msgs/Pose`` of (3,) m and (4,) x y z w."""
+    x, y, z = position.tolist()
+    qx, qy, qz, qw = orientation.tolist()
+    return factory.make(
+        "geometry_msgs/msg/Pose",
+        position=factory.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=factory.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    )
+
+
+def float32(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return values in single precision."""
+    # A value beyond the range becomes infinite, which the receiver rejects by name; it is no fault of this code.
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

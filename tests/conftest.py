@@ -1,0 +1,134 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures that several folders of tests use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Return the folder of data sets that are not part of the repository, or skip the test."""
+    folder = _ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("needs the data sets in ../shared/data, which are not part of the repository")
+    return folder
+
+
+@pytest.fixture
+def keyframe() -> Keyframe:
+    return Keyframe(
+        session_id=3,
+        keyframe_id=2**64 - 1,
+        stamp_ns=1_700_000_000_123_456_789,
+        frame_id="map",
+        position=np.array([1.5, -2.25, 1e-300]),
+        orientation=np.array([0.1, -0.2, 0.3, 0.9273618495495704]),
+    )
+
+
+@pytest.fixture
+def tracks() -> FeatureTracks:
+    return FeatureTracks(
+        session_id=3,
+        keyframe_id=2**64 - 1,
+        camera_index=65535,
+        track_id=np.array([0, 2**53 + 1, 2**64 - 1], dtype=np.uint64),
+        uv=np.array([[0.5, -1.25], [640.0, 479.75], [np.nan, 3.0]]),
+        sigma_px=np.array([0.5, 1.0, 2.0]),
+        depth_m=np.array([np.nan, 4.5, np.inf]),
+    )
+
+
+@pytest.fixture
+def guesses() -> LandmarkGuesses:
+    return LandmarkGuesses(3, np.array([7, 2**63], dtype=np.uint64), np.array([[1.0, 2.0, 3.0], [0.1, -0.2, 1e30]]))
+
+
+@pytest.fixture
+def rig() -> CameraRig:
+    return CameraRig(
+        frame_id="base_link",
+        names=("left_optical", "right_optical"),
+        models=("plumb_bob", "equidistant"),
+        intrinsics=np.array([[700.1, 701.2, 320.3, 240.4], [500.5, 501.6, 310.7, 230.8]]),
+        distortion=(np.array([0.1, -0.2, 0.001, 0.002, 0.3]), np.array([0.01, 0.02, 0.03, 0.04])),
+        image_size=np.array([[640, 480], [0, 0]]),
+        position=np.array([[0.0, 0.0, 0.0], [0.12, -0.01, 0.02]]),
+        orientation=np.array([[0.5, -0.5, 0.5, -0.5], [0.0, 0.0, 0.0, 1.0]]),
+    )
+
+
+def make_poses(n: int, seed: int) -> Poses:
+    rng = np.random.default_rng(seed)
+    orientation = rng.normal(size=(n, 4))
+    orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
+    return Poses(
+        keyframe_id=rng.integers(0, 2**64, size=n, dtype=np.uint64),
+        stamp_ns=1_700_000_000_000_000_001 + 100_000_000 * np.arange(n, dtype=np.int64),
+        position=rng.normal(size=(n, 3)),
+        orientation=orientation,
+    )
+
+
+def make_cloud(n: int, seed: int) -> Cloud:
+    rng = np.random.default_rng(seed)
+    return Cloud(
+        track_id=rng.integers(0, 2**64, size=n, dtype=np.uint64),
+        position=rng.normal(scale=10.0, size=(n, 3)),
+        rms_px=rng.random(n).astype(np.float32),
+        views=rng.integers(2, 20, size=n, dtype=np.int32),
+    )
+
+
+@pytest.fixture
+def report() -> SolveReport:
+    """Return a report with a value of its own in every field, so that two that were swapped are told apart."""
+    return SolveReport(
+        session_id=3,
+        solve_count=2**63 + 1,
+        newest_keyframe_id=2**64 - 1,
+        status=Status.MAX_ITERATIONS,
+        reason="reached 12 iterations",
+        method="local_dinm",
+        iterations=12,
+        accepted_iterations=9,
+        linear_iterations=345,
+        objective_before=1234.5,
+        objective_after=678.9,
+        gradient_norm=1e-3,
+        rms_px_before=1.02,
+        rms_px_after=0.35,
+        keyframes=20,
+        fixed_keyframes=4,
+        landmarks=1500,
+        observations=15_000,
+        outliers=17,
+        rejected={"unknown_camera": 2, "malformed": 5},
+        solve_time_s=0.025,
+        queue_wait_s=0.75,
+        dropped=6,
+        coalesced=8,
+    )
+
+
+@pytest.fixture
+def estimate(report: SolveReport) -> Estimate:
+    trajectory = make_poses(12, seed=1)
+    return Estimate(
+        stamp_ns=int(trajectory.stamp_ns[-1]),
+        frame_id="map",
+        refined=trajectory[-5:],
+        trajectory=trajectory,
+        cloud=make_cloud(100, seed=2),
+        report=report,
+    )

@@ -1,0 +1,54 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ba_node.estimate import Estimate
+from ba_node.io.ply import PlyError, read_ply, write_ply
+
+
+def test_layout_byte_by_byte(tmp_path: Path, estimate: Estimate) -> None:
+    path = tmp_path / "c.ply"
+    write_ply(path, estimate.cloud, "map")
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    assert head.decode().splitlines() == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment frame map",
+        "element vertex 100",
+        "property float x",
+        "property float y",
+        "property float z",
+        "property float rms_px",
+        "property uint views",
+    ]
+    assert len(body) == 100 * 20
+    x, y, z, rms, views = struct.unpack_from("<ffffI", body, 20 * 7)
+    assert [x, y, z] == estimate.cloud.position[7].astype(np.float32).tolist()
+    assert (rms, views) == (float(estimate.cloud.rms_px[7]), int(estimate.cloud.views[7]))
+
+
+@pytest.mark.parametrize("frame", ["map", "", "two words", "line\nend_header\nbreak", "caf\u00e9 \\ \u5730\u56fe"])
+def test_any_frame_survives(tmp_path: Path, estimate: Estimate, frame: str) -> None:
+    path = tmp_path / "c.ply"
+    write_ply(path, estimate.cloud, frame)
+    points, found = read_ply(path)
+    assert found == frame
+    np.testing.assert_array_equal(points["views"], estimate.cloud.views)
+    np.testing.assert_array_equal(points["z"], estimate.cloud.position[:, 2].astype(np.float32))
+
+
+def test_what_is_no_cloud_of_ours_is_an_error(tmp_path: Path, estimate: Estimate) -> None:
+    path = tmp_path / "c.ply"
+    write_ply(path, estimate.cloud, "map")
+    data = path.read_bytes()
+    cases = [b"", b"ply\n", data[:-1], data[:100], data.replace(b"property uint", b"property int")]
+    for case in cases:
+        path.write_bytes(case)
+        with pytest.raises(PlyError, match=str(path)):
+            read_ply(path)

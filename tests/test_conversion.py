@@ -1,0 +1,300 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import array
+import dataclasses
+import time
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ba_node.config import OutputConfig
+from ba_node.conversion import (
+    INPUT_TYPES,
+    OUTPUT_TYPES,
+    ConversionError,
+    guesses_message,
+    keyframe_message,
+    measurement_from_message,
+    output_messages,
+    rig_message,
+    stamp_ns_from_message,
+    tracks_message,
+)
+from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.output_messages import POINT_DTYPE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+_CODES = {np.dtype(c): c for c in "BbHhIiQqfd"}
+
+
+class PlainFactory:
+    """Messages as bare attributes, sequences as rclpy has them: array.array for sequences, ndarray for fixed ones."""
+
+    def make(self, type_name: str, **fields: Any) -> Any:
+        return SimpleNamespace(type_name=type_name, **fields)
+
+    def array(self, values: NDArray[Any]) -> Any:
+        return array.array(_CODES[values.dtype], values.tobytes())
+
+    def fixed(self, values: NDArray[Any]) -> Any:
+        return values
+
+
+FACTORY = PlainFactory()
+
+
+def assert_same(a: object, b: object) -> None:
+    """Compare two dataclasses of arrays, NaN equal to NaN."""
+    assert type(a) is type(b)
+    for f in dataclasses.fields(a):  # type: ignore[arg-type]
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, tuple) and x and isinstance(x[0], np.ndarray):
+            assert len(x) == len(y), f.name
+            for left, right in zip(x, y, strict=True):
+                np.testing.assert_array_equal(left, right, err_msg=f.name)
+        elif isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype, f"{f.name}: {x.dtype} against {y.dtype}"
+            np.testing.assert_array_equal(x, y, err_msg=f.name)
+        else:
+            assert x == y, f.name
+
+
+def test_measurements_survive_the_way_through_messages(
+    keyframe: Keyframe, tracks: FeatureTracks, guesses: LandmarkGuesses, rig: CameraRig
+) -> None:
+    messages = {
+        "keyframes": (keyframe, keyframe_message(FACTORY, keyframe)),
+        "feature_tracks": (tracks, tracks_message(FACTORY, tracks, 5, "left_optical")),
+        "landmark_guesses": (guesses, guesses_message(FACTORY, guesses, 5, "map")),
+        "camera_rig": (rig, rig_message(FACTORY, rig, 5)),
+    }
+    for topic, (measurement, message) in messages.items():
+        assert message.type_name == INPUT_TYPES[topic]
+        assert_same(measurement, measurement_from_message(INPUT_TYPES[topic], message))
+    assert messages["feature_tracks"][1].header.frame_id == "left_optical"
+    assert not messages["keyframes"][1].pose.covariance.any()
+
+
+def test_lone_camera_is_a_rig_of_one_at_the_origin(rig: CameraRig) -> None:
+    info = rig_message(FACTORY, rig, 0).cameras[0]
+    one = measurement_from_message("sensor_msgs/msg/CameraInfo", info)
+    assert isinstance(one, CameraRig)
+    assert (len(one), one.frame_id, one.names, one.models) == (1, "left_optical", ("left_optical",), ("plumb_bob",))
+    np.testing.assert_array_equal(one.intrinsics, rig.intrinsics[:1])
+    np.testing.assert_array_equal(one.position, np.zeros((1, 3)))
+    np.testing.assert_array_equal(one.orientation, [[0.0, 0.0, 0.0, 1.0]])
+    np.testing.assert_array_equal(info.p, [700.1, 0, 320.3, 0, 0, 701.2, 240.4, 0, 0, 0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("field", "length", "words"),
+    [
+        ("u", 10, "u has 10 entries, track_id 12"),
+        ("v", 13, "v has 13 entries, track_id 12"),
+        ("v", 0, "v has 0 entries, track_id 12"),
+        ("sigma_px", 1, "sigma_px has 1 entries, track_id 12"),
+        ("depth_m", 11, "depth_m has 11 entries, track_id 12"),
+        ("track_id", 11, "u has 12 entries, track_id 11; v has 12 entries, track_id 11"),
+    ],
+)
+def test_tracks_of_unequal_lengths_say_so(field: str, length: int, words: str) -> None:
+    good = FeatureTracks(1, 2, 0, np.arange(12, dtype=np.uint64), np.zeros((12, 2)))
+    message = tracks_message(FACTORY, good, 0, "c")
+    setattr(message, field, array.array("Q" if field == "track_id" else "f", [0] * length))
+    tracks = measurement_from_message(INPUT_TYPES["feature_tracks"], message)
+    assert isinstance(tracks, FeatureTracks)
+    assert tracks.malformed == words
+    assert tracks.uv.shape == (0, 2)
+    assert (len(tracks.track_id), len(tracks.sigma_px), len(tracks.depth_m)) == (0, 0, 0)
+    assert (tracks.session_id, tracks.keyframe_id) == (1, 2)
+
+
+def test_guesses_of_unequal_lengths_say_so(guesses: LandmarkGuesses) -> None:
+    message = guesses_message(FACTORY, guesses, 0, "map")
+    message.position = array.array("d", [0.0] * 5)
+    found = measurement_from_message(INPUT_TYPES["landmark_guesses"], message)
+    assert isinstance(found, LandmarkGuesses)
+    assert found.malformed.startswith("position has 5 entries, track_id 2")
+    assert found.position.shape == (0, 3)
+    assert len(found.track_id) == 0
+
+
+def test_a_rig_that_cannot_be_read_is_an_error_with_the_numbers(rig: CameraRig) -> None:
+    message = rig_message(FACTORY, rig, 0)
+    message.body_from_camera.pop()
+    with pytest.raises(ConversionError, match="cameras has 2 entries, body_from_camera 1"):
+        measurement_from_message(INPUT_TYPES["camera_rig"], message)
+    message.cameras, message.body_from_camera = [], []
+    with pytest.raises(ConversionError, match="no cameras"):
+        measurement_from_message(INPUT_TYPES["camera_rig"], message)
+    message = rig_message(FACTORY, rig, 0)
+    message.cameras[1].k[1] = 0.5
+    with pytest.raises(ConversionError, match=r"camera 1: skew k\[1\] = 0.5"):
+        measurement_from_message(INPUT_TYPES["camera_rig"], message)
+
+
+def test_a_type_that_is_no_input_is_named() -> None:
+    with pytest.raises(ConversionError, match="'std_msgs/msg/String' is not an input"):
+        measurement_from_message("std_msgs/msg/String", SimpleNamespace())
+
+
+@given(arrays(np.uint64, st.integers(0, 5), elements=st.integers(0, 2**64 - 1)))
+def test_ids_are_exact(ids: NDArray[np.uint64]) -> None:
+    tracks = FeatureTracks(0, 0, 0, ids, np.zeros((len(ids), 2)))
+    back = measurement_from_message(INPUT_TYPES["feature_tracks"], tracks_message(FACTORY, tracks, 0, ""))
+    assert isinstance(back, FeatureTracks)
+    assert back.track_id.tolist() == ids.tolist()
+
+
+@given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
+def test_stamps_are_exact_and_nanoseconds_never_negative(stamp_ns: int) -> None:
+    keyframe = Keyframe(0, 0, stamp_ns, "map", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    stamp = keyframe_message(FACTORY, keyframe).header.stamp
+    assert 0 <= stamp.nanosec < 10**9
+    assert stamp_ns_from_message(stamp) == stamp_ns
+
+
+def test_a_stamp_beyond_the_message_is_an_error(keyframe: Keyframe) -> None:
+    with pytest.raises(ConversionError, match="2147483648"):
+        keyframe_message(FACTORY, dataclasses.replace(keyframe, stamp_ns=2**31 * 10**9))
+
+
+def test_nothing_kept_shares_memory_with_the_message(tracks: FeatureTracks) -> None:
+    message = tracks_message(FACTORY, tracks, 0, "c")
+    kept = measurement_from_message(INPUT_TYPES["feature_tracks"], message)
+    assert isinstance(kept, FeatureTracks)
+    message.track_id[0] = 99
+    assert kept.track_id[0] == 0
+
+
+def test_output_topics_types_and_stamps(estimate: Estimate) -> None:
+    out = output_messages(FACTORY, estimate, OutputConfig())
+    assert [topic for topic, _, _ in out] == ["refined_keyframes", *["pose"] * 5, "path", "points", "report"]
+    assert all(type_name == OUTPUT_TYPES[topic] == message.type_name for topic, type_name, message in out)
+    assert {message.header.frame_id for _, _, message in out} == {"map"}
+    stamps = [stamp_ns_from_message(message.header.stamp) for _, _, message in out]
+    newest = estimate.stamp_ns
+    assert stamps == [newest, *estimate.refined.stamp_ns.tolist(), newest, newest, newest]
+
+
+def test_output_poses_are_those_of_the_estimate(estimate: Estimate) -> None:
+    out = output_messages(FACTORY, estimate, OutputConfig())
+    refined = out[0][2]
+    assert refined.session_id == 3
+    assert list(refined.keyframe_id) == estimate.refined.keyframe_id.tolist()
+    assert list(refined.stamp_ns) == estimate.refined.stamp_ns.tolist()
+    assert list(refined.position) == estimate.refined.position.ravel().tolist()
+    assert list(refined.orientation) == estimate.refined.orientation.ravel().tolist()
+    singles = [message.pose for topic, _, message in out if topic == "pose"]
+    np.testing.assert_array_equal(
+        [[p.position.x, p.position.y, p.position.z] for p in singles], estimate.refined.position
+    )
+    q = [[p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w] for p in singles]
+    np.testing.assert_array_equal(q, estimate.refined.orientation)
+
+
+def test_path_keeps_the_newest(estimate: Estimate) -> None:
+    out = output_messages(FACTORY, estimate, OutputConfig(path_max_poses=4), wanted={"path"})
+    assert [topic for topic, _, _ in out] == ["path"]
+    poses = out[0][2].poses
+    assert [stamp_ns_from_message(p.header.stamp) for p in poses] == estimate.trajectory.stamp_ns[-4:].tolist()
+    assert [p.header.frame_id for p in poses] == ["map"] * 4
+
+
+def test_points_are_laid_out_as_their_fields_say(estimate: Estimate) -> None:
+    ((_, _, cloud),) = output_messages(FACTORY, estimate, OutputConfig(), wanted=["points"])
+    assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
+        ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), ("rms_px", 12, 7, 1), ("views", 16, 6, 1),
+    ]  # fmt: skip
+    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (1, 100, 20, 2000)
+    assert (cloud.is_bigendian, cloud.is_dense) == (False, True)
+    assert isinstance(cloud.data, array.array)
+    records = np.frombuffer(cloud.data, dtype=POINT_DTYPE)
+    for column, name in enumerate("xyz"):
+        np.testing.assert_array_equal(records[name], estimate.cloud.position[:, column].astype(np.float32))
+    np.testing.assert_array_equal(records["rms_px"], estimate.cloud.rms_px)
+    np.testing.assert_array_equal(records["views"], estimate.cloud.views)
+
+
+@pytest.mark.parametrize("limit", [1, 7, 99, 100, 101])
+def test_points_are_thinned_evenly(estimate: Estimate, limit: int) -> None:
+    ((_, _, cloud),) = output_messages(FACTORY, estimate, OutputConfig(points_max=limit), wanted={"points"})
+    kept = np.frombuffer(cloud.data, dtype=POINT_DTYPE)["x"]
+    rows = np.flatnonzero(np.isin(estimate.cloud.position[:, 0].astype(np.float32), kept))
+    assert cloud.width == len(rows) == min(limit, 100)
+    if limit > 1:
+        assert np.ptp(np.diff(rows)) <= 1, f"gaps between kept points differ by more than one: {np.diff(rows)}"
+
+
+def test_points_beyond_single_precision_are_not_called_dense(estimate: Estimate) -> None:
+    far = dataclasses.replace(estimate.cloud, position=np.full((100, 3), 1e300))
+    ((_, _, cloud),) = output_messages(
+        FACTORY, dataclasses.replace(estimate, cloud=far), OutputConfig(), wanted={"points"}
+    )
+    assert cloud.is_dense is False
+
+
+def test_report_carries_every_field(estimate: Estimate, report: SolveReport) -> None:
+    ((_, _, message),) = output_messages(FACTORY, estimate, OutputConfig(), wanted={"report"})
+    names = {f.name for f in dataclasses.fields(SolveReport)} - {"rejected"}
+    values = {name: getattr(report, name) for name in names}
+    assert len({(type(v), v) for v in values.values()}) >= len(values) - 2, "values too alike to tell fields apart"
+    for name in names:
+        assert getattr(message, name) == values[name], name
+    assert type(message.status) is int
+    assert message.rejected_reason == ["malformed", "unknown_camera"]
+    assert list(message.rejected_count) == [5, 2]
+    assert vars(message).keys() == names | {"type_name", "header", "rejected_reason", "rejected_count"}
+
+
+@pytest.mark.parametrize("status", [Status.FAILED, Status.SKIPPED])
+def test_a_failed_solve_gives_the_report_only(estimate: Estimate, status: Status) -> None:
+    failed = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, status=status))
+    out = output_messages(FACTORY, failed, OutputConfig())
+    assert [topic for topic, _, _ in out] == ["report"]
+    assert out[0][2].status == status
+
+
+def test_an_empty_map_makes_empty_messages(estimate: Estimate) -> None:
+    none = Poses(np.empty(0, np.uint64), np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 4)))
+    cloud = Cloud(np.empty(0, np.uint64), np.empty((0, 3)), np.empty(0, np.float32), np.empty(0, np.int32))
+    empty = dataclasses.replace(estimate, refined=none, trajectory=none, cloud=cloud)
+    out = {topic: message for topic, _, message in output_messages(FACTORY, empty, OutputConfig())}
+    assert (len(out["refined_keyframes"].keyframe_id), out["path"].poses) == (0, [])
+    assert (out["points"].width, len(out["points"].data), out["points"].is_dense) == (0, 0, True)
+    assert "pose" not in out
+
+
+def best_cpu_time_s(action: Callable[[], object]) -> float:
+    times = []
+    for _ in range(20):
+        start = time.thread_time()
+        action()
+        times.append(time.thread_time() - start)
+    return min(times)
+
+
+def test_conversion_does_not_loop_over_elements(estimate: Estimate) -> None:
+    n = 1000
+    tracks = FeatureTracks(0, 0, 0, np.arange(n, dtype=np.uint64), np.zeros((n, 2)), np.ones(n), np.ones(n))
+    message = tracks_message(FACTORY, tracks, 0, "c")
+    taken = best_cpu_time_s(lambda: measurement_from_message(INPUT_TYPES["feature_tracks"], message))
+    assert taken < 1e-3, f"1000 tracks took {1e3 * taken:.3f} ms"
+
+    m = 200_000
+    cloud = Cloud(np.arange(m, dtype=np.uint64), np.zeros((m, 3)), np.zeros(m, np.float32), np.zeros(m, np.int32))
+    large = dataclasses.replace(estimate, cloud=cloud)
+    taken = best_cpu_time_s(lambda: output_messages(FACTORY, large, OutputConfig(), wanted={"points"}))
+    assert taken < 1e-2, f"200 000 points took {1e3 * taken:.3f} ms"
