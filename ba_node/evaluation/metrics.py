@@ -1,0 +1,152 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Compare a trajectory with a reference: which poses belong together, and how far apart they are."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core.geometry import matrix_from_quaternion, so3_log
+from ba_node.evaluation.alignment import Alignment, EvaluationError, Kind, align
+
+if TYPE_CHECKING:
+    from ba_node.estimate import Poses
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Summary of non-negative errors, all in their unit. ``std`` is that of the sample itself (divided by n)."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+    std: float
+    count: int
+
+    @classmethod
+    def of(cls, errors: FloatArray) -> Statistics:
+        """Summarise errors: (n,) with n > 0."""
+        return cls(
+            rmse=float(np.sqrt(np.mean(errors**2))),
+            mean=float(np.mean(errors)),
+            median=float(np.median(errors)),
+            max=float(np.max(errors)),
+            std=float(np.std(errors)),
+            count=len(errors),
+        )
+
+    def as_dict(self) -> dict[str, float | int]:
+        """Return the fields by name."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class TrajectoryError:
+    """Absolute error of a trajectory after alignment (Sturm et al., IROS 2012).
+
+    Attributes:
+        alignment: from the estimate to the reference.
+        stamp_ns: (n,) of the estimate's poses that have a partner, by time.
+        translation_m: (n,) distance to the partner.
+        rotation_deg: (n,) angle to the partner.
+        translation: summary, m.
+        rotation: summary, deg.
+    """
+
+    alignment: Alignment
+    stamp_ns: NDArray[np.int64]
+    translation_m: FloatArray
+    rotation_deg: FloatArray
+    translation: Statistics
+    rotation: Statistics
+
+
+def associate(
+    estimate_ns: NDArray[np.int64], reference_ns: NDArray[np.int64], max_difference_s: float = 0.01
+) -> tuple[IndexArray, IndexArray]:
+    """Pair stamps that are nearest to each other.
+
+    Args:
+        estimate_ns: (n,) in any order.
+        reference_ns: (m,) in any order.
+        max_difference_s: pairs farther apart are no pairs.
+
+    Returns:
+        Rows of the estimate and of the reference, by time; each row is in at most one pair, the closest; of
+        equal reference stamps the first counts.
+    """
+    none = np.empty(0, dtype=np.intp)
+    if len(estimate_ns) == 0 or len(reference_ns) == 0:
+        return none, none
+    stamps, order = np.unique(reference_ns, return_index=True)
+    after = np.searchsorted(stamps, estimate_ns)
+    low, high = np.maximum(after - 1, 0), np.minimum(after, len(stamps) - 1)
+    nearer = np.abs(estimate_ns - stamps[low]) <= np.abs(stamps[high] - estimate_ns)
+    partner = np.where(nearer, low, high)
+    gap = np.abs(estimate_ns - stamps[partner])
+    rows = np.flatnonzero(gap <= round(max_difference_s * 1e9))
+    # Of those that want the same partner the closest one gets it.
+    rows = rows[np.lexsort((gap[rows], partner[rows]))]
+    _, first = np.unique(partner[rows], return_index=True)
+    rows = rows[first]
+    return rows, order[partner[rows]]
+
+
+def absolute_error(
+    estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01
+) -> TrajectoryError:
+    """Return how far an estimated trajectory is from the reference.
+
+    Args:
+        estimate: poses.
+        reference: true poses, paired with the estimate's by stamp.
+        kind: alignment of the estimate, by the positions of the pairs.
+        max_difference_s: largest difference of the stamps of a pair.
+
+    Raises:
+        EvaluationError: no pose has a partner, or the pairs cannot be aligned.
+    """
+    rows, partners = associate(estimate.stamp_ns, reference.stamp_ns, max_difference_s)
+    if len(rows) == 0:
+        raise EvaluationError(
+            f"0 of {len(estimate)} poses have a stamp within {max_difference_s:g} s of one of the {len(reference)}"
+            f" reference poses: {_span('estimate', estimate)}, {_span('reference', reference)};"
+            " compare trajectories of one recording, or raise the allowed difference"
+        )
+    ours, theirs = estimate[rows], reference[partners]
+    try:
+        alignment = align(ours.position, theirs.position, kind)
+    except EvaluationError as error:
+        raise EvaluationError(f"{len(rows)} of {len(estimate)} poses have a partner; {error}") from None
+    translation = np.linalg.norm(alignment.apply(ours.position) - theirs.position, axis=1)
+    turned = alignment.rotation @ matrix_from_quaternion(ours.orientation)
+    difference = np.swapaxes(matrix_from_quaternion(theirs.orientation), -1, -2) @ turned
+    rotation = np.degrees(np.linalg.norm(so3_log(difference), axis=1))
+    return TrajectoryError(
+        alignment=alignment,
+        stamp_ns=ours.stamp_ns,
+        translation_m=translation,
+        rotation_deg=rotation,
+        translation=Statistics.of(translation),
+        rotation=Statistics.of(rotation),
+    )
+
+
+def _span(name: str, poses: Poses) -> str:
+    if len(poses) == 0:
+        return f"the {name} is empty"
+    return f"the {name} spans {_seconds(poses.stamp_ns.min())} to {_seconds(poses.stamp_ns.max())} s"
+
+
+def _seconds(stamp_ns: np.int64) -> str:
+    seconds, rest = divmod(int(stamp_ns), 1_000_000_000)
+    return f"{seconds}.{rest:09d}"

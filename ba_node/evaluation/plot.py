@@ -1,0 +1,119 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Draw a trajectory before and after, the truth, and the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ba_node.estimate import Poses
+    from ba_node.evaluation.alignment import Kind
+
+FloatArray = NDArray[np.float64]
+
+# Okabe-Ito colours, told apart by colour-blind readers.
+_TRUTH, _BEFORE, _AFTER, _CLOUD = "#000000", "#D55E00", "#0072B2", "#8C8C8C"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is drawn.
+
+    Attributes:
+        before: trajectory of the front-end; None to show that after adjustment alone.
+        after: trajectory after adjustment.
+        truth: reference.
+        cloud: (n, 3) points of the map, in the frame of ``after``, m; may be empty.
+        kind: alignment of both trajectories to the truth.
+    """
+
+    before: Poses | None
+    after: Poses
+    truth: Poses
+    cloud: FloatArray
+    kind: Kind = "se3"
+
+
+def draw(path: Path, comparison: Comparison) -> None:
+    """Write a PNG: the site from above on the left, the error over time on the right.
+
+    The same input gives the same bytes with the same version of matplotlib.
+
+    Raises:
+        EvaluationError: a trajectory cannot be compared with the truth.
+    """
+    # Slow to import, and needed here only; the canvas is Agg, so no display is asked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    before = None
+    if comparison.before is not None:
+        before = absolute_error(comparison.before, comparison.truth, comparison.kind)
+    after = absolute_error(comparison.after, comparison.truth, comparison.kind)
+    figure = Figure(figsize=(12.0, 5.4), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    above, over_time = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
+    _draw_site(above, comparison, before, after)
+    _draw_errors(over_time, before, after)
+    figure.legend(
+        *above.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, markerscale=1.5
+    )
+    change = f"{after.translation.rmse:.3f} m"
+    if before is not None:
+        change = f"{before.translation.rmse:.3f} m before, {change} after adjustment"
+    figure.suptitle(f"Trajectory error (RMSE, {comparison.kind} alignment): {change}", fontsize=13)
+    figure.savefig(path, metadata={"Software": None})
+
+
+def _draw_site(axes: Any, comparison: Comparison, before: TrajectoryError | None, after: TrajectoryError) -> None:
+    truth = comparison.truth.position
+    cloud = after.alignment.apply(comparison.cloud)
+    if len(cloud):
+        axes.scatter(cloud[:, 0], cloud[:, 1], s=5.0, c=_CLOUD, alpha=0.7, linewidths=0, label="map", rasterized=True)
+    paths = [truth]
+    if before is not None and comparison.before is not None:
+        before_path = before.alignment.apply(comparison.before.position)
+        paths.append(before_path)
+        axes.plot(before_path[:, 0], before_path[:, 1], ".--", color=_BEFORE, lw=1.3, ms=4.0, label="before")
+    axes.plot(truth[:, 0], truth[:, 1], "-", color=_TRUTH, lw=3.0, alpha=0.35, label="truth")
+    path = after.alignment.apply(comparison.after.position)
+    axes.plot(
+        path[:, 0], path[:, 1], ".-", color=_AFTER, lw=1.3, ms=5.0, label="estimate" if before is None else "after"
+    )
+    axes.set_aspect("equal")
+    _frame_site(axes, np.concatenate([*paths, path])[:, :2], cloud[:, :2])
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.set_title("From above", fontsize=11)
+
+
+def _frame_site(axes: Any, paths: FloatArray, cloud: FloatArray) -> None:
+    """Show the paths (n, 2) and what all but 1 % of the cloud (m, 2) spans: strays must not shrink the picture."""
+    corners = np.percentile(cloud, [0.5, 99.5], axis=0) if len(cloud) else np.empty((0, 2))
+    shown = np.concatenate([paths, corners])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = 0.04 * float(np.max(high - low)) + 0.1
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def _draw_errors(axes: Any, before: TrajectoryError | None, after: TrajectoryError) -> None:
+    start = after.stamp_ns[0] if before is None else before.stamp_ns[0]
+    for error, colour, style in ((before, _BEFORE, ".--"), (after, _AFTER, ".-")):
+        if error is None:
+            continue
+        axes.plot((error.stamp_ns - start) / 1e9, error.translation_m, style, color=colour, lw=1.3, ms=5.0)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("position error [m]")
+    axes.set_title("Error of each keyframe", fontsize=11)
+    axes.grid(alpha=0.3)

@@ -1,0 +1,8 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Make recordings with ground truth: what a visual front-end would publish in a known world."""
+
+from ba_node.synthetic.generate import SyntheticData, generate
+from ba_node.synthetic.options import SyntheticOptions, declarations
+
+__all__ = ["SyntheticData", "SyntheticOptions", "declarations", "generate"]
