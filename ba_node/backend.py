@@ -1,0 +1,308 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Take measurements in, give refined estimates out: what the node and the offline tools both use.
+
+A keyframe is complete when as many cameras delivered tracks for it as for the keyframes before it, when a newer one
+came, or when :meth:`Backend.flush` says so. The node drains its inbox and then solves once, for the newest::
+
+    for measurement in waiting:
+        backend.add(measurement)
+    if backend.ready:
+        publish(backend.solve())
+
+A replay solves once for every keyframe, however the messages are spaced, just before the next one begins::
+
+    for measurement in recording:
+        if backend.completes(measurement):
+            write(backend.solve())
+        backend.add(measurement)
+    backend.flush(final=True)
+    while backend.ready:
+        write(backend.solve())
+
+When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
+stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
+due again if it was not refined without them. A higher session id begins a new map with the same rig; the last estimate
+of the one before is kept in ``finished``. Nothing here reads a clock: the caller passes one, for the report alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter, deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node import quality, window
+from ba_node.core import geometry, methods, solver
+from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.measurements import CameraRig, Keyframe, Measurement
+from ba_node.scene import Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.config import Config
+    from ba_node.core.problem import Cameras
+    from ba_node.core.result import Iteration
+    from ba_node.tables import IntArray
+
+FINISHED_KEPT = 8
+# Keyframes from which it is learned how many cameras deliver.
+_LEARN_FROM = 5
+_UNSOLVED = "not solved yet"
+
+
+def _no_clock() -> float:
+    return 0.0
+
+
+class Backend:
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise on no data whatever.
+
+    Attributes:
+        config: all parameters; change with :meth:`configure`.
+        scene: the current map.
+        finished: session id and last estimate of the sessions before, oldest first, the last few.
+        solve_count: solves since the beginning.
+    """
+
+    def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
+        """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
+        self.config = config
+        self.scene = Scene(config.scene)
+        self.finished: list[tuple[int, Estimate]] = []
+        self.solve_count = 0
+        self._clock = clock
+        self._current: int | None = None
+        self._settled = False
+        self._delivered: deque[int] = deque(maxlen=_LEARN_FROM)
+        self._report = SolveReport(reason=_UNSOLVED)
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Return what was turned away in this session, by reason (``rejections.REASONS``)."""
+        return self.scene.log.rejected
+
+    @property
+    def notices(self) -> Counter[str]:
+        """Return what was unusual but used in this session, by kind (``rejections.NOTICES``)."""
+        return self.scene.log.notices
+
+    @property
+    def rejection_notes(self) -> deque[str]:
+        """Return the last rejections in words, oldest first."""
+        return self.scene.log.notes
+
+    @property
+    def ready(self) -> bool:
+        """Return True if a complete keyframe has not been solved yet."""
+        return len(self._due()) > 0
+
+    def configure(self, config: Config) -> None:
+        """Take new parameters, from the next solve and the next measurement on."""
+        self.config = config
+        self.scene.config = config.scene
+
+    def reset(self) -> None:
+        """Forget the map but not the rig; the session goes on with what comes next."""
+        self._renew(self.scene.session_id, self.scene.cameras)
+
+    def completes(self, measurement: Measurement) -> bool:
+        """Return True if adding this would begin a new keyframe (or session) while the last one is unsolved."""
+        if isinstance(measurement, CameraRig) or self.scene.keyframes.solved.all():
+            return False
+        if self._opens(measurement):
+            return True
+        if not isinstance(measurement, Keyframe) or measurement.session_id != self.scene.session_id:
+            return False
+        return self.scene.find_keyframe(measurement.keyframe_id) is None
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in a measurement; what cannot be used is counted in ``rejected``."""
+        if not isinstance(measurement, CameraRig) and self._opens(measurement):
+            self._begin(measurement.session_id)
+        last = self._current
+        if not isinstance(measurement, Keyframe) or self.scene.find_keyframe(measurement.keyframe_id) is not None:
+            self.scene.add(measurement)
+            return
+        self.scene.add(measurement)
+        if self.scene.find_keyframe(measurement.keyframe_id) is None:
+            return
+        if last is not None:
+            self._delivered.append(self._cameras_of(last))
+        self._current, self._settled = measurement.keyframe_id, False
+
+    def flush(self, final: bool = False) -> None:
+        """Call the newest keyframe complete with what has come.
+
+        Args:
+            final: nothing more will come: give up on what waits for its keyframe or for the rig.
+        """
+        self._settled = True
+        if final:
+            self.scene.end_pending()
+
+    def solve(self, on_iteration: Callable[[Iteration], bool] | None = None) -> Estimate | None:
+        """Refine the newest window; None while there is no keyframe.
+
+        Args:
+            on_iteration: called with each iteration; returning False ends the solve after it.
+
+        Returns:
+            The estimate. After a failed or skipped solve poses and points are as before, and the report says why.
+        """
+        if len(self.scene.keyframes) == 0:
+            return None
+        due = self._due()
+        end = self._end(due)
+        selection = window.select(self.scene, self.config, end)
+        taking_part = window.rows_of(self.scene, self.config, end)
+        self.solve_count += 1
+        newest = int(self.scene.keyframes.keyframe_id[taking_part[-1]])
+        if isinstance(selection, str):
+            self._report = self._base_report(newest, Status.SKIPPED, selection)
+        else:
+            taking_part = _taking_part(self.scene, selection)
+            self._report = self._solve(newest, selection, on_iteration)
+        reached = np.zeros(len(self.scene.keyframes), bool)
+        reached[self.scene.order[:end]] = True
+        self.scene.keyframes.solved[due[reached[due]]] = True
+        return self._estimate(taking_part)
+
+    def rms_px(self, state: str = "refined") -> float:
+        """Return the root mean square reprojection error per coordinate over all observations of the map, px.
+
+        Outliers count too; tracks with fewer than two views do not, nor do points without a position.
+
+        Args:
+            state: ``refined``, or ``input`` for the front-end's poses and guesses (without a guess: triangulated).
+        """
+        return quality.rms_px(self.scene, self.config, state)
+
+    def _solve(
+        self, newest: int, selection: window.Selection, on_iteration: Callable[[Iteration], bool] | None
+    ) -> SolveReport:
+        began = self._clock()
+        problem = selection.problem
+        result = solver.solve(
+            problem, methods.from_config(self.config.solver), clock=self._clock, on_iteration=on_iteration
+        )
+        elapsed = self._clock() - began
+        window.merge(self.scene, selection, result, self.config.tracks.outlier_px)
+        return dataclasses.replace(
+            self._base_report(newest, result.status, result.reason),
+            method=result.method,
+            iterations=max(len(result.trace) - 1, 0),
+            accepted_iterations=result.accepted_iterations,
+            linear_iterations=result.linear_iterations,
+            objective_before=result.objective_before,
+            objective_after=result.objective_after,
+            gradient_norm=result.gradient_norm,
+            rms_px_before=quality.problem_rms_px(problem, problem.start),
+            rms_px_after=quality.problem_rms_px(problem, result.state),
+            keyframes=int(np.count_nonzero(~problem.fixed)),
+            fixed_keyframes=int(np.count_nonzero(problem.fixed)),
+            landmarks=problem.n_points,
+            observations=len(problem.observations),
+            outliers=len(selection.rows) - len(problem.observations),
+            solve_time_s=elapsed,
+        )
+
+    def _base_report(self, newest: int, status: Status, reason: str) -> SolveReport:
+        return SolveReport(
+            session_id=self.scene.session_id or 0,
+            solve_count=self.solve_count,
+            newest_keyframe_id=newest,
+            status=status,
+            reason=reason,
+            method=self.config.solver.method,
+            rejected=dict(sorted(self.rejected.items())),
+        )
+
+    def _estimate(self, refined: IntArray) -> Estimate:
+        scene = self.scene
+        scene.settle_poses()
+        points = scene.landmarks
+        rows = scene.landmark_order
+        rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
+        return Estimate(
+            stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]),
+            frame_id=scene.frame_id,
+            refined=_poses(scene, refined),
+            trajectory=_poses(scene, scene.order),
+            cloud=Cloud(points.track_id[rows], points.position[rows], points.rms_px[rows], points.views[rows]),
+            report=self._report,
+        )
+
+    def _due(self) -> IntArray:
+        """Return the rows of complete keyframes that were not solved."""
+        due = ~self.scene.keyframes.solved
+        current = None if self._current is None else self.scene.find_keyframe(self._current)
+        if current is not None and not self._complete(current):
+            due[current] = False
+        return np.flatnonzero(due)
+
+    def _end(self, due: IntArray) -> int:
+        """Return how many keyframes, oldest first, there are up to the newest that the next solve is to refine."""
+        n, size = len(self.scene.order), self.config.window.max_keyframes
+        is_due = np.zeros(n, bool)
+        is_due[due] = True
+        waiting = np.flatnonzero(is_due[self.scene.order])
+        # With one solved keyframe at least in the window the newest can be reached at once.
+        if not len(waiting) or n - waiting[0] < size or n <= size:
+            return n
+        return int(waiting[0]) + size // 2
+
+    def _complete(self, row: int) -> bool:
+        if self._settled:
+            return True
+        cameras = self.scene.cameras
+        expected = max(self._delivered, default=0) or (len(cameras.model) if cameras is not None else 1)
+        return len(self.scene.cameras_of(row)) >= expected
+
+    def _cameras_of(self, keyframe_id: int) -> int:
+        row = self.scene.find_keyframe(keyframe_id)
+        return 0 if row is None else len(self.scene.cameras_of(row))
+
+    def _opens(self, measurement: Measurement) -> bool:
+        """Return True if a measurement belongs to a later session than the current."""
+        current = self.scene.session_id
+        if isinstance(measurement, CameraRig) or current is None or measurement.session_id <= current:
+            return False
+        return self.scene.usable(measurement)
+
+    def _begin(self, session_id: int) -> None:
+        if len(self.scene.keyframes):
+            assert self.scene.session_id is not None
+            self.scene.end_pending()
+            self._report = dataclasses.replace(self._report, rejected=dict(sorted(self.rejected.items())))
+            self.finished.append((self.scene.session_id, self._estimate(self.scene.order)))
+            del self.finished[:-FINISHED_KEPT]
+        self._renew(session_id, self.scene.next_cameras or self.scene.cameras)
+
+    def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
+        self.scene = Scene(self.config.scene, session_id)
+        self.scene.cameras = cameras
+        self._current, self._settled = None, False
+        self._delivered.clear()
+        self._report = SolveReport(reason=_UNSOLVED)
+
+
+def _taking_part(scene: Scene, selection: window.Selection) -> IntArray:
+    """Return the keyframes of the window and of the problem, oldest first."""
+    marked = np.zeros(len(scene.keyframes), bool)
+    marked[selection.window] = True
+    marked[selection.keyframes] = True
+    return scene.order[marked[scene.order]]
+
+
+def _poses(scene: Scene, rows: IntArray) -> Poses:
+    table = scene.keyframes
+    return Poses(
+        table.keyframe_id[rows],
+        table.stamp_ns[rows],
+        table.position[rows],
+        geometry.quaternion_from_matrix(table.rotation[rows]),
+    )

@@ -1,0 +1,177 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Triangulate points from the rays of all their views, for all points at once.
+
+With camera centres ``c_i``, unit rays ``d_i`` and distances ``s_i = |x - c_i|``, the point minimises::
+
+    sum_i (f_i / (sigma_i s_i))^2 |(I - d_i d_i') (x - c_i)|^2  +  sum_i |d_i' (x - c_i) - m_i|^2 / sigma_mi^2
+
+The first sum is the angular error in pixels (to first order the reprojection error), the second ties the point to
+measured distances ``m_i`` along the rays. For given ``s_i`` it is a 3x3 linear system a point; ``s_i`` starts at 1
+(plain midpoint) and is updated in rounds (iterative least squares: Hartley & Sturm, *Triangulation*, CVIU 1997). The
+later rounds weigh each view by Huber's rule, so that a mismatch among several views does not drag the point away. Paid:
+one batch of 3x3 solves a round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core import cameras
+
+if TYPE_CHECKING:
+    from ba_node.core.problem import Problem
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+_PLAIN_ROUNDS = 3
+_ROBUST_ROUNDS = 5
+# Where the robust weight leaves 1, in sigmas.
+_HUBER = 1.5
+_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Views of points as rays in the world; rows whose pixel no ray projects to are left out.
+
+    Attributes:
+        point: (n,) index of the point.
+        centre: (n, 3) camera centre, m.
+        direction: (n, 3) unit vector.
+        px_per_rad: (n,) focal length over sigma.
+        distance_m: (n,) measured distance along the ray, NaN where there is none.
+        distance_sigma_m: (n,) its standard deviation.
+    """
+
+    point: IntArray
+    centre: FloatArray
+    direction: FloatArray
+    px_per_rad: FloatArray
+    distance_m: FloatArray
+    distance_sigma_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points and how well their rays determine them.
+
+    Attributes:
+        points: (n_pt, 3), m; NaN where there is neither a pair of rays nor a ray with a distance.
+        parallax_rad: (n_pt,) largest angle between two rays (exact for two, at least half of it for more).
+        measured: (n_pt,) True where a distance was measured.
+    """
+
+    points: FloatArray
+    parallax_rad: FloatArray
+    measured: BoolArray
+
+
+def rays_of(problem: Problem) -> Rays:
+    """Return the rays of all observations of a problem at its start poses."""
+    obs, cams = problem.observations, problem.cameras
+    rotation_cb, rotation = cams.rotation[obs.camera], problem.start.rotation[obs.keyframe]
+    # Camera centre: x with R x + t = -Rc' tc.
+    body_centre = -(np.swapaxes(rotation_cb, -1, -2) @ cams.translation[obs.camera][:, :, None])[..., 0]
+    world_from_body = np.swapaxes(rotation, -1, -2)
+    centre = (world_from_body @ (body_centre - problem.start.translation[obs.keyframe])[:, :, None])[..., 0]
+    params = cams.params[obs.camera]
+    ray = np.ones((len(obs), 3))
+    ray[:, :2] = cameras.normalise(obs.uv, cams.model[obs.camera], params)
+    length = np.linalg.norm(ray, axis=1)
+    direction = (world_from_body @ (np.swapaxes(rotation_cb, -1, -2) @ (ray / length[:, None])[:, :, None]))[..., 0]
+    focal = np.sqrt(params[:, cameras.FX] * params[:, cameras.FY])
+    has_depth = len(obs.depth_m) > 0
+    depth = obs.depth_m if has_depth else np.full(len(obs), np.nan)
+    sigma = obs.depth_sigma_m if has_depth else np.full(len(obs), np.nan)
+    good = np.isfinite(length)
+    return Rays(
+        obs.point[good],
+        centre[good],
+        direction[good],
+        (focal / obs.sigma_px)[good],
+        (depth * length)[good],
+        (sigma * length)[good],
+    )
+
+
+def triangulate(rays: Rays, n_points: int) -> Triangulation:
+    """Return the point of each group of rays. Nothing is judged here: see the parallax before believing one."""
+    measured_row = np.isfinite(rays.distance_m)
+    measured = np.bincount(rays.point[measured_row], minlength=n_points) > 0
+    count = np.bincount(rays.point, minlength=n_points)
+    # Relative to the mean centre of each point's cameras: keeps digits far from the origin.
+    origin = _sum_by_point(rays.centre, rays.point, n_points) / np.maximum(count, 1)[:, None]
+    centre = rays.centre - origin[rays.point]
+    distance = _first_distance(rays, measured_row, n_points)
+    trust = np.ones(len(distance))
+    points = np.zeros((n_points, 3))
+    for i in range(_PLAIN_ROUNDS + _ROBUST_ROUNDS):
+        points = _weighted_midpoint(rays, centre, distance, trust, n_points)
+        away = points[rays.point] - centre
+        distance = np.linalg.norm(away, axis=1)
+        if i >= _PLAIN_ROUNDS - 1:
+            across = np.linalg.norm(np.cross(rays.direction, away), axis=1) / np.maximum(distance, 1e-9)
+            trust = _HUBER / np.maximum(rays.px_per_rad * across, _HUBER)
+    points = points + origin
+    points[(count < 2) & ~measured] = np.nan
+    return Triangulation(points, parallax(rays, n_points), measured)
+
+
+def parallax(rays: Rays, n_points: int) -> FloatArray:
+    """Return the largest angle between two rays of each point, (n_points,) rad; 0 for fewer than two rays.
+
+    Takes the ray farthest from the mean, then the ray farthest from that one: exact for two rays.
+    """
+    angle = np.zeros(n_points)
+    if not len(rays.point):
+        return angle
+    mean = _sum_by_point(rays.direction, rays.point, n_points)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+    chord = np.linalg.norm(rays.direction - mean[rays.point], axis=1)
+    # Last write wins: of each point's rays in ascending order of distance, that is the farthest.
+    order = np.argsort(chord, kind="stable")
+    farthest = np.zeros(n_points, np.intp)
+    farthest[rays.point[order]] = order
+    chord = np.linalg.norm(rays.direction - rays.direction[farthest[rays.point]], axis=1)
+    np.maximum.at(angle, rays.point, 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
+    return angle
+
+
+def _first_distance(rays: Rays, measured_row: BoolArray, n_points: int) -> FloatArray:
+    """Return a distance for every ray: the mean of the point's measured ones, or 1."""
+    total = np.bincount(rays.point[measured_row], rays.distance_m[measured_row], n_points)
+    count = np.bincount(rays.point[measured_row], minlength=n_points)
+    mean = np.where(count > 0, total / np.maximum(count, 1), 1.0)
+    return mean[rays.point]
+
+
+def _weighted_midpoint(
+    rays: Rays, centre: FloatArray, distance: FloatArray, trust: FloatArray, n_points: int
+) -> FloatArray:
+    """Solve the 3x3 systems of the module's equation for given distances and weights in (0, 1]; (n_points, 3)."""
+    across = trust * (rays.px_per_rad / np.maximum(distance, 1e-9)) ** 2
+    along = np.nan_to_num(1.0 / rays.distance_sigma_m**2, nan=0.0)
+    d = rays.direction
+    # W = across (I - d d') + along d d';  sum W x = sum W c + along m d
+    outer = (along - across)[:, None, None] * d[:, :, None] * d[:, None, :]
+    weight = outer + across[:, None, None] * np.eye(3)
+    shift = (along * np.nan_to_num(rays.distance_m, nan=0.0))[:, None] * d
+    rhs = _sum_by_point((weight @ centre[:, :, None])[..., 0] + shift, rays.point, n_points)
+    matrix = np.empty((n_points, 3, 3))
+    for i, j in _SYMMETRIC:
+        matrix[:, i, j] = matrix[:, j, i] = np.bincount(rays.point, weight[:, i, j], n_points)
+    trace = np.trace(matrix, axis1=1, axis2=2)
+    # A whiff of damping: parallel rays give a far point instead of a singular matrix.
+    matrix += (1e-14 * trace + np.where(trace > 0, 0.0, 1.0))[:, None, None] * np.eye(3)
+    return np.asarray(np.linalg.solve(matrix, rhs[:, :, None])[..., 0])
+
+
+def _sum_by_point(values: FloatArray, point: IntArray, n_points: int) -> FloatArray:
+    return np.stack([np.bincount(point, values[:, k], n_points) for k in range(values.shape[1])], axis=1)

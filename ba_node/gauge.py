@@ -1,0 +1,118 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Hold the freedom of a problem: place, heading, and scale where it cannot be seen.
+
+Scale can be seen where two cameras of one keyframe, apart from each other, see the same point, or where depth is
+measured. For each connected part of a problem:
+
+- scale is seen: one fixed keyframe holds the rest;
+- it is not, and older keyframes take part: two fixed ones hold it, the oldest of the window being the second if need
+  be;
+- it is not, and the whole part is free (a map begins): the oldest is fixed, and after the solve the part is scaled
+  about it so that the steps from keyframe to keyframe are as long as the front-end's, in the least-squares sense.
+  Fixing the first two keyframes instead would take the scale from one short step, and keep its direction's error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ba_node.core.problem import Observations, Problem
+    from ba_node.tables import BoolArray, FloatArray, IntArray
+
+# A fixed keyframe with fewer observations takes part, but is not relied on to hold anything.
+_ANCHOR_OBSERVATIONS = 10
+# Cameras of a rig nearer to each other (m) show no scale.
+_MIN_BASELINE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """What holds a problem.
+
+    Attributes:
+        fixed: (n_kf,) keyframes whose pose is held.
+        unscaled: (n_kf,) for a keyframe of a part whose scale floats the number of its fixed keyframe, else -1.
+    """
+
+    fixed: BoolArray
+    unscaled: IntArray
+
+
+def choose(problem: Problem, old: BoolArray) -> Gauge:
+    """Choose what holds a problem.
+
+    Args:
+        problem: keyframes oldest first.
+        old: (n_kf,) keyframes that are fixed in any case.
+    """
+    obs, n_kf = problem.observations, problem.n_keyframes
+    fixed, unscaled = old.copy(), np.full(n_kf, -1)
+    part_of = _parts(obs, n_kf, problem.n_points)
+    shows_scale = _shows_scale(problem)
+    strong = np.bincount(obs.keyframe, minlength=n_kf) >= _ANCHOR_OBSERVATIONS
+    for part in np.unique(part_of):
+        members = part_of == part
+        free = np.flatnonzero(members & ~old)
+        scaled = bool(np.any(shows_scale & members[obs.keyframe]))
+        missing = (1 if scaled else 2) - int(np.count_nonzero(members & old & strong))
+        if not scaled and not np.any(members & old):
+            fixed[free[:1]] = True
+            unscaled[members] = free[0]
+        elif missing > 0:
+            fixed[free[:missing]] = True
+    return Gauge(fixed, unscaled)
+
+
+def step_ratio(measured: FloatArray, estimated: FloatArray) -> float:
+    """Return the scale that makes the steps between estimated positions as long as between measured ones.
+
+    Least squares over the lengths of consecutive steps; 1 where there is nothing to compare.
+
+    Args:
+        measured: (n, 3) positions by the front-end, m.
+        estimated: (n, 3) positions in the scale of the problem.
+    """
+    long = np.linalg.norm(np.diff(measured, axis=0), axis=1)
+    short = np.linalg.norm(np.diff(estimated, axis=0), axis=1)
+    top, bottom = float(long @ short), float(short @ short)
+    return top / bottom if top > 0 and bottom > 0 and np.isfinite(top / bottom) else 1.0
+
+
+def _parts(obs: Observations, n_kf: int, n_points: int) -> IntArray:
+    """Return for each keyframe the first keyframe that it is connected with over common points."""
+    label = np.arange(n_kf)
+    while True:
+        by_point = np.full(n_points, n_kf)
+        np.minimum.at(by_point, obs.point, label[obs.keyframe])
+        spread = label.copy()
+        np.minimum.at(spread, obs.keyframe, by_point[obs.point])
+        # Labels name keyframes, so a label's own label is a shortcut: long chains settle in few rounds.
+        spread = spread[spread]
+        if np.array_equal(spread, label):
+            return label
+        label = spread
+
+
+def _shows_scale(problem: Problem) -> BoolArray:
+    """Return which observations fix the scale.
+
+    Those with depth, and those of a point that another camera of the same keyframe sees from another place.
+    """
+    obs = problem.observations
+    scale = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
+    centres = _camera_centres(problem)
+    # Rows are sorted by point, keyframe, camera: the views of one point from one keyframe are neighbours.
+    same = (np.diff(obs.point) == 0) & (np.diff(obs.keyframe) == 0)
+    apart = np.linalg.norm(centres[obs.camera[1:]] - centres[obs.camera[:-1]], axis=1) > _MIN_BASELINE_M
+    scale[1:] |= same & apart
+    return scale
+
+
+def _camera_centres(problem: Problem) -> FloatArray:
+    cams = problem.cameras
+    return np.asarray(-(np.swapaxes(cams.rotation, -1, -2) @ cams.translation[:, :, None])[..., 0])

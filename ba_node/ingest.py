@@ -1,0 +1,175 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Judge measurements by themselves, before anything that is known: shapes, numbers, ranges.
+
+Bad rows are dropped one by one, good rows stay. Everything that is dropped is counted in a RejectionLog.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core import cameras, geometry
+from ba_node.core.problem import Cameras
+
+if TYPE_CHECKING:
+    from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+    from ba_node.rejections import RejectionLog
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MAX_PIXEL = 1e6
+SIGMA_RANGE = (1e-6, 1e6)
+DEPTH_RANGE_M = (1e-3, 1e6)
+MAX_POSITION_M = 1e9
+MAX_GUESS_M = 1e12
+_MIN_QUATERNION_NORM = 1e-6
+_STAMP = np.iinfo(np.int64)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A checked pose: rotation (3, 3) world from body, position (3,) of the body, m."""
+
+    rotation: FloatArray
+    position: FloatArray
+
+
+def keyframe_pose(keyframe: Keyframe, log: RejectionLog) -> Pose | None:
+    """Return the pose of a keyframe message, or None (counted) if it is not one."""
+    name = f"keyframe {keyframe.keyframe_id}"
+    position, quaternion = np.asarray(keyframe.position, float), np.asarray(keyframe.orientation, float)
+    if position.shape != (3,) or quaternion.shape != (4,):
+        log.reject("malformed", f"{name}: pose of shape {position.shape}, {quaternion.shape}, expected (3,), (4,)")
+        return None
+    if not _STAMP.min <= keyframe.stamp_ns <= _STAMP.max:
+        log.reject("malformed", f"{name}: stamp {keyframe.stamp_ns} ns, expected 64 bits")
+        return None
+    if not _within(position, MAX_POSITION_M) or not _is_rotation(quaternion):
+        log.reject("bad_pose", f"{name}: position {position} m, quaternion {quaternion}, expected finite and not zero")
+        return None
+    return Pose(geometry.matrix_from_quaternion(quaternion), position)
+
+
+def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | None:
+    """Return the good rows of a tracks message with sigma and depth filled in, or None (counted) if malformed."""
+    name = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}"
+    wrong = tracks.malformed or _wrong_shape(tracks)
+    if wrong:
+        log.reject("malformed", f"{name}: {wrong}")
+        return None
+    n = len(tracks.track_id)
+    uv = np.asarray(tracks.uv, float)
+    sigma = np.asarray(tracks.sigma_px, float) if len(tracks.sigma_px) else np.ones(n)
+    depth = np.array(tracks.depth_m, float) if len(tracks.depth_m) else np.full(n, np.nan)
+    finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & ~np.isinf(depth)
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(uv) <= MAX_PIXEL).all(axis=1)
+        sane_sigma = (sigma >= SIGMA_RANGE[0]) & (sigma <= SIGMA_RANGE[1])
+        bad_depth = (depth < DEPTH_RANGE_M[0]) | (depth > DEPTH_RANGE_M[1])
+    good = np.ones(n, bool)
+    for reason, passed in (("non_finite", finite), ("out_of_range", near), ("bad_sigma", sane_sigma)):
+        failed = np.flatnonzero(good & ~passed)
+        if len(failed):
+            i = failed[0]
+            values = f"u = {uv[i, 0]:g}, v = {uv[i, 1]:g}, sigma = {sigma[i]:g} px, depth = {depth[i]:g} m"
+            log.reject(reason, f"track {tracks.track_id[i]} in {name[10:]}: {values}", len(failed))
+        good &= passed
+    failed = np.flatnonzero(good & bad_depth)
+    if len(failed):
+        i = failed[0]
+        log.reject("bad_depth", f"track {tracks.track_id[i]} in {name[10:]}: depth = {depth[i]:g} m", len(failed))
+        depth[failed] = np.nan
+    good &= _first_of_each(tracks, good, log)
+    ids = np.asarray(tracks.track_id).astype(np.uint64)
+    return dataclasses.replace(
+        tracks, track_id=ids[good], uv=uv[good], sigma_px=sigma[good], depth_m=depth[good]
+    )
+
+
+def clean_guesses(guesses: LandmarkGuesses, log: RejectionLog) -> LandmarkGuesses | None:
+    """Return the good rows of a guesses message, the first of each track; None (counted) if malformed."""
+    ids, position = np.asarray(guesses.track_id), np.asarray(guesses.position, float)
+    wrong = guesses.malformed
+    if not wrong and (not _is_id_array(ids) or position.shape != (len(ids), 3)):
+        wrong = f"{ids.shape} ids of type {ids.dtype} and positions of shape {position.shape}, expected (n,) and (n, 3)"
+    if wrong:
+        log.reject("malformed", f"landmark guesses: {wrong}")
+        return None
+    with np.errstate(invalid="ignore"):
+        good = (np.abs(position) <= MAX_GUESS_M).all(axis=1)
+    failed = np.flatnonzero(~good)
+    if len(failed):
+        log.reject("bad_guess", f"guess for track {ids[failed[0]]}: {position[failed[0]]} m", len(failed))
+    unique, first = np.unique(ids[good].astype(np.uint64), return_index=True)
+    log.notice("repeated_guess", int(good.sum()) - len(unique))
+    return dataclasses.replace(guesses, track_id=unique, position=position[good][first])
+
+
+def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
+    """Return the cameras of a rig, or None (counted) if one of them cannot be used."""
+    n = len(rig)
+    shapes = (np.shape(rig.intrinsics), np.shape(rig.position), np.shape(rig.orientation), len(rig.distortion))
+    if n == 0 or shapes != ((n, 4), (n, 3), (n, 4), n):
+        log.reject("bad_rig", f"camera rig of {n} cameras: shapes {shapes}, expected ({n}, 4), ({n}, 3), ({n}, 4), {n}")
+        return None
+    model, params = np.zeros(n, np.uint8), np.zeros((n, cameras.N_PARAMS))
+    for i in range(n):
+        if not _within(rig.position[i], MAX_POSITION_M) or not _is_rotation(rig.orientation[i]):
+            pose = f"position {rig.position[i]} m, quaternion {rig.orientation[i]}"
+            log.reject("bad_rig", f"camera {i}: {pose}, expected finite and not zero")
+            return None
+        try:
+            model[i], params[i] = cameras.parameters(rig.models[i], rig.intrinsics[i], rig.distortion[i])
+        except cameras.CameraError as error:
+            log.reject("unknown_model", f"camera {i} of the rig: {error}")
+            return None
+    rotation, translation = geometry.inverse(geometry.matrix_from_quaternion(rig.orientation), rig.position)
+    return Cameras(rotation, translation, model, params)
+
+
+def _first_of_each(tracks: FeatureTracks, good: BoolArray, log: RejectionLog) -> BoolArray:
+    """Return which rows are the first good one of their track."""
+    rows = np.flatnonzero(good)
+    _, first = np.unique(tracks.track_id[rows], return_index=True)
+    keep = np.zeros(len(good), bool)
+    keep[rows[first]] = True
+    repeated = np.flatnonzero(good & ~keep)
+    if len(repeated):
+        where = f"keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
+        what = f"track {tracks.track_id[repeated[0]]} twice in the message of {where}"
+        log.reject("duplicate_observation", what, len(repeated))
+    return keep
+
+
+def _wrong_shape(tracks: FeatureTracks) -> str:
+    ids, n = np.asarray(tracks.track_id), len(tracks.track_id)
+    if not _is_id_array(ids):
+        return f"track_id of shape {ids.shape} and type {ids.dtype}, expected a row of uint64"
+    if np.shape(tracks.uv) != (n, 2):
+        return f"{n} ids but coordinates of shape {np.shape(tracks.uv)}, expected ({n}, 2)"
+    for name, values in (("sigma_px", tracks.sigma_px), ("depth_m", tracks.depth_m)):
+        if np.shape(values) not in ((n,), (0,)):
+            return f"{n} ids but {np.shape(values)} values of {name}, expected none or {n}"
+    return ""
+
+
+def _is_id_array(ids: NDArray[np.generic]) -> bool:
+    return ids.ndim == 1 and (ids.dtype.kind == "u" or len(ids) == 0)
+
+
+def _within(values: FloatArray, limit: float) -> bool:
+    with np.errstate(invalid="ignore"):
+        return bool((np.abs(values) <= limit).all())
+
+
+def _is_rotation(quaternion: FloatArray) -> bool:
+    if not np.isfinite(quaternion).all() or np.abs(quaternion).max() > 1e6:
+        return False
+    return bool(np.linalg.norm(quaternion) > _MIN_QUATERNION_NORM)

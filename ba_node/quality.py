@@ -1,0 +1,103 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Say how well a map explains what was seen: root mean square reprojection errors per coordinate, px."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry, objective, triangulation
+from ba_node.core.problem import Problem, State
+from ba_node.window import problem_of
+
+if TYPE_CHECKING:
+    from ba_node.config import Config
+    from ba_node.scene import Scene
+    from ba_node.tables import FloatArray
+
+STATES = ("input", "refined")
+
+
+def problem_rms_px(problem: Problem, state: State) -> float:
+    """Return the rms over the observations of a problem whose point is in front of the camera; 0 without any."""
+    return _rms(_errors(problem, state))
+
+
+def rms_px(scene: Scene, config: Config, state: str) -> float:
+    """Return the rms over all observations of a scene, outliers too, of tracks with two views; 0 without any.
+
+    Args: as of :func:`errors_px`.
+    """
+    return _rms(errors_px(scene, config, state))
+
+
+def summary(scene: Scene, config: Config, state: str) -> dict[str, float]:
+    """Return how well a state explains the observations: one wild outlier rules the rms of all, so that is not all.
+
+    Args: as of :func:`errors_px`.
+
+    Returns:
+        ``rms_px`` of all observations, ``rms_px_without_outliers`` of those that solves use now, ``median_px`` of the
+        lengths of all residuals.
+    """
+    error = errors_px(scene, config, state)
+    return {
+        "rms_px": _rms(error),
+        "rms_px_without_outliers": _rms(errors_px(scene, config, state, outliers=False)),
+        "median_px": float(np.median(np.hypot(error[:, 0], error[:, 1]))) if len(error) else 0.0,
+    }
+
+
+def errors_px(scene: Scene, config: Config, state: str, *, outliers: bool = True) -> FloatArray:
+    """Return predicted minus measured, (n, 2) px, of the observations of tracks with two views that are in front.
+
+    Args:
+        scene: the map.
+        config: for the precision of depths, which triangulation uses.
+        state: ``refined``: poses and points as they are now; ``input``: the front-end's poses and guesses, points
+            without a guess triangulated.
+        outliers: count also the observations that are left out of solves as outliers.
+    """
+    if state not in STATES:
+        raise ValueError(f"state {state!r}: expected one of {', '.join(STATES)}")
+    if scene.cameras is None or len(scene.keyframes) == 0:
+        return np.empty((0, 2))
+    table = scene.landmarks
+    seen_twice = table.views >= 2
+    if state == "refined":
+        seen_twice &= table.has_position
+    landmarks = np.flatnonzero(seen_twice)
+    rows = scene.views_of(landmarks)
+    if not outliers:
+        rows = rows[~scene.sightings.outlier[rows]]
+    if not len(rows):
+        return np.empty((0, 2))
+    origin = scene.keyframes.position[scene.order[0]]
+    positions = table.position[landmarks] - origin
+    problem = problem_of(scene, rows, scene.order, landmarks, origin, positions, config)
+    if state == "refined":
+        return _errors(problem, problem.start)
+    return _input_errors(scene, problem, table.guess[landmarks] - origin, origin)
+
+
+def _input_errors(scene: Scene, problem: Problem, guess: FloatArray, origin: FloatArray) -> FloatArray:
+    order = scene.order
+    poses = geometry.inverse(scene.keyframes.input_rotation[order], scene.keyframes.input_position[order] - origin)
+    # Start points are not looked at by the triangulation.
+    problem = dataclasses.replace(problem, start=State(*poses, np.zeros_like(guess), problem.start.intrinsics))
+    missing = np.asarray(np.isnan(guess).any(axis=1))
+    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points)
+    points = np.where(missing[:, None], found.points, guess)
+    return _errors(problem, dataclasses.replace(problem.start, points=points))
+
+
+def _errors(problem: Problem, state: State) -> FloatArray:
+    error = objective.reprojection_errors(problem, state)
+    return error[~np.isnan(error).any(axis=1)]
+
+
+def _rms(error: FloatArray) -> float:
+    return float(np.sqrt(np.mean(error * error))) if len(error) else 0.0

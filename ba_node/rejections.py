@@ -1,0 +1,64 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Count what is turned away, by reason, and keep the last few cases in words."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+# Reason -> what was turned away and why. The keys are published in ba_msgs/SolverReport.
+REASONS: dict[str, str] = {
+    "malformed": "A message whose arrays do not fit together.",
+    "non_finite": "An observation with u, v or sigma not finite, or a depth that is infinite.",
+    "out_of_range": "An observation with |u| or |v| above 1e6 px.",
+    "bad_sigma": "An observation whose sigma is outside [1e-6, 1e6] px.",
+    "bad_depth": "A depth outside [1e-3, 1e6] m; the pixel is used without it.",
+    "bad_pose": "A keyframe whose position is not finite or beyond 1e9 m, or whose quaternion is not finite or zero.",
+    "bad_guess": "A guess that is not finite or beyond 1e12 m.",
+    "bad_rig": "A camera rig without cameras, or with poses that are not finite or quaternions that are zero.",
+    "unknown_model": "A camera rig with a camera that cannot be used (distortion model, coefficients, focal length).",
+    "rig_changed": "Another camera rig while a session has observations; it is used from the next session on.",
+    "unknown_camera": "A tracks message whose camera_index is not in the rig.",
+    "unknown_keyframe": "A tracks message whose keyframe never came.",
+    "duplicate_keyframe": "A keyframe whose id is known; the first one stays.",
+    "duplicate_observation": "A second observation of a track by one camera in one keyframe; the first one stays.",
+    "stale_session": "A message of a session before the current one.",
+    "pending_overflow": "A tracks message that waited for the camera rig longer than scene.max_pending messages.",
+}
+
+# Things that are worth counting although nothing was lost by them.
+NOTICES: dict[str, str] = {
+    "reordered": "A keyframe whose stamp lies before the newest one; it was sorted in.",
+    "repeated_guess": "A second guess for a track; the first one stays.",
+}
+
+NOTES_KEPT = 50
+
+
+class RejectionLog:
+    """Counts by reason, and notes that name ids and values.
+
+    Attributes:
+        rejected: what was turned away; keys from REASONS. Whole messages count as one, observations one by one.
+        notices: what was unusual but used; keys from NOTICES.
+        notes: the last cases in words, oldest first.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing counted."""
+        self.rejected: Counter[str] = Counter()
+        self.notices: Counter[str] = Counter()
+        self.notes: deque[str] = deque(maxlen=NOTES_KEPT)
+
+    def reject(self, reason: str, what: str, count: int = 1) -> None:
+        """Count a rejection; ``what`` names the first case: thing, id, value, what was expected."""
+        assert reason in REASONS, reason
+        self.rejected[reason] += count
+        more = f" and {count - 1} more" if count > 1 else ""
+        self.notes.append(f"{what}{more}; dropped ({reason} = {self.rejected[reason]})")
+
+    def notice(self, kind: str, count: int = 1) -> None:
+        """Count something that was unusual but used."""
+        assert kind in NOTICES, kind
+        if count:
+            self.notices[kind] += count

@@ -1,0 +1,145 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ba_node.core import cameras, geometry, objective
+from ba_node.core.problem import Cameras, Observations, Problem, State
+from ba_node.core.triangulation import parallax, rays_of, triangulate
+
+_OFFSET = np.array([4.0e5, 5.0e6, 100.0])
+
+
+def make_problem(seed: int, n_kf: int = 4, n_pt: int = 30, noise_px: float = 0.0, offset: float = 0.0) -> Problem:
+    """Return a body with a plumb_bob and an equidistant camera that sees points 5 to 20 m ahead, at the true state."""
+    rng = np.random.default_rng(seed)
+    models = [
+        cameras.parameters("plumb_bob", np.array([400.0, 410, 320, 240]), np.array([-0.1, 0.02, 1e-3, -1e-3, 0])),
+        cameras.parameters("equidistant", np.array([300.0, 300, 320, 240]), np.array([0.01, -0.005, 0.001, 0])),
+    ]
+    rig = Cameras(
+        geometry.so3_exp(rng.normal(0, 0.05, (2, 3))),
+        np.array([[0.0, 0, 0], [-0.5, 0, 0]]),
+        np.array([m for m, _ in models], np.uint8),
+        np.stack([p for _, p in models]),
+    )
+    rotation = geometry.so3_exp(rng.normal(0, 0.05, (n_kf, 3)))
+    position = rng.normal(0, 1.0, (n_kf, 3)) + offset * _OFFSET
+    points = rng.uniform([-4, -3, 5], [4, 3, 20], (n_pt, 3)) + offset * _OFFSET
+    state = State(*geometry.inverse(rotation, position), points, np.empty((0, 3)))
+    point, keyframe, camera = (a.ravel() for a in np.meshgrid(range(n_pt), range(n_kf), range(2), indexing="ij"))
+    n = len(point)
+    empty = Observations(keyframe, camera, point, np.zeros((n, 2)), np.ones(n), np.empty(0), np.empty(0))
+    problem = Problem(state, np.zeros(n_kf, bool), rig, empty)
+    uv = objective.reprojection_errors(problem, state) + noise_px * rng.normal(size=(n, 2))
+    return dataclasses.replace(problem, observations=dataclasses.replace(empty, uv=uv))
+
+
+def take(problem: Problem, rows: np.ndarray) -> Problem:
+    obs = problem.observations
+    parts = {f.name: getattr(obs, f.name) for f in dataclasses.fields(obs)}
+    return dataclasses.replace(
+        problem, observations=Observations(**{k: v[rows] if len(v) else v for k, v in parts.items()})
+    )
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_exact_rays_give_the_exact_point(offset: float) -> None:
+    problem = make_problem(1, offset=offset)
+    found = triangulate(rays_of(problem), problem.n_points)
+    error = np.abs(found.points - problem.start.points).max()
+    assert error < (1e-6 if offset else 1e-9), f"largest error {error:.2e} m"
+
+
+def test_noise_is_weighed_close_to_the_reprojection_optimum() -> None:
+    problem = make_problem(2, noise_px=0.5)
+    points = triangulate(rays_of(problem), problem.n_points).points
+    cost = _cost(problem, points)
+    rng = np.random.default_rng(0)
+    # No nearby point is clearly better: the algebraic minimum is the reprojection minimum to within 2 %.
+    for size in (0.003, 0.01, 0.03):
+        for _ in range(20):
+            moved = _cost(problem, points + size * rng.normal(size=points.shape))
+            share = np.min(moved / cost)
+            assert share > 0.98, f"a step of {size} m lowers the cost of a point to {share:.3f} of it"
+
+
+def _cost(problem: Problem, points: np.ndarray) -> np.ndarray:
+    error = objective.reprojection_errors(problem, dataclasses.replace(problem.start, points=points))
+    return np.bincount(problem.observations.point, np.sum(error * error, axis=1))
+
+
+def test_parallax_of_two_views_is_the_angle_between_the_rays() -> None:
+    problem = make_problem(3)
+    two = take(problem, (problem.observations.camera == 0) & (problem.observations.keyframe < 2))
+    rays = rays_of(two)
+    d = rays.direction.reshape(-1, 2, 3)
+    expected = np.arctan2(np.linalg.norm(np.cross(d[:, 0], d[:, 1]), axis=1), np.sum(d[:, 0] * d[:, 1], axis=1))
+    np.testing.assert_allclose(parallax(rays, problem.n_points), expected, rtol=1e-9)
+
+
+def test_parallax_of_many_views_is_at_least_half_the_largest_angle() -> None:
+    problem = make_problem(4, n_kf=6)
+    rays = rays_of(problem)
+    d = rays.direction.reshape(problem.n_points, -1, 3)
+    largest = np.arccos(np.clip(d @ np.swapaxes(d, 1, 2), -1, 1)).max(axis=(1, 2))
+    found = parallax(rays, problem.n_points)
+    assert (found <= largest + 1e-7).all()
+    assert (found >= 0.5 * largest).all(), f"smallest share {np.min(found / largest):.3f}"
+
+
+def test_a_measured_depth_places_a_point_from_one_view() -> None:
+    problem = make_problem(5)
+    first = take(problem, (problem.observations.camera == 0) & (problem.observations.keyframe == 0))
+    depth = objective.Objective(first, objective.Rules()).in_camera(first.start)[:, 2]
+    obs = dataclasses.replace(first.observations, depth_m=depth, depth_sigma_m=0.02 * depth)
+    found = triangulate(rays_of(dataclasses.replace(first, observations=obs)), problem.n_points)
+    assert found.measured.all()
+    error = np.abs(found.points - problem.start.points).max()
+    assert error < 1e-9, f"largest error {error:.2e} m"
+
+
+def test_one_view_without_depth_gives_no_point_and_others_are_not_disturbed() -> None:
+    problem = make_problem(6)
+    obs = problem.observations
+    keep = (obs.point != 3) | ((obs.keyframe == 0) & (obs.camera == 0))
+    found = triangulate(rays_of(take(problem, keep & (obs.point != 5))), problem.n_points)
+    assert np.isnan(found.points[[3, 5]]).all()
+    assert found.parallax_rad[3] == 0.0
+    others = np.setdiff1d(np.arange(problem.n_points), [3, 5])
+    assert np.abs(found.points[others] - problem.start.points[others]).max() < 1e-9
+
+
+def test_pixels_outside_the_lens_are_left_out() -> None:
+    problem = make_problem(7)
+    uv = problem.observations.uv.copy()
+    # plumb_bob with k1 < 0 folds back far out: no ray goes through this pixel.
+    uv[0] = (1e6, 1e6)
+    rays = rays_of(dataclasses.replace(problem, observations=dataclasses.replace(problem.observations, uv=uv)))
+    assert len(rays.point) in (len(uv) - 1, len(uv))
+    assert np.isfinite(rays.direction).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 50.0))
+def test_any_rays_give_finite_points_or_nan_marks(seed: int, noise_px: float) -> None:
+    problem = make_problem(seed, n_kf=3, n_pt=5, noise_px=noise_px)
+    found = triangulate(rays_of(problem), problem.n_points)
+    assert np.isfinite(found.points).all()
+    assert np.isfinite(found.parallax_rad).all()
+
+
+def test_identical_rays_do_not_raise() -> None:
+    problem = make_problem(8)
+    rays = rays_of(take(problem, (problem.observations.camera == 0) & (problem.observations.keyframe == 0)))
+    rows = np.repeat(np.arange(len(rays.point)), 2)
+    twice = dataclasses.replace(rays, **{f.name: getattr(rays, f.name)[rows] for f in dataclasses.fields(rays)})
+    found = triangulate(twice, problem.n_points)
+    assert np.isfinite(found.points).all()
+    assert found.parallax_rad.max() == 0.0
