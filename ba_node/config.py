@@ -115,7 +115,7 @@ class SceneConfig:
     )
     max_pending: int = _param(
         200,
-        "Track and guess messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",
+        "Track messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",
         minimum=1,
         maximum=100_000,
     )
@@ -134,14 +134,14 @@ class TracksConfig:
     )
     max_triangulation_px: float = _param(
         12.0,
-        "Largest reprojection error, in units of the observation's sigma, of a newly triangulated point or of a guess.",
+        "Largest median reprojection error, in sigmas, of a first point; at least 4.4 x the median of them all.",
         unit="px",
         minimum=0.1,
         maximum=1e6,
     )
     outlier_px: float = _param(
         6.0,
-        "After a solve, observations with a residual above this many sigmas are left out of the next one; 0 keeps all.",
+        "Observations beyond this many sigmas (at least 4.4 x the median) sit out the next solve; 0 keeps all.",
         unit="px",
         minimum=0.0,
         maximum=1e6,
@@ -179,7 +179,7 @@ class SolverConfig:
     max_iterations: int = _param(12, "Cap on outer iterations of a solve.", minimum=1, maximum=100_000)
     max_linear_iterations: int = _param(500, "Cap on PCG steps in one outer iteration.", minimum=1, maximum=1_000_000)
     function_tolerance: float = _param(
-        1e-4,
+        1e-3,
         "Stop when an accepted step lowers the objective by less than this share.",
         minimum=0.0,
         maximum=1.0,

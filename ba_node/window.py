@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: it would follow the noise.
 MIN_OBSERVATIONS = 6
+# An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
+# the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
+_ABSURD = 25.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Selection:
         keyframes: (n_kf,) row of each keyframe in the scene, oldest first.
         landmarks: (n_pt,) row of each point, by track id.
         window: rows of all keyframes of the window, those held out included, oldest first.
+        lost: rows of landmarks that have a position which their views contradict; they sit this solve out.
         origin: (3,) of the problem in the map, m.
         unscaled: see ``gauge.Gauge``.
     """
@@ -59,6 +63,7 @@ class Selection:
     keyframes: IntArray
     landmarks: IntArray
     window: IntArray
+    lost: IntArray
     origin: FloatArray
     unscaled: IntArray
 
@@ -89,11 +94,13 @@ def select(scene: Scene, config: Config, end: int | None = None) -> Selection | 
     part = _reach(scene, window, config.window.max_fixed_keyframes)
     origin = scene.keyframes.position[part.keyframes[0]] if len(part.keyframes) else np.zeros(3)
     positions = _positions(scene, part, origin, config)
-    part, positions = _restrict(scene, part, positions, config.window.max_landmarks)
+    usable = _usable(scene, part, origin, positions, config)
+    lost = _contradicted(scene, part, usable)
+    part, positions = _restrict(scene, part, positions, usable, config.window.max_landmarks)
     if not np.isin(part.keyframes, window).any():
         return "no keyframe of the window sees enough points that a second image sees"
     problem = problem_of(scene, part.rows, part.keyframes, part.landmarks, origin, positions, config)
-    believed = ~scene.sightings.outlier[part.rows]
+    believed = usable[part.rows]
     active = dataclasses.replace(problem, observations=_take(problem.observations, believed))
     is_old = ~np.isin(part.keyframes, window)
     held = gauge.choose(active, is_old)
@@ -105,6 +112,7 @@ def select(scene: Scene, config: Config, end: int | None = None) -> Selection | 
         part.keyframes,
         part.landmarks,
         window,
+        lost,
         origin,
         held.unscaled,
     )
@@ -125,6 +133,7 @@ def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float)
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
     _judge(scene, selection, state, outlier_px)
+    _displace(scene, selection.lost)
 
 
 def _scaled(scene: Scene, selection: Selection, state: State) -> State:
@@ -261,12 +270,52 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     return np.asarray((rotation @ guess[:, :, None])[..., 0] + translation)
 
 
-def _restrict(scene: Scene, part: _Part, positions: FloatArray, max_landmarks: int) -> tuple[_Part, FloatArray]:
+def _usable(scene: Scene, part: _Part, origin: FloatArray, positions: FloatArray, config: Config) -> BoolArray:
+    """Return which observations may take part: no outliers, and none that begins with an absurd residual."""
+    usable: BoolArray = ~scene.sightings.outlier[: len(scene.sightings)]
+    if config.tracks.outlier_px <= 0 or not len(part.rows):
+        return usable
+    rows = part.rows.copy()
+    known = np.nan_to_num(positions, nan=0.0)
+    problem = problem_of(scene, rows, part.keyframes, part.landmarks, origin, known, config)
+    norm = _norms(problem, problem.start)
+    placed = ~np.isnan(positions[problem.observations.point, 0])
+    gate = widened(_ABSURD * config.tracks.outlier_px, norm[placed & usable[rows]])
+    usable[rows[norm > gate]] = False
+    return usable
+
+
+def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
+    """Return the rows of placed landmarks that absurd residuals leave with too few views, by track id."""
+    rows = part.rows[~scene.sightings.outlier[part.rows]]
+    weight = np.where(np.isfinite(scene.sightings.depth_m[rows]), 2, 1)
+    n = len(scene.landmarks)
+    before = np.bincount(scene.sightings.landmark[rows], weight, n)
+    after = np.bincount(scene.sightings.landmark[rows], weight * usable[rows], n)
+    lost = scene.landmarks.has_position & (before >= 2) & (after < 2)
+    return part.landmarks[lost[part.landmarks]]
+
+
+def _displace(scene: Scene, landmarks: IntArray) -> None:
+    """Take the position of landmarks away; all their views are heard again when they are next placed."""
+    scene.landmarks.has_position[landmarks] = False
+    scene.sightings.outlier[scene.views_of(landmarks)] = False
+
+
+def _norms(problem: Problem, state: State) -> FloatArray:
+    """Return the size of each residual in sigmas, inf for points on or behind the camera plane."""
+    error = objective.reprojection_errors(problem, state)
+    return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
+
+
+def _restrict(
+    scene: Scene, part: _Part, positions: FloatArray, usable: BoolArray, max_landmarks: int
+) -> tuple[_Part, FloatArray]:
     """Leave out what does not determine anything, until nothing more has to go."""
     rows, n_kf, n_pt = part.rows, len(part.keyframes), len(part.landmarks)
     keyframe = _number(part.keyframes, len(scene.keyframes))[scene.sightings.keyframe[rows]]
     point = _number(part.landmarks, len(scene.landmarks))[scene.sightings.landmark[rows]]
-    active = ~scene.sightings.outlier[rows]
+    active = usable[rows]
     measured = active & np.isfinite(scene.sightings.depth_m[rows])
     keep_pt = _most_seen(~np.isnan(positions[:, 0]), np.bincount(point[active], minlength=n_pt), max_landmarks)
     count = -1
@@ -296,40 +345,26 @@ def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
 def _judge(scene: Scene, selection: Selection, state: State, outlier_px: float) -> None:
     """Mark the observations to leave out next time, and note the error of each point.
 
-    The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. The two best
-    observations of a point stay in any case: a point with fewer is lost for good.
+    The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point with
+    fewer than two good views (or one with a measured depth) is in the wrong place, or its track is: it loses its
+    position, and all its views are heard again when it is next placed.
     """
     problem = dataclasses.replace(selection.problem, observations=selection.sightings)
     obs = selection.sightings
-    error = objective.reprojection_errors(problem, state)
-    squared = np.sum(error * error, axis=1)
-    norm = np.nan_to_num(np.sqrt(squared) / obs.sigma_px, nan=np.inf)
-    outlier = np.zeros(len(norm), bool)
-    if outlier_px > 0:
-        outlier = _beyond(norm, widened(outlier_px, norm), obs.point, problem.n_points)
+    norm = _norms(problem, state)
+    outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
     scene.sightings.outlier[selection.rows] = outlier
-    scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(
-        squared, obs.point, ~outlier, problem.n_points
-    )
-
-
-def _beyond(norm: FloatArray, gate: float, point: IntArray, n_points: int) -> BoolArray:
-    """Return which residuals are beyond the gate, but never the two smallest of a point."""
-    beyond: BoolArray = norm > gate
-    suspect = np.zeros(n_points, bool)
-    suspect[point[beyond]] = True
-    rows = np.flatnonzero(suspect[point])
-    order = rows[np.lexsort((norm[rows], point[rows]))]
-    # Sorted by point, then size: the rows two places after the first of a point and later may go.
-    first = np.searchsorted(point[order], point[order])
-    may_go = np.zeros(len(norm), bool)
-    may_go[order] = np.arange(len(order)) - first >= 2
-    return beyond & may_go
+    if outlier_px > 0:
+        measured = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(norm), bool)
+        good = np.bincount(obs.point, ~outlier * np.where(measured, 2, 1), problem.n_points)
+        _displace(scene, selection.landmarks[good < 2])
+    error = norm * obs.sigma_px
+    scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, problem.n_points)
 
 
 def _rms_by_point(squared: FloatArray, point: IntArray, believed: BoolArray, n_points: int) -> FloatArray:
     """Return the root mean square error per coordinate of each point's believed observations, px."""
-    good = np.asarray(believed & ~np.isnan(squared))
+    good = np.asarray(believed & np.isfinite(squared))
     total = np.bincount(point[good], squared[good], n_points)
     count = np.bincount(point[good], minlength=n_points)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -180,11 +180,36 @@ def test_a_bad_window_does_not_lose_its_points() -> None:
     assert share < 0.01, f"{share:.1%} of the observations were left out"
 
 
-def test_two_views_of_each_point_stay() -> None:
-    norm = np.array([50.0, 60.0, 70.0, 1.0, 80.0, 90.0, 1.0, 2.0, 3.0])
-    point = np.array([0, 0, 0, 1, 1, 1, 2, 2, 2])
-    beyond = window._beyond(norm, 6.0, point, 3)
-    assert beyond.tolist() == [False, False, True, False, False, True, False, False, False]
+def test_a_point_that_its_views_contradict_loses_its_position_and_is_placed_anew() -> None:
+    settings = config()
+    scene = scene_of(settings)
+    window.merge(scene, selection := selected(scene, settings), solved(selection), 6.0)
+    wrong = selection.landmarks[::50]
+    true = scene.landmarks.position[wrong].copy()
+    scene.landmarks.position[wrong] += [0.0, 0.0, 3.0]
+    window.merge(scene, selection := selected(scene, settings), solved(selection), 6.0)
+    assert not scene.landmarks.has_position[wrong].any()
+    assert not scene.sightings.outlier.any()
+    window.merge(scene, selection := selected(scene, settings), solved(selection), 6.0)
+    np.testing.assert_allclose(scene.landmarks.position[wrong], true, atol=1e-2)
+
+
+def test_a_point_in_the_plane_of_a_camera_sits_out_the_solve() -> None:
+    """Its residual (1e8 px here) would outweigh all others: the objective stays that of the rest."""
+    settings = config()
+    scene = scene_of(settings)
+    window.merge(scene, selection := selected(scene, settings), solved(selection), 6.0)
+    row = scene.order[3]
+    camera = scene.keyframes.position[row]
+    forward = scene.keyframes.rotation[row][:, 0]
+    sideways = scene.keyframes.rotation[row][:, 1]
+    seen = scene.sightings.landmark[(scene.sightings.keyframe == row)][0]
+    scene.landmarks.position[seen] = camera + 5.0 * sideways + 1e-5 * forward
+    selection = selected(scene, settings)
+    assert seen in selection.lost.tolist()
+    assert seen not in selection.landmarks.tolist()
+    errors = objective.reprojection_errors(selection.problem, selection.problem.start)
+    assert np.nanmax(np.abs(errors)) < 1.0
 
 
 def test_the_cap_keeps_the_points_with_most_views() -> None:
