@@ -66,6 +66,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         *shared("launch"),
         *shared("config"),
+        *shared("bags"),
     ],
     python_requires=">=3.10",
     install_requires=[

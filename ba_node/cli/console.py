@@ -1,0 +1,61 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What commands print: tables, and a progress bar where someone is looking."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table with the first column flush left and the others flush right."""
+    columns = list(zip(head, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    lines = []
+    for row in (head, *rows):
+        first, *others = (
+            cell.ljust(width) if index == 0 else cell.rjust(width)
+            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  ".join([first, *others]).rstrip())
+    return "\n".join(lines)
+
+
+def facts(rows: Sequence[tuple[str, str]]) -> str:
+    """Return pairs of name and value, one a line."""
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name.ljust(width)}  {value}".rstrip() for name, value in rows)
+
+
+@contextmanager
+def progress_bar(name: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function to be called with what is done and the total; it shows nothing unless on a terminal."""
+    from tqdm import tqdm  # noqa: PLC0415  # slow to import
+
+    with tqdm(desc=name, unit=f" {unit}", disable=not sys.stderr.isatty(), leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+class TargetError(ValueError):
+    """A file that is asked for in a format that is not written."""
+
+
+def require_folder(path: Path | None) -> None:
+    """Raise TargetError if a file to write is in no folder, before long work is done for it."""
+    if path is not None and not path.parent.is_dir():
+        raise TargetError(f"{path}: there is no folder {path.parent}: make it first")
+
+
+def require_mcap(path: Path) -> None:
+    """Raise TargetError unless a recording may have this name."""
+    require_folder(path)
+    if path.suffix != ".mcap":
+        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so")

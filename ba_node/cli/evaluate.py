@@ -1,0 +1,87 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Compare a trajectory with a reference, pose by pose with the nearest stamp. Both are in the TUM format."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ba_node.cli.console import require_folder, table
+
+if TYPE_CHECKING:
+    from ba_node.estimate import Poses
+    from ba_node.io.trajectory import Trajectory
+
+SUMMARY = "compare a trajectory with a reference"
+EXAMPLE = "ba evaluate out/trajectory.tum ground_truth.tum --align se3"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("estimate", type=Path, metavar="ESTIMATE.tum")
+    parser.add_argument("reference", type=Path, metavar="REFERENCE.tum")
+    parser.add_argument(
+        "--align",
+        choices=("none", "se3", "sim3"),
+        default="se3",
+        help="what is fitted before comparing: nothing, rotation and translation, or scale too (default: se3)",
+    )
+    parser.add_argument(
+        "--max-difference",
+        type=float,
+        default=0.01,
+        metavar="S",
+        help="largest difference of the stamps of a pair, s (default: 0.01)",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
+    parser.add_argument("--plot", type=Path, metavar="PNG", help="draw both trajectories and the error over time")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the errors."""
+    from ba_node.evaluation.metrics import absolute_error  # noqa: PLC0415
+    from ba_node.io.json_file import write_json  # noqa: PLC0415
+    from ba_node.io.trajectory import read_tum  # noqa: PLC0415
+
+    require_folder(args.json)
+    require_folder(args.plot)
+    estimate, reference = (_poses(read_tum(path)) for path in (args.estimate, args.reference))
+    error = absolute_error(estimate, reference, args.align, args.max_difference)
+    rows = []
+    for name, unit, numbers in (("translation", "m", error.translation), ("rotation", "deg", error.rotation)):
+        figures = (numbers.rmse, numbers.mean, numbers.median, numbers.max, numbers.std)
+        rows.append([f"{name} [{unit}]", *(f"{value:.6f}" for value in figures)])
+    print(f"{len(error.stamp_ns)} of {len(estimate)} poses have a partner; alignment {args.align}")
+    print(table(["", "rmse", "mean", "median", "max", "std"], rows))
+    if args.align == "sim3":
+        print(f"scale {error.alignment.scale:.9f}")
+    if args.json:
+        write_json(
+            args.json,
+            {
+                "align": args.align,
+                "scale": error.alignment.scale,
+                "translation_m": error.translation.as_dict(),
+                "rotation_deg": error.rotation.as_dict(),
+            },
+        )
+    if args.plot:
+        import numpy as np  # noqa: PLC0415
+
+        from ba_node.evaluation.plot import Comparison, draw  # noqa: PLC0415
+
+        draw(args.plot, Comparison(None, estimate, reference, np.empty((0, 3)), args.align))
+    return 0
+
+
+def _poses(trajectory: Trajectory) -> Poses:
+    """Return a trajectory by time; its poses are numbered, as the file has no ids."""
+    import numpy as np  # noqa: PLC0415
+
+    from ba_node.estimate import Poses  # noqa: PLC0415
+
+    order = np.argsort(trajectory.stamp_ns, kind="stable")
+    ids = np.arange(len(trajectory), dtype=np.uint64)
+    return Poses(ids, trajectory.stamp_ns[order], trajectory.position[order], trajectory.orientation[order])

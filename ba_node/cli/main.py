@@ -1,0 +1,96 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run ``ba``: read the command line, hand over to the file of the command, turn errors into one line.
+
+Only the command that is asked for says what options it has: that of ``synth`` comes from modules that are slow to
+import, and ``ba --help`` is not to wait for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import NoReturn
+
+from ba_node import __version__
+from ba_node.cli import convert, demo, evaluate, params, play, replay, solve, synth
+
+COMMANDS: dict[str, ModuleType] = {
+    module.__name__.rsplit(".", 1)[1]: module
+    for module in (replay, play, solve, convert, evaluate, synth, demo, params)
+}
+USAGE_ERROR = 2
+INTERRUPTED = 130
+_ROS_PACKAGES = ("rclpy", "ba_msgs", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rcl_interfaces")
+
+
+class Parser(argparse.ArgumentParser):
+    """Report a wrong command line as every other error: in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and leave."""
+        self.exit(USAGE_ERROR, f"ba: error: {message}; see {self.prog} --help\n")
+
+
+def build_parser(command: str | None) -> argparse.ArgumentParser:
+    """Return the parser, with the options of one command (all if None)."""
+    parser = Parser(
+        prog="ba",
+        description="Offline tools of ba_node, the bundle-adjustment back-end for ROS 2.",
+        epilog="ba COMMAND --help tells more about each.",
+    )
+    parser.add_argument("--version", action="version", version=f"ba_node {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
+    for name, module in COMMANDS.items():
+        sub = subparsers.add_parser(
+            name,
+            help=module.SUMMARY,
+            description=module.__doc__,
+            epilog=f"example:\n  {module.EXAMPLE}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        if command in (None, name):
+            module.add_arguments(sub)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; return its exit code: 0, 2 for wrong input, 130 when interrupted."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    command = next((word for word in arguments if not word.startswith("-")), "")
+    args = build_parser(command).parse_args(arguments)
+    try:
+        code: int = COMMANDS[args.command].run(args)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # The reader of our output has enough. Python must not try to flush the rest when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except KeyboardInterrupt:
+        return _end(INTERRUPTED, "interrupted")
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in _ROS_PACKAGES:
+            raise
+        return _end(USAGE_ERROR, f"error: {error}: run this where ROS 2 is: after make setup in .venv, or sourced")
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _end(USAGE_ERROR, f"error: {where}{error.strerror or error}")
+    except ValueError as error:
+        # The errors of this package that speak of its input are all ValueErrors of its own.
+        if not type(error).__module__.startswith("ba_node."):
+            raise
+        return _end(USAGE_ERROR, f"error: {' '.join(str(error).split())}")
+
+
+def _end(code: int, message: str) -> int:
+    print(f"ba: {message}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,91 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run the back-end on a recording, without a middleware; the same recording gives the same bytes every time.
+
+Writes into DIR: trajectory.tum, trajectory_input.tum (the front-end's), points.ply, refined.mcap (the node's output
+topics), report.json, effective.yaml (all parameters), and ground_truth.tum if the recording has a ground truth.
+Older sessions of the recording go to DIR/session_<id>/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ba_node.cli.console import facts, progress_bar
+
+SUMMARY = "run the back-end on a recording, without a middleware"
+EXAMPLE = "ba replay bags/loop.mcap --out out/replay --set window.max_keyframes=30"
+
+_ERRORS = (
+    ("rms, all observations", "rms_px"),
+    ("rms without outliers", "rms_px_without_outliers"),
+    ("median residual", "median_px"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("bag", type=Path, metavar="BAG.mcap")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the results; made if missing"
+    )
+    parser.add_argument(
+        "--params", type=Path, metavar="YAML", help="parameters, in the form of ROS or plain (ba params)"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay."""
+    from ba_node.config import parse_assignment  # noqa: PLC0415
+    from ba_node.io.parameters import configure  # noqa: PLC0415
+    from ba_node.replay import Watch, replay  # noqa: PLC0415
+
+    config = configure(args.params, dict(parse_assignment(text) for text in args.set))
+    with progress_bar("replay", "messages") as progress:
+        report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress))
+    print(facts(_rows(report)))
+    _tell(report)
+    print(f"written to {args.out}")
+    return 0
+
+
+def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    statuses = report["solves_by_status"]
+    rows = [
+        ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
+        ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
+        *((label, f"{_short(report[key]['input'])} -> {_short(report[key]['refined'])} px") for label, key in _ERRORS),
+        ("solves", f"{report['solves']} ({', '.join(f'{n} {name.lower()}' for name, n in statuses.items())})"),
+        ("time in the solver", f"{report['solver_time_s']:.2f} s, slowest {1e3 * report['slowest_solve_s']:.0f} ms"),
+        ("outliers left out", str(report["outliers"])),
+        ("rejected", ", ".join(f"{n} {reason}" for reason, n in _rejected(report).items()) or "nothing"),
+    ]
+    error = report.get("trajectory_error_m")
+    if error:
+        rows.insert(5, ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)"))
+    if report["older_sessions"]:
+        rows.append(("older sessions", ", ".join(str(old["session_id"]) for old in report["older_sessions"])))
+    return rows
+
+
+def _short(value: float) -> str:
+    return f"{value:.3f}" if value < 1e5 else f"{value:.1e}"
+
+
+def _rejected(report: Mapping[str, Any]) -> dict[str, int]:
+    return {**report["bag_rejected"], **report["rejected"]}
+
+
+def _tell(report: Mapping[str, Any]) -> None:
+    """Print the last rejection in words; all of them are in report.json."""
+    notes = [*report["bag_notes"], *report["rejection_notes"]]
+    if notes:
+        print(f"ba: {notes[-1]}{' (more in report.json)' if len(notes) > 1 else ''}", file=sys.stderr)

@@ -1,0 +1,93 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Solve a problem of "Bundle Adjustment in the Large" (.txt, .bz2, .gz) as a whole.
+
+Poses, points and each camera's f, k1, k2 are free. The defaults are those of the method: squared loss for
+local_dinm, points behind a camera keep their residual, as the published results count. Parameters of the node
+(solver.*) and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ba_node.cli.console import require_folder
+
+if TYPE_CHECKING:
+    from ba_node.core.result import Iteration
+
+SUMMARY = "solve a BAL file as a whole"
+EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json"
+_HEAD = ("iter", "time [s]", "objective", "|gradient|", "linear", "step", "damping", "radius")
+_WIDTHS = (4, 9, 18, 11, 7, 9, 10, 10)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("problem", type=Path, metavar="PROBLEM")
+    parser.add_argument(
+        "--method", default="local_dinm", help="named method, see docs/methods.md (default: local_dinm)"
+    )
+    parser.add_argument(
+        "--iterations", type=int, metavar="N", help="cap on outer iterations (default: the method's, 50)"
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="change an option; repeatable")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write trace, options and figures as JSON")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem as a BAL file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve."""
+    from ba_node.io.bal import write_bal  # noqa: PLC0415
+    from ba_node.io.json_file import write_json  # noqa: PLC0415
+    from ba_node.solve_bal import solve_file  # noqa: PLC0415
+    from ba_node.solver_settings import solver_options  # noqa: PLC0415
+
+    assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]
+    options = solver_options(args.method, assignments)
+    require_folder(args.json)
+    require_folder(args.out)
+    solution = solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
+    figures = solution.as_dict()
+    figures["peak_rss_mb"] = _peak_rss_mb()
+    sizes, status = figures["problem"], figures["status"]
+    print(
+        f"{status.lower()}: {figures['reason']}\n"
+        f"objective {figures['objective_before']:.8g} -> {figures['objective_after']:.8g},"
+        f" rms {figures['rms_px_before']:.4g} -> {figures['rms_px_after']:.4g} px"
+        f" ({sizes['cameras']} cameras, {sizes['points']} points, {sizes['observations']} observations)\n"
+        f"set-up {figures['setup_s']:.3f} s, solver {figures['solve_s']:.3f} s, memory {figures['peak_rss_mb']:.0f} MB"
+    )
+    if args.json:
+        write_json(args.json, figures)
+    if args.out:
+        write_bal(args.out, solution.refined())
+    return 0 if solution.result.status.usable else 1
+
+
+def _show(row: Iteration) -> bool:
+    if row.iteration == 0:
+        print("  ".join(name.rjust(width) for name, width in zip(_HEAD, _WIDTHS, strict=True)))
+    cells = (
+        str(row.iteration),
+        f"{row.time_s:.3f}",
+        f"{row.objective:.8g}",
+        f"{row.gradient_norm:.3e}",
+        str(row.linear_iterations),
+        "taken" if row.accepted else "rejected",
+        f"{row.damping:.2e}",
+        f"{row.radius:.2e}",
+    )
+    print("  ".join(cell.rjust(width) for cell, width in zip(cells, _WIDTHS, strict=True)), flush=True)
+    return True
+
+
+def _peak_rss_mb() -> float:
+    """Return the largest memory of this process so far; the unit of the system call is kB, on macOS bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)

@@ -1,0 +1,84 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write measurements as the recording that a front-end would have left, and read the truth that comes with one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from ba_node.conversion import INPUT_TYPES, guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.estimate import Poses
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses, Measurement
+from ba_node.message_factory import header_message, pose_message, stamp_ns_from_message
+
+TRUTH_TOPIC = "ground_truth/pose"
+TRUTH_TYPE = "geometry_msgs/msg/PoseStamped"
+
+
+def record(path: Path | str, timeline: Iterable[tuple[str, int, Measurement]], truth: Poses | None = None) -> int:
+    """Write a recording; return the number of messages.
+
+    Args:
+        path: the file.
+        timeline: topic (one of INPUT_TYPES), stamp in ns, measurement; the rig before the tracks.
+        truth: true poses, by keyframe id, to be written beside the keyframes; None for none.
+
+    Raises:
+        BagError: a message cannot be written.
+        ConversionError: a stamp does not fit into a message.
+    """
+    rows = {} if truth is None else {int(keyframe): row for row, keyframe in enumerate(truth.keyframe_id)}
+    names: tuple[str, ...] = ()
+    fixed_frame = ""
+    count = 0
+    with BagWriter(path) as writer:
+        for topic, stamp_ns, measurement in timeline:
+            if isinstance(measurement, CameraRig):
+                names = measurement.names
+                message = rig_message(ROSBAGS_FACTORY, measurement, stamp_ns)
+            elif isinstance(measurement, Keyframe):
+                fixed_frame = measurement.frame_id
+                message = keyframe_message(ROSBAGS_FACTORY, measurement)
+                if truth is not None:
+                    pose = _true_pose(truth, rows[measurement.keyframe_id], fixed_frame)
+                    writer.write(TRUTH_TOPIC, TRUTH_TYPE, pose, stamp_ns)
+                    count += 1
+            elif isinstance(measurement, LandmarkGuesses):
+                message = guesses_message(ROSBAGS_FACTORY, measurement, stamp_ns, fixed_frame)
+            else:
+                message = tracks_message(ROSBAGS_FACTORY, measurement, stamp_ns, names[measurement.camera_index])
+            writer.write(topic, INPUT_TYPES[topic], message, stamp_ns, latched=isinstance(measurement, CameraRig))
+            count += 1
+    return count
+
+
+def read_truth(reader: BagReader) -> Poses | None:
+    """Return the true poses in a recording by time, numbered from 0; None if it has none.
+
+    Raises:
+        BagError: a message cannot be read.
+    """
+    topics = [
+        topic for topic, kind in reader.topics.items() if kind == TRUTH_TYPE and f"/{topic}".endswith(f"/{TRUTH_TOPIC}")
+    ]
+    messages = [reader.decode(topic, data) for topic, _, _, data in reader.messages(topics[:1])] if topics else []
+    if not messages:
+        return None
+    poses = [message.pose for message in messages]
+    stamps = np.array([stamp_ns_from_message(message.header.stamp) for message in messages], dtype=np.int64)
+    order = np.argsort(stamps, kind="stable")
+    position = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
+    orientation = np.array([(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses])
+    return Poses(np.arange(len(order), dtype=np.uint64), stamps[order], position[order], orientation[order])
+
+
+def _true_pose(truth: Poses, row: int, frame_id: str) -> object:
+    return ROSBAGS_FACTORY.make(
+        TRUTH_TYPE,
+        header=header_message(ROSBAGS_FACTORY, int(truth.stamp_ns[row]), frame_id),
+        pose=pose_message(ROSBAGS_FACTORY, truth.position[row], truth.orientation[row]),
+    )

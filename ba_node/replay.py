@@ -1,0 +1,198 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run the back-end on a recording, without a middleware: the same recording gives the same bytes every time.
+
+Every keyframe is solved once, when the next one begins, so nothing depends on how fast the machine is. Times are in
+report.json alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.conversion import output_messages
+from ba_node.estimate import Estimate, Poses
+from ba_node.evaluation.alignment import EvaluationError
+from ba_node.evaluation.metrics import absolute_error
+from ba_node.io.files import whole_file
+from ba_node.io.json_file import write_json
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.parameters import NODE_NAME, parameters_yaml
+from ba_node.io.ply import write_ply
+from ba_node.io.trajectory import write_tum
+from ba_node.measurements import Keyframe, Measurement
+from ba_node.recording import read_truth
+from ba_node.scene import Scene
+from ba_node.session_record import SessionRecord
+
+# Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
+# leave a file that grows with the square of its length.
+_WHOLE_MAP = ("path", "points")
+_GROWTH = 0.02
+
+
+class ReplayError(ValueError):
+    """A recording that leaves nothing to write."""
+
+
+def _no_clock() -> float:
+    return 0.0
+
+
+def _nothing(_done: int, _total: int) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a replay takes from outside.
+
+    Attributes:
+        clock: seconds, for the times in report.json alone.
+        progress: called with the number of messages read and of all messages.
+    """
+
+    clock: Callable[[], float] = _no_clock
+    progress: Callable[[int, int], None] = _nothing
+
+
+def replay(bag: Path, out: Path, config: Config, watch: Watch = Watch()) -> dict[str, Any]:
+    """Replay a recording and write the results; return the content of report.json.
+
+    The newest session's files go to ``out``, those of older sessions to ``out/session_<id>``. report.json is written
+    last: where it stands, all others are whole.
+
+    Raises:
+        BagError: the recording cannot be read.
+        ReplayError: it holds no keyframe that can be used.
+        OSError: a file cannot be written.
+    """
+    with BagReader(bag) as reader:
+        measurements = reader.measurements()
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "report.json").unlink(missing_ok=True)
+        with BagWriter(out / "refined.mcap") as writer:
+            run = _Run(config, writer, watch)
+            run.read((measurement for _, _, measurement in measurements), reader.message_count)
+            if not run.sessions:
+                raise ReplayError(f"{bag}: no keyframe in it can be used{_why(reader, run)}")
+        truth = read_truth(reader)
+        report = {"bag": bag.name, **_write(out, run.sessions, truth)}
+        report["bag_rejected"] = dict(sorted(reader.rejected.items()))
+        report["bag_notes"] = list(reader.rejection_notes)
+    with whole_file(out / "effective.yaml") as stream:
+        stream.write(parameters_yaml(config, comments=False).encode())
+    write_json(out / "report.json", report)
+    return report
+
+
+class _Run:
+    """One pass over the measurements."""
+
+    def __init__(self, config: Config, writer: BagWriter, watch: Watch) -> None:
+        self.backend = Backend(config, clock=watch.clock)
+        self.sessions: list[SessionRecord] = []
+        self._config = config
+        self._writer = writer
+        self._watch = watch
+        self._inputs: dict[int, Keyframe] = {}
+        self._written = 0
+
+    def read(self, measurements: Iterable[Measurement], total: int) -> None:
+        for done, measurement in enumerate(measurements, start=1):
+            if self.backend.completes(measurement):
+                self._solve()
+            self._add(measurement)
+            self._watch.progress(done, total)
+        self.backend.flush(final=True)
+        if self.backend.ready:
+            self._solve()
+        self._close(self.backend.scene)
+
+    def _add(self, measurement: Measurement) -> None:
+        backend, scene = self.backend, self.backend.scene
+        backend.add(measurement)
+        if backend.scene is not scene:
+            self._close(scene)
+        if isinstance(measurement, Keyframe) and backend.scene.find_keyframe(measurement.keyframe_id) is not None:
+            self._inputs.setdefault(measurement.keyframe_id, measurement)
+
+    def _solve(self) -> None:
+        estimate = self.backend.solve()
+        if estimate is None:
+            return
+        session = estimate.report.session_id
+        if not self.sessions or self.sessions[-1].session_id != session:
+            self.sessions.append(SessionRecord(session, inputs=self._inputs))
+            self._written = 0
+        self.sessions[-1].add(estimate, self.backend.scene)
+        if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
+            self._written = len(estimate.trajectory)
+            self._write(estimate, _AllTopics())
+        else:
+            self._write(estimate, _AllTopics(without=_WHOLE_MAP))
+
+    def _close(self, scene: Scene) -> None:
+        """End a session: its whole map is written once more if the last estimate was not."""
+        if self.sessions and self.sessions[-1].session_id == scene.session_id:
+            record = self.sessions[-1]
+            record.close(scene, self._config)
+            if record.last is not None and len(record.last.trajectory) > self._written:
+                self._write(record.last, _WHOLE_MAP)
+        self._inputs = {}
+
+    def _write(self, estimate: Estimate, wanted: Any) -> None:
+        timeless = dataclasses.replace(estimate, report=estimate.report.without_times())
+        for topic, kind, message in output_messages(ROSBAGS_FACTORY, timeless, self._config.output, wanted):
+            time_ns = max(0, estimate.stamp_ns)
+            self._writer.write(f"/{NODE_NAME}/{topic}", kind, message, time_ns, latched=topic in _WHOLE_MAP)
+
+
+class _AllTopics:
+    """Contain every topic but some."""
+
+    def __init__(self, without: tuple[str, ...] = ()) -> None:
+        self._without = without
+
+    def __contains__(self, topic: object) -> bool:
+        return topic not in self._without
+
+
+def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dict[str, Any]:
+    """Write the files of every session; return the figures of the newest, with those of the older ones in it."""
+    for index, record in enumerate(sessions):
+        folder = out if index == len(sessions) - 1 else out / f"session_{record.session_id}"
+        folder.mkdir(exist_ok=True)
+        assert record.last is not None
+        write_tum(folder / "trajectory.tum", record.trajectory)
+        write_tum(folder / "trajectory_input.tum", record.input_trajectory)
+        write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
+    figures = [record.as_dict() | _against(truth, record) for record in sessions]
+    if truth is not None:
+        write_tum(out / "ground_truth.tum", truth)
+    return {**figures[-1], "older_sessions": figures[:-1]}
+
+
+def _against(truth: Poses | None, record: SessionRecord) -> dict[str, Any]:
+    """Return the error against the truth in the recording before and after, if it has one that can be compared."""
+    if truth is None:
+        return {}
+    try:
+        errors = {
+            name: absolute_error(poses, truth).translation.rmse
+            for name, poses in (("input", record.input_trajectory), ("refined", record.trajectory))
+        }
+    except EvaluationError as error:
+        return {"trajectory_error_m": None, "trajectory_error_note": str(error)}
+    return {"trajectory_error_m": errors}
+
+
+def _why(reader: BagReader, run: _Run) -> str:
+    notes = [*run.backend.rejection_notes, *reader.rejection_notes]
+    return f": {notes[-1]}" if notes else ""

@@ -1,0 +1,123 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Collect what a replay gives, session by session, so that nothing is lost when the back-end forgets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ba_node import quality
+from ba_node.config import Config
+from ba_node.estimate import Estimate, Poses
+from ba_node.measurements import Keyframe
+from ba_node.scene import Scene
+
+
+@dataclass
+class SessionRecord:
+    """One session of a replay.
+
+    Attributes:
+        session_id: the session.
+        last: newest estimate.
+        forgotten: last values of the keyframes that the back-end has forgotten.
+        inputs: accepted keyframe messages by id.
+        refined: ids of the keyframes that took part in a usable solve.
+        statuses: solves by status.
+        solver_time_s: in all, s.
+        slowest: time and keyframe of the slowest solve.
+        iterations: outer iterations in all.
+        figures: what is known only while the session's scene exists, see :meth:`close`.
+    """
+
+    session_id: int
+    last: Estimate | None = None
+    forgotten: list[Poses] = field(default_factory=list)
+    inputs: dict[int, Keyframe] = field(default_factory=dict)
+    refined: set[int] = field(default_factory=set)
+    statuses: Counter[str] = field(default_factory=Counter)
+    solver_time_s: float = 0.0
+    slowest: tuple[float, int] = (0.0, 0)
+    iterations: int = 0
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    def add(self, estimate: Estimate, scene: Scene) -> None:
+        """Take in the next estimate."""
+        if self.last is not None:
+            before = self.last.trajectory
+            gone = ~np.isin(before.keyframe_id, estimate.trajectory.keyframe_id)
+            if gone.any():
+                self.forgotten.append(before[gone])
+        self.last = estimate
+        report = estimate.report
+        self.statuses[report.status.name] += 1
+        self.iterations += report.iterations
+        self.solver_time_s += report.solve_time_s
+        self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
+        rows = ((key, scene.find_keyframe(key)) for key in estimate.refined.keyframe_id.tolist())
+        self.refined.update(key for key, row in rows if row is not None and scene.keyframes.refined[row])
+
+    def close(self, scene: Scene, config: Config) -> None:
+        """Take the figures of the whole map from a scene that is about to go."""
+        of = {state: quality.summary(scene, config, state) for state in quality.STATES}
+        self.figures = {
+            **{name: {state: of[state][name] for state in of} for name in of["input"]},
+            "observations": len(scene.sightings),
+            "outliers": int(np.count_nonzero(scene.sightings.outlier)),
+            "rejected": dict(sorted(scene.log.rejected.items())),
+            "notices": dict(sorted(scene.log.notices.items())),
+            "rejection_notes": list(scene.log.notes),
+        }
+
+    @property
+    def trajectory(self) -> Poses:
+        """Return the newest estimate of every keyframe, by time."""
+        assert self.last is not None
+        return _by_time(_joined([*self.forgotten, self.last.trajectory]))
+
+    @property
+    def input_trajectory(self) -> Poses:
+        """Return the front-end's poses of the same keyframes, in the same order."""
+        poses = self.trajectory
+        inputs = [self.inputs[key] for key in poses.keyframe_id.tolist()]
+        return Poses(
+            poses.keyframe_id,
+            poses.stamp_ns,
+            np.array([keyframe.position for keyframe in inputs]).reshape(-1, 3),
+            np.array([keyframe.orientation for keyframe in inputs]).reshape(-1, 4),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures for report.json."""
+        assert self.last is not None
+        return {
+            "session_id": self.session_id,
+            "frame_id": self.last.frame_id,
+            "keyframes": len(self.last.trajectory) + sum(map(len, self.forgotten)),
+            "keyframes_refined": len(self.refined),
+            "landmarks": len(self.last.cloud),
+            **self.figures,
+            "solves": sum(self.statuses.values()),
+            "solves_by_status": dict(sorted(self.statuses.items())),
+            "iterations": self.iterations,
+            "solver_time_s": self.solver_time_s,
+            "slowest_solve_s": self.slowest[0],
+            "slowest_solve_keyframe_id": self.slowest[1],
+        }
+
+
+def _joined(parts: list[Poses]) -> Poses:
+    return Poses(
+        np.concatenate([part.keyframe_id for part in parts]),
+        np.concatenate([part.stamp_ns for part in parts]),
+        np.concatenate([part.position for part in parts]),
+        np.concatenate([part.orientation for part in parts]),
+    )
+
+
+def _by_time(poses: Poses) -> Poses:
+    return poses[np.argsort(poses.stamp_ns, kind="stable")]

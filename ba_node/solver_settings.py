@@ -1,0 +1,127 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Set options of a solver from text, by their bare names or by those of the parameters ``solver.*``."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from ba_node import native
+from ba_node.config import ConfigError, Value, parse_assignment
+from ba_node.core import methods
+from ba_node.core.loss import LOSSES
+from ba_node.core.native_kernels import BACKENDS
+from ba_node.core.objective import CHEIRALITY, Rules
+from ba_node.core.parameterisation import PARAMETERISATIONS
+from ba_node.core.scaling import SCALINGS
+from ba_node.core.solver import SolverOptions
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "parameterisation": PARAMETERISATIONS,
+    "loss": LOSSES,
+    "cheirality": CHEIRALITY,
+    "damping": SCALINGS,
+    "damping_policy": ("nielsen", "fast"),
+    "trust_region": SCALINGS,
+    "linear_solver": ("auto", "cholesky", "pcg"),
+    "preconditioner": ("none", "schur_block"),
+    "backend": BACKENDS,
+}
+# Numbers that may be zero; the others must be above it.
+_MAY_BE_ZERO = (
+    "t_eps",
+    "function_tolerance",
+    "gradient_tolerance",
+    "objective_tolerance",
+    "initial_damping",
+    "polish_steps",
+)
+_GROUP = "solver."
+# Where the parameter of the node has another name than the option.
+_RENAMED = {"loss_scale_px": "loss_scale"}
+_RULES = tuple(item.name for item in dataclasses.fields(Rules))
+_OPTIONS = tuple(item.name for item in dataclasses.fields(SolverOptions) if item.name not in ("method", "rules"))
+
+
+def option_names() -> tuple[str, ...]:
+    """Return the bare names that can be set."""
+    return _RULES + _OPTIONS
+
+
+def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
+    """Return the options of a named method with changes.
+
+    Args:
+        method: name of the method.
+        assignments: ``name=value``, the name being a field of SolverOptions or Rules or a parameter ``solver.*``;
+            the latter must also be in the range of the parameter.
+
+    Raises:
+        ConfigError: a method, name or value that does not exist or is out of range, or kernels that are not there.
+    """
+    changes: dict[str, Value] = {}
+    for text in assignments:
+        name, value = _read(text)
+        changes[name] = value
+    method = str(changes.pop("method", method))
+    if method not in methods.METHODS:
+        raise ConfigError(f"method {method!r} does not exist{_nearest(method, methods.METHODS)}")
+    options = methods.options(method)
+    rules = dataclasses.replace(options.rules, **_taken(changes, _RULES))
+    options = dataclasses.replace(options, rules=rules, **_taken(changes, _OPTIONS))
+    reason = native.missing(rules.parameterisation, rules.loss)
+    if options.backend == "native" and reason:
+        raise ConfigError(f"option backend = 'native': {reason}; take numpy or auto")
+    return options
+
+
+def describe(options: SolverOptions) -> dict[str, Value]:
+    """Return all options by their bare names."""
+    named = dataclasses.asdict(options)
+    rules: dict[str, Value] = named.pop("rules")
+    return {**named, **rules}
+
+
+def _taken(changes: dict[str, Value], names: Iterable[str]) -> dict[str, Any]:
+    """Remove some of the changes and return them."""
+    return {name: changes.pop(name) for name in names if name in changes}
+
+
+def _read(text: str) -> tuple[str, Value]:
+    name, separator, raw = text.partition("=")
+    if not separator:
+        raise ConfigError(f"{text!r}: expected name=value, for example loss=huber")
+    if name.startswith(_GROUP):
+        name, value = parse_assignment(text)
+        bare = name.removeprefix(_GROUP)
+        return _RENAMED.get(bare, bare), value
+    if name in _CHOICES:
+        if raw not in _CHOICES[name]:
+            raise ConfigError(f"option {name} = {raw!r}: choose one of {', '.join(_CHOICES[name])}")
+        return name, raw
+    if name not in option_names():
+        raise ConfigError(f"option {name!r} does not exist{_nearest(name, option_names())}")
+    return name, _number(name, raw)
+
+
+def _number(name: str, raw: str) -> int | float:
+    default = describe(SolverOptions())[name]
+    kind = int if isinstance(default, int) else float
+    low = 0 if name in _MAY_BE_ZERO else 1 if kind is int else 5e-324
+    try:
+        value = kind(raw)
+    except ValueError:
+        raise ConfigError(f"option {name} = {raw!r}: expected {kind.__name__}") from None
+    if not math.isfinite(value) or value < low:
+        raise ConfigError(f"option {name} = {raw}: expected a finite number {'>= 0' if low == 0 else '> 0'}")
+    return value
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"; did you mean {near[0]!r}?" if near else f": choose one of {', '.join(names)}"

@@ -1,0 +1,140 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ba_node.cli.main import COMMANDS, main
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert f"example:\n  ba {command}" in text
+
+
+def test_overview_names_every_command_and_is_fast() -> None:
+    began = time.perf_counter()
+    run = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "ba_node.cli.main", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert all(f"    {command} " in run.stdout for command in COMMANDS)
+    slow = [name for name in ("numpy", "scipy", "rosbags", "mcap", "rclpy") if f"| {name}\n" in run.stderr]
+    assert not slow, f"ba --help imports {slow}, {time.perf_counter() - began:.2f} s"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "the following arguments are required: COMMAND; see ba --help"),
+        (["replya"], "invalid choice: 'replya'"),
+        (["replay", "x.mcap"], "the following arguments are required: --out; see ba replay --help"),
+        (["evaluate", "a.tum", "b.tum", "--align", "affine"], "invalid choice: 'affine'"),
+    ],
+)
+def test_wrong_command_line_is_one_line(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert error.startswith("ba: error: ")
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run a command that must end with code 2; return its one line of error."""
+    code = main(arguments)
+    error = capsys.readouterr().err
+    assert code == 2, f"exit code {code}: {error}"
+    assert error.startswith("ba: error: ")
+    assert error.count("\n") == 1, f"not one line: {error!r}"
+    return error
+
+
+def test_bad_recordings_are_named(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "out")
+    empty, text = tmp_path / "empty.mcap", tmp_path / "text.mcap"
+    empty.write_bytes(b"")
+    text.write_text("not a recording")
+    stub = tmp_path / "stub.mcap"
+    stub.write_bytes(bag.read_bytes()[:60])
+    for path in (empty, text, stub, tmp_path / "missing.mcap", tmp_path):
+        assert str(path) in refused(capsys, "replay", str(path), "--out", out)
+    assert not (tmp_path / "out" / "report.json").exists()
+
+
+def test_recording_without_keyframes_names_what_is_missing(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 0
+    capsys.readouterr()
+    outputs = tmp_path / "out" / "refined.mcap"
+    error = refused(capsys, "replay", str(outputs), "--out", str(tmp_path / "again"))
+    assert "ba_msgs/msg/Keyframe" in error
+    assert "/ba_node/refined_keyframes" in error
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("window.max_keyframe=3", "did you mean 'window.max_keyframes'?"),
+        ("window.max_keyframes=many", "expected int"),
+        ("window.max_keyframes=1", "expected a number in [2, 100000]"),
+        ("solver.loss=cauchy", "choose one of squared, huber"),
+        ("window.max_keyframes", "expected name=value"),
+    ],
+)
+def test_bad_settings_are_explained(
+    setting: str, words: str, tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert words in refused(capsys, "replay", str(bag), "--out", str(tmp_path / "out"), "--set", setting)
+    assert not (tmp_path / "out").exists()
+
+
+def test_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(COMMANDS["params"], "run", interrupted)
+    assert main(["params"]) == 130
+    assert capsys.readouterr().err == "ba: interrupted\n"
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    script = "import sys; from ba_node.cli.main import main; sys.exit(main(['params']))"
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+
+
+def test_faults_of_our_own_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def faulty(_: object) -> int:
+        raise ValueError("a fault")
+
+    monkeypatch.setattr(COMMANDS["params"], "run", faulty)
+    with pytest.raises(ValueError, match="a fault"):
+        main(["params"])
+
+
+def test_missing_ros_is_named() -> None:
+    script = "import sys; sys.modules['rclpy'] = None; from ba_node.cli.main import main; sys.exit(main(['play', 'x']))"
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert run.returncode == 2
+    assert run.stderr.startswith("ba: error: import of rclpy halted")
+    assert run.stderr.count("\n") == 1

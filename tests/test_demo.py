@@ -1,0 +1,63 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The demo from end to end: node, player and listener in three processes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ba_node.io.ply import read_ply
+from ba_node.io.trajectory import read_tum
+
+pytest.importorskip("ba_msgs")
+demo = pytest.importorskip("ba_node.demo", reason="needs ROS 2")
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run_demo(out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "ba_node.cli.main", "demo", "--out", str(out), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=150, check=False, cwd=ROOT)
+
+
+@pytest.mark.dds
+@pytest.mark.slow
+def test_demo_improves_the_trajectory(tmp_path: Path) -> None:
+    run = run_demo(tmp_path)
+    assert run.returncode == 0, run.stdout + run.stderr
+    error = {
+        name: float(re.search(rf"translation {name} \[m\]\s+(\S+)", run.stdout)[1])  # type: ignore[index]
+        for name in ("before", "after")
+    }
+    assert error["after"] < 0.25 * error["before"], run.stdout
+    assert "60 of 60 came back refined" in run.stdout
+    assert len(read_tum(tmp_path / "trajectory.tum")) == 60
+    assert len(read_tum(tmp_path / "ground_truth.tum")) == 60
+    assert len(read_ply(tmp_path / "points.ply")[0]) > 500
+    assert (tmp_path / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    assert "stopped: 60 keyframes refined" in (tmp_path / "node.log").read_text(), "the node ends by SIGINT"
+
+
+def test_recording_without_truth_is_refused(tmp_path: Path, shared_data: Path) -> None:
+    run = run_demo(tmp_path, "--bag", str(shared_data / "kitti-stereo-vo" / "kitti_stereo.mcap"))
+    assert run.returncode == 2
+    assert "no keyframes with ground_truth/pose" in run.stderr
+    assert run.stderr.count("\n") == 1
+
+
+@pytest.mark.dds
+def test_a_node_that_fails_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = tmp_path / "broken_node.py"
+    module.write_text("import sys\nprint('no such luck')\nsys.exit(3)\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
+    monkeypatch.setattr(demo, "NODE_MODULE", "broken_node")
+    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.setenv(name, os.environ.get(name, ""))
+    with pytest.raises(demo.DemoError, match=r"broken_node ended with code 3: .*node.log: no such luck"):
+        demo.run(demo.shipped_bag(), tmp_path / "out", lambda _: None)

@@ -1,0 +1,107 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layers, asserted from the imports: each module may use what stands below it, and nothing else."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "ba_node"
+
+# Lowest first. A module may import modules of the layers before its own, and of its own layer where SAME says so.
+LAYERS: dict[str, tuple[str, ...]] = {
+    "config": ("config",),
+    "native": ("native",),
+    "core": ("core",),
+    "scene": ("measurements", "estimate", "tables", "records", "rejections", "ingest", "scene"),
+    "window": ("gauge", "initial_points", "window", "quality"),
+    "backend": ("backend",),
+    "services": ("message_factory", "output_messages", "conversion", "io", "evaluation", "synthetic"),
+    "tools": (
+        "bal_timeline",
+        "recording",
+        "session_record",
+        "solver_settings",
+        "solve_bal",
+        "replay",
+        "ros",
+        "demo",
+        "cli",
+    ),
+}
+RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
+# Who may use its neighbours in a layer, and which of them.
+SAME = {
+    "records": {"tables"},
+    "ingest": {"measurements", "rejections"},
+    "scene": {"measurements", "tables", "records", "rejections", "ingest"},
+    "window": {"gauge", "initial_points"},
+    "quality": {"window"},
+    "output_messages": {"message_factory"},
+    "conversion": {"message_factory", "output_messages"},
+    "io": {"message_factory", "output_messages", "conversion"},
+    "recording": set(),
+    "solve_bal": {"solver_settings"},
+    "replay": {"recording", "session_record"},
+    "demo": {"recording", "ros"},
+    "cli": {"bal_timeline", "recording", "solver_settings", "solve_bal", "replay", "ros", "demo"},
+}
+ROS_ONLY = ("rclpy", "ba_msgs", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rcl_interfaces", "tf2_msgs")
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def unit(path: Path) -> str:
+    """Return the module or folder directly below the package that a file belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(path: Path) -> list[str]:
+    """Return the full names of everything that a file imports anywhere, for typing too."""
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
+
+
+def test_every_module_has_a_layer() -> None:
+    units = {unit(path) for path in MODULES} - {"__init__"}
+    assert units == set(RANK)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_go_down(path: Path) -> None:
+    here = unit(path)
+    for name in imports(path):
+        parts = name.split(".")
+        if parts[0] in ROS_ONLY:
+            assert here == "ros", f"{path} imports {name}"
+        if parts[0] != "ba_node" or here == "__init__" or parts[1] in (here, "__version__"):
+            continue
+        below = RANK[parts[1]] < RANK[here] or parts[1] in SAME.get(here, ())
+        assert below, f"{here} may not import {parts[1]} ({name} in {path.name})"
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("ba_node.config", ("numpy",)),
+        ("ba_node.core.methods", ("mcap", "rosbags", "rclpy", "yaml")),
+        ("ba_node.backend", ("mcap", "rosbags", "matplotlib", *ROS_ONLY)),
+        ("ba_node.replay", ("matplotlib", *ROS_ONLY)),
+    ],
+)
+def test_import_brings_nothing_from_above(module: str, absent: tuple[str, ...]) -> None:
+    script = f"import {module}, sys; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    loaded = set(run.stdout.split())
+    assert "ba_node" in loaded
+    assert not loaded & set(absent), f"{module} brings {sorted(loaded & set(absent))}"

@@ -1,0 +1,151 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write config/ba_node.yaml, docs/parameters.md and docs/topics.md from config.py and the message definitions.
+
+Run it without arguments to write them, with --check to learn whether they are up to date (exit code 1 if not).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ba_node.config import Config
+from ba_node.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.io.parameters import parameters_markdown, parameters_yaml
+from ba_node.rejections import NOTICES, REASONS
+
+ROOT = Path(__file__).resolve().parent.parent
+LICENCE = "# Copyright 2026 The ba_node Authors\n# SPDX-License-Identifier: Apache-2.0\n"
+MADE_BY = "python tools/generate_docs.py"
+
+INPUTS = {
+    "keyframes": ("reliable", "Pose of the body at every keyframe, as the front-end has it."),
+    "feature_tracks": ("reliable", "What one camera saw in one keyframe; one message a camera."),
+    "landmark_guesses": ("reliable", "Optional: first positions of points."),
+    "camera_rig": ("latched", "Cameras and where they sit on the body. Sent once is enough."),
+    "camera_info": ("latched or not", "Instead of a rig: one camera at the body's origin."),
+}
+OUTPUTS = {
+    "refined_keyframes": ("reliable", "Poses of the window after each solve, by id."),
+    "pose": ("reliable", "The same, one message a keyframe with the keyframe's stamp."),
+    "path": ("latched", "Poses of all keyframes kept, newest `output.path_max_poses`."),
+    "points": ("latched", "The map: fields x, y, z (m), rms_px (float32), views (uint32)."),
+    "report": ("reliable", "How each solve went, failed and skipped ones too."),
+}
+
+TOPICS_INTRO = """\
+# Topics
+
+`ba_node` takes the messages of `ba_msgs` on relative names, so that a namespace or a remapping
+(`-r keyframes:=front/keyframes`) connects it to a front-end. Outputs are below the node's own name. "Latched" is
+reliable with durability transient local, "reliable" is reliable and volatile.
+
+How a front-end talks to it:
+
+1. Publish the cameras once, latched: `camera_rig`, or `camera_info` for one camera.
+2. For every keyframe publish `keyframes`, and `feature_tracks` once for each camera. They are paired by `session_id`
+   and `keyframe_id`, never by time, and may come in any order.
+3. Give a point the same `track_id` in every image that sees it. Points that only one image sees are not used, unless
+   they have a depth.
+4. After a restart, or when tracking was lost for good, raise `session_id`: a new map begins.
+
+A message that cannot be used is counted by reason in `report`, named in the node's log, and leaves everything known
+as it was.
+"""
+
+PARAMETERS_INTRO = """\
+# Parameters
+
+The same names serve the node (`--ros-args -p window.max_keyframes:=30`, `--params-file`, `ros2 param set`) and
+`ba replay` (`--set window.max_keyframes=30`, `--params my.yaml`). A change is checked as a whole: a name that does not
+exist or a value out of range is refused with the reason, and nothing is changed. `ba params` prints a file with all
+defaults, the same as `config/ba_node.yaml`.
+
+"""
+
+
+def topics_markdown() -> str:
+    """Return docs/topics.md."""
+    parts = [TOPICS_INTRO]
+    for title, prefix, types, about in (
+        ("Inputs", "", INPUT_TYPES, INPUTS),
+        ("Outputs", "~/", OUTPUT_TYPES, OUTPUTS),
+    ):
+        if types.keys() != about.keys():
+            raise SystemExit(f"tools/generate_docs.py describes {sorted(about)}, the node has {sorted(types)}")
+        lines = [f"## {title}\n", "| topic | type | quality of service | what |", "|---|---|---|---|"]
+        lines += [
+            f"| `{prefix}{topic}` | `{kind}` | {about[topic][0]} | {about[topic][1]} |" for topic, kind in types.items()
+        ]
+        parts.append("\n".join(lines) + "\n")
+    parts.append("## Messages\n")
+    parts += [_message(path) for path in sorted((ROOT / "msg_defs" / "msg").glob("*.msg"))]
+    parts.append(_table("Reasons for rejection", "In `report`, and in report.json of a replay.", REASONS))
+    parts.append(_table("Notices", "Counted in report.json of a replay; nothing is lost by them.", NOTICES))
+    return "\n".join(parts)
+
+
+def parameters_page() -> str:
+    """Return docs/parameters.md."""
+    return PARAMETERS_INTRO + parameters_markdown()
+
+
+def yaml_file() -> str:
+    """Return config/ba_node.yaml."""
+    return f"{LICENCE}# All parameters with their defaults; written by `{MADE_BY}`.\n{parameters_yaml(Config())}"
+
+
+def pages() -> dict[str, str]:
+    """Return the content of every generated file by its path from the root."""
+    note = f"<!-- Written by `{MADE_BY}`: do not edit. -->\n\n"
+    return {
+        "config/ba_node.yaml": yaml_file(),
+        "docs/parameters.md": note + parameters_page(),
+        "docs/topics.md": note + topics_markdown(),
+    }
+
+
+def _message(path: Path) -> str:
+    """Return a table of the fields of a message."""
+    about: list[str] = []
+    rows: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        code, _, comment = (part.strip() for part in line.partition("#"))
+        if not code and not rows and comment:
+            about.append(comment)
+        elif code:
+            kind, _, name = code.partition(" ")
+            rows.append(f"| `{name.strip()}` | `{kind}` | {comment} |")
+    head = f"### ba_msgs/{path.stem}\n\n{' '.join(about)}\n\n| field | type | meaning |\n|---|---|---|\n"
+    return head + "\n".join(rows) + "\n"
+
+
+def _table(title: str, about: str, entries: dict[str, str]) -> str:
+    rows = "\n".join(f"| `{name}` | {doc} |" for name, doc in entries.items())
+    return f"## {title}\n\n{about}\n\n| reason | what |\n|---|---|\n{rows}\n"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write or check the files."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a file is stale")
+    args = parser.parse_args(argv)
+    stale = []
+    for name, text in pages().items():
+        path = ROOT / name
+        if path.is_file() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale.append(name)
+        if not args.check:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    if stale:
+        print(f"{'stale' if args.check else 'written'}: {', '.join(stale)}")
+    return 1 if args.check and stale else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
