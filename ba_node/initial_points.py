@@ -65,9 +65,15 @@ def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig) ->
     return np.where(take_guess[:, None], guess, points)
 
 
-def widened(gate: float, errors: FloatArray) -> float:
-    """Return a gate that lets the bulk of the errors pass: three robust standard deviations, where there is a bulk."""
-    if len(errors) < _BULK:
+def widened(gate: float, errors: FloatArray, bulk: int = _BULK) -> float:
+    """Return a gate that lets the bulk of the errors pass: three robust standard deviations.
+
+    Args:
+        gate: smallest gate.
+        errors: to look at.
+        bulk: with fewer errors than this there is no bulk, and the gate stays.
+    """
+    if len(errors) < bulk:
         return gate
     return max(gate, _GATE_SIGMAS * _MAD_TO_SIGMA * float(np.median(errors)))
 

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from ba_node.scene import Scene
     from ba_node.tables import BoolArray, FloatArray, IntArray
 
-# A keyframe with fewer observations (two residuals each, six unknowns) is not refined: it would follow the noise.
-MIN_OBSERVATIONS = 6
+# A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
+MIN_OBSERVATIONS = 4
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
 # the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
 _ABSURD = 25.0
@@ -280,8 +280,12 @@ def _usable(scene: Scene, part: _Part, origin: FloatArray, positions: FloatArray
     problem = problem_of(scene, rows, part.keyframes, part.landmarks, origin, known, config)
     norm = _norms(problem, problem.start)
     placed = ~np.isnan(positions[problem.observations.point, 0])
-    gate = widened(_ABSURD * config.tracks.outlier_px, norm[placed & usable[rows]])
-    usable[rows[norm > gate]] = False
+    counted = placed & usable[rows]
+    gate = np.empty(len(part.keyframes))
+    for k in range(len(gate)):
+        # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
+        gate[k] = widened(_ABSURD * config.tracks.outlier_px, norm[counted & (problem.observations.keyframe == k)], 1)
+    usable[rows[norm > gate[problem.observations.keyframe]]] = False
     return usable
 
 

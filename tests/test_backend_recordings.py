@@ -100,3 +100,11 @@ def test_images_of_a_whole_map_as_keyframes(shared_data: Path) -> None:
     lengths = np.hypot(*quality.errors_px(backend.scene, backend.config, "refined").T)
     median, most = np.percentile(lengths, [50, 99])
     assert median < 0.35 and most < 6.0, f"median {median:.3f} px, 99 % below {most:.3f} px"
+
+
+def test_a_keyframe_that_starts_far_off_is_brought_in(shared_data: Path) -> None:
+    """Seven points, five of them seen by the third image, whose residuals begin at some 150 px."""
+    backend = Backend(Config())
+    replay(backend, messages_of(read_bal(shared_data / "gtsam-dubrovnik-small" / "dubrovnik-3-7-pre.txt")))
+    assert backend.scene.keyframes.refined.all()
+    assert backend.rms_px("refined") < 0.5, f"{backend.rms_px('refined'):.2f} px"

@@ -25,15 +25,19 @@ BACKENDS = ("auto", "native", "numpy")
 _LOSSES = ("squared", "huber")
 
 
+class KernelsError(ValueError):
+    """Kernels that were asked for by name and cannot be had."""
+
+
 def make(problem: Problem, rules: Rules, backend: str = "auto") -> Kernels:
     """Return the kernels of a problem.
 
     Raises:
-        ValueError: native is asked for and is not built, or does not have what the rules ask for.
+        KernelsError: native is asked for and is not built, or does not have what the rules ask for.
     """
     reason = native.missing(rules.parameterisation, rules.loss)
     if backend == "native" and reason:
-        raise ValueError(f"backend native: {reason}; take numpy or auto")
+        raise KernelsError(f"backend native: {reason}; take numpy or auto")
     if backend == "numpy" or reason:
         return NumpyKernels(problem, rules)
     return NativeKernels(problem, rules)

@@ -112,8 +112,12 @@ def solve(
     problem.check()
     if len(problem.observations) == 0 or (problem.fixed.all() and problem.n_points == 0):
         return Result(problem.start, Status.SKIPPED, "no observations: nothing to solve", options.method, ())
+    try:
+        run = _Run(problem, options, clock, on_iteration)
+    except native_kernels.KernelsError as error:
+        return Result(problem.start, Status.FAILED, str(error), options.method, ())
     with np.errstate(all="ignore"):
-        return _Run(problem, options, clock, on_iteration).run()
+        return run.run()
 
 
 class _Run:
@@ -129,7 +133,8 @@ class _Run:
         self.options = options
         self.clock, self.began = clock, clock()
         self.on_iteration = on_iteration
-        self.kernels = native_kernels.make(problem, options.rules, options.backend)
+        with np.errstate(all="ignore"):
+            self.kernels = native_kernels.make(problem, options.rules, options.backend)
         self.free = np.flatnonzero(~problem.fixed)
         self.state = problem.start
         self.value = np.inf

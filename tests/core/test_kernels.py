@@ -13,8 +13,10 @@ import pytest
 from ba_node import native
 from ba_node.core import cameras, native_kernels, solver
 from ba_node.core.kernels import Kernels
+from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Objective, Rules
 from ba_node.core.problem import Problem, State
+from ba_node.core.result import Status
 
 Make = Callable[..., tuple[Problem, State]]
 SHAPES = {
@@ -151,5 +153,15 @@ def test_native_solves_end_where_numpy_ends(make_problem: Make) -> None:
 
 def test_native_is_refused_where_it_lacks_something(make_problem: Make) -> None:
     problem, _ = make_problem()
-    with pytest.raises(ValueError, match="native"):
-        native_kernels.make(problem, Rules(parameterisation="global"), "native")
+    rules = Rules(parameterisation="global")
+    with pytest.raises(native_kernels.KernelsError, match="native"):
+        native_kernels.make(problem, rules, "native")
+    result = solver.solve(problem, dataclasses.replace(solver.SolverOptions(), rules=rules, backend="native"))
+    assert result.status == Status.FAILED and "backend native" in result.reason
+
+
+def test_without_a_compiler_numpy_takes_over(make_problem: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "kernels", None)
+    problem, _ = make_problem()
+    assert isinstance(native_kernels.make(problem, Rules()), NumpyKernels)
+    assert solver.solve(problem, solver.SolverOptions()).status.usable
