@@ -88,9 +88,7 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
         depth[failed] = np.nan
     good &= _first_of_each(tracks, good, log)
     ids = np.asarray(tracks.track_id).astype(np.uint64)
-    return dataclasses.replace(
-        tracks, track_id=ids[good], uv=uv[good], sigma_px=sigma[good], depth_m=depth[good]
-    )
+    return dataclasses.replace(tracks, track_id=ids[good], uv=uv[good], sigma_px=sigma[good], depth_m=depth[good])
 
 
 def clean_guesses(guesses: LandmarkGuesses, log: RejectionLog) -> LandmarkGuesses | None:

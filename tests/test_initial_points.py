@@ -23,9 +23,7 @@ def problem_of(baseline_m: float = 1.0, shift_px: float = 0.0, depth_m: float | 
     translation = np.array([[-baseline_m * i, 0.0, 0.0] for i in range(views)])
     state = State(np.tile(np.eye(3), (views, 1, 1)), translation, POINT[None], np.empty((0, 3)))
     zeros = np.zeros(views, np.intp)
-    obs = Observations(
-        np.arange(views), zeros, zeros, np.zeros((views, 2)), np.ones(views), np.empty(0), np.empty(0)
-    )
+    obs = Observations(np.arange(views), zeros, zeros, np.zeros((views, 2)), np.ones(views), np.empty(0), np.empty(0))
     problem = Problem(state, np.zeros(views, bool), rig, obs)
     uv = objective.reprojection_errors(problem, state)
     uv[-1, 1] += shift_px
