@@ -34,11 +34,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node import quality, window
+from ba_node import window
 from ba_node.core import geometry, methods, solver
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import CameraRig, Keyframe, Measurement
-from ba_node.scene import Scene
+from ba_node.scene.scene import Scene
+from ba_node.window import quality
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.core.problem import Cameras
     from ba_node.core.result import Iteration
-    from ba_node.tables import IntArray
+    from ba_node.scene.tables import IntArray
 
 FINISHED_KEPT = 8
 # Keyframes from which it is learned how many cameras deliver.

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hold what a front-end delivers, as arrays: the neutral form of the input messages.
 
-The node and the offline tools both turn their messages into these (``conversion.py``); from here
+The node and the offline tools both turn their messages into these (``messages/``); from here
 on nothing knows whether data came over a topic or from a file. Nothing in this module judges
-values: lengths and numbers are checked where they are used, in ``scene.py``, which counts what it rejects.
+values: lengths and numbers are checked where they are used, in ``scene/``, which counts what it rejects.
 """
 
 from __future__ import annotations

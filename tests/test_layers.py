@@ -18,38 +18,19 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "config": ("config",),
     "native": ("native",),
     "core": ("core",),
-    "scene": ("measurements", "estimate", "tables", "records", "rejections", "ingest", "scene"),
-    "window": ("gauge", "initial_points", "window", "quality"),
+    "scene": ("measurements", "estimate", "scene"),
+    "window": ("window",),
     "backend": ("backend",),
-    "services": ("message_factory", "output_messages", "conversion", "io", "evaluation", "synthetic"),
-    "tools": (
-        "bal_timeline",
-        "recording",
-        "session_record",
-        "solver_settings",
-        "solve_bal",
-        "replay",
-        "ros",
-        "demo",
-        "cli",
-    ),
+    "services": ("messages", "io", "evaluation", "synthetic"),
+    "tools": ("ros", "offline", "cli"),
 }
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
 SAME = {
-    "records": {"tables"},
-    "ingest": {"measurements", "rejections"},
-    "scene": {"measurements", "tables", "records", "rejections", "ingest"},
-    "window": {"gauge", "initial_points"},
-    "quality": {"window"},
-    "output_messages": {"message_factory"},
-    "conversion": {"message_factory", "output_messages"},
-    "io": {"message_factory", "output_messages", "conversion"},
-    "recording": set(),
-    "solve_bal": {"solver_settings"},
-    "replay": {"recording", "session_record"},
-    "demo": {"recording", "ros"},
-    "cli": {"bal_timeline", "recording", "solver_settings", "solve_bal", "replay", "ros", "demo"},
+    "scene": {"measurements"},
+    "io": {"messages"},
+    "offline": {"ros"},
+    "cli": {"offline", "ros"},
 }
 ROS_ONLY = ("rclpy", "ba_msgs", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rcl_interfaces", "tf2_msgs")
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -96,7 +77,7 @@ def test_imports_go_down(path: Path) -> None:
         ("ba_node.config", ("numpy",)),
         ("ba_node.core.methods", ("mcap", "rosbags", "rclpy", "yaml")),
         ("ba_node.backend", ("mcap", "rosbags", "matplotlib", *ROS_ONLY)),
-        ("ba_node.replay", ("matplotlib", *ROS_ONLY)),
+        ("ba_node.offline.replay", ("matplotlib", *ROS_ONLY)),
     ],
 )
 def test_import_brings_nothing_from_above(module: str, absent: tuple[str, ...]) -> None:

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ba_node.config import Config
-from ba_node.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
-from ba_node.rejections import NOTICES, REASONS
+from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.scene.rejections import NOTICES, REASONS
 
 ROOT = Path(__file__).resolve().parent.parent
 LICENCE = "# Copyright 2026 The ba_node Authors\n# SPDX-License-Identifier: Apache-2.0\n"

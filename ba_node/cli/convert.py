@@ -25,9 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert."""
-    from ba_node.bal_timeline import timeline  # noqa: PLC0415
     from ba_node.io.bal import read_bal  # noqa: PLC0415
-    from ba_node.recording import record  # noqa: PLC0415
+    from ba_node.offline.bal_timeline import timeline  # noqa: PLC0415
+    from ba_node.offline.recording import record  # noqa: PLC0415
 
     require_mcap(args.target)
     bal = read_bal(args.source)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from ba_node.cli.console import facts, table
 
 if TYPE_CHECKING:
-    from ba_node.demo import Outcome
+    from ba_node.offline.demo import Outcome
 
 SUMMARY = "run the node on a recording and compare with ground truth"
 EXAMPLE = "ba demo --out out/demo"
@@ -31,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the demo."""
-    from ba_node.demo import run as run_demo  # noqa: PLC0415
-    from ba_node.demo import shipped_bag, write  # noqa: PLC0415
+    from ba_node.offline.demo import run as run_demo  # noqa: PLC0415
+    from ba_node.offline.demo import shipped_bag, write  # noqa: PLC0415
 
     outcome = run_demo(args.bag or shipped_bag(), args.out, lambda text: print(text, flush=True))
     errors = write(outcome, args.out)

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay."""
     from ba_node.config import parse_assignment  # noqa: PLC0415
     from ba_node.io.parameters import configure  # noqa: PLC0415
-    from ba_node.replay import Watch, replay  # noqa: PLC0415
+    from ba_node.offline.replay import Watch, replay  # noqa: PLC0415
 
     config = configure(args.params, dict(parse_assignment(text) for text in args.set))
     with progress_bar("replay", "messages") as progress:

@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     """Solve."""
     from ba_node.io.bal import write_bal  # noqa: PLC0415
     from ba_node.io.json_file import write_json  # noqa: PLC0415
-    from ba_node.solve_bal import solve_file  # noqa: PLC0415
-    from ba_node.solver_settings import solver_options  # noqa: PLC0415
+    from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
+    from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
 
     assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]
     options = solver_options(args.method, assignments)

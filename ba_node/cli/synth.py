@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Generate."""
-    from ba_node.recording import record  # noqa: PLC0415
+    from ba_node.offline.recording import record  # noqa: PLC0415
     from ba_node.synthetic import SyntheticOptions, declarations, generate  # noqa: PLC0415
 
     require_mcap(args.target)

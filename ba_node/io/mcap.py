@@ -9,12 +9,12 @@ from collections import Counter, deque
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from ba_node.conversion import INPUT_TYPES, measurement_from_message
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError
 from ba_node.io.bag_index import BagIndex, read_index, read_messages
 from ba_node.io.bag_writer import BagWriter
 from ba_node.io.ros_types import ROSBAGS_FACTORY, TypeMismatchError
+from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator

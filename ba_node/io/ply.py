@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.io.files import whole_file
-from ba_node.output_messages import POINT_DTYPE, point_records
+from ba_node.messages.outputs import POINT_DTYPE, point_records
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -31,7 +31,7 @@ class TypeMismatchError(ValueError):
 
 
 class RosbagsFactory:
-    """Make messages as dataclasses of rosbags (a :class:`~ba_node.conversion.MessageFactory`)."""
+    """Make messages as dataclasses of rosbags (a :class:`~ba_node.messages.conversion.MessageFactory`)."""
 
     def make(self, type_name: str, **fields: Any) -> Any:
         """Return a message with all its fields."""

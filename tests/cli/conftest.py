@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ba_node.io.bal import BalProblem, write_bal
-from ba_node.recording import record
+from ba_node.offline.recording import record
 from ba_node.synthetic import SyntheticOptions, generate
 
 KEYFRAMES = 8

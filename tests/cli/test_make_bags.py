@@ -16,7 +16,7 @@ from ba_node.core.geometry import inverse, matrix_from_quaternion
 from ba_node.io.bal import read_bal
 from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.recording import read_truth
+from ba_node.offline.recording import read_truth
 
 SMALL = ["--keyframes", "5", "--landmarks", "200", "--tracks", "30", "--path", "line", "--length-m", "10"]
 

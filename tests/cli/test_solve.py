@@ -13,7 +13,7 @@ from ba_node.cli.main import main
 from ba_node.config import ConfigError
 from ba_node.core import methods
 from ba_node.io.bal import read_bal
-from ba_node.solver_settings import describe, option_names, solver_options
+from ba_node.offline.solver_settings import describe, option_names, solver_options
 
 ROW = {"iteration", "time_s", "objective", "gradient_norm", "linear_iterations", "accepted", "damping", "radius"}
 

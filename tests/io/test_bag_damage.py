@@ -13,11 +13,11 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
-from ba_node.conversion import INPUT_TYPES, keyframe_message, rig_message, tracks_message
 from ba_node.io import ros_types
 from ba_node.io.bag_index import MAGIC
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
+from ba_node.messages.conversion import INPUT_TYPES, keyframe_message, rig_message, tracks_message
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,7 +21,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from ba_node.config import OutputConfig
-from ba_node.conversion import (
+from ba_node.io import ros_types
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.messages.conversion import (
     INPUT_TYPES,
     OUTPUT_TYPES,
     guesses_message,
@@ -31,9 +34,6 @@ from ba_node.conversion import (
     rig_message,
     tracks_message,
 )
-from ba_node.io import ros_types
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate

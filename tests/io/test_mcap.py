@@ -15,7 +15,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as RosbagsReader
 
 from ba_node.config import OutputConfig
-from ba_node.conversion import (
+from ba_node.io import ros_types
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.messages.conversion import (
     INPUT_TYPES,
     guesses_message,
     keyframe_message,
@@ -23,9 +26,6 @@ from ba_node.conversion import (
     rig_message,
     tracks_message,
 )
-from ba_node.io import ros_types
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 
 if TYPE_CHECKING:
     from collections.abc import Callable

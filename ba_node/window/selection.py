@@ -1,15 +1,14 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn the newest part of a scene into a problem, and put the solution back.
+"""Turn the newest part of a scene into a problem.
 
 Free are the newest ``window.max_keyframes`` keyframes. Older ones that were refined before and see the same points take
-part with fixed poses.
-A point takes part when two images see it (a stereo pair counts), or one with a measured depth.
+part with fixed poses. A point takes part when two images see it (a stereo pair counts), or one with a measured depth.
 
 What holds the problem in place is chosen in ``gauge.py``. A keyframe with too few observations is held out of it, and
 goes on following its predecessor (``Scene.settle_poses``).
 
-``select`` does not change the scene (but for settling poses), ``merge`` does, and only after a usable solve. The
+``select`` does not change the scene (but for settling poses); ``merging.py`` does, and only after a usable solve. The
 problem has its origin at its oldest keyframe: far from the map's origin (UTM) no digits are lost.
 """
 
@@ -21,16 +20,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node import gauge
 from ba_node.core import geometry, objective
 from ba_node.core.problem import Observations, Problem, State
-from ba_node.initial_points import initial_points, widened
+from ba_node.window import gauge
+from ba_node.window.initial_points import initial_points, widened
 
 if TYPE_CHECKING:
     from ba_node.config import Config
-    from ba_node.core.result import Result
-    from ba_node.scene import Scene
-    from ba_node.tables import BoolArray, FloatArray, IntArray
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
@@ -116,43 +114,6 @@ def select(scene: Scene, config: Config, end: int | None = None) -> Selection | 
         origin,
         held.unscaled,
     )
-
-
-def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float) -> None:
-    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
-    state = result.state
-    if not result.status.usable or not state.is_finite():
-        return
-    state = _scaled(scene, selection, state)
-    free = ~selection.problem.fixed
-    rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
-    rows = selection.keyframes[free]
-    scene.keyframes.rotation[rows] = geometry.nearest_rotation(rotation)
-    scene.keyframes.position[rows] = position + selection.origin
-    scene.keyframes.refined[selection.keyframes] = True
-    scene.landmarks.position[selection.landmarks] = state.points + selection.origin
-    scene.landmarks.has_position[selection.landmarks] = True
-    _judge(scene, selection, state, outlier_px)
-    _displace(scene, selection.lost)
-
-
-def _scaled(scene: Scene, selection: Selection, state: State) -> State:
-    """Give the parts whose scale floats the scale of the front-end's steps."""
-    obs = selection.problem.observations
-    anchor_of_point = np.full(selection.problem.n_points, -1)
-    anchor_of_point[obs.point] = selection.unscaled[obs.keyframe]
-    measured = scene.keyframes.input_position[selection.keyframes]
-    rotation, position = geometry.inverse(state.rotation, state.translation)
-    points = state.points.copy()
-    for anchor in np.unique(selection.unscaled[selection.unscaled >= 0]):
-        members = selection.unscaled == anchor
-        centre = position[anchor].copy()
-        scale = gauge.step_ratio(measured[members], position[members])
-        position[members] = centre + scale * (position[members] - centre)
-        hanging = anchor_of_point == anchor
-        points[hanging] = centre + scale * (points[hanging] - centre)
-    _, translation = geometry.inverse(rotation, position)
-    return dataclasses.replace(state, translation=translation, points=points)
 
 
 def problem_of(
@@ -278,7 +239,7 @@ def _usable(scene: Scene, part: _Part, origin: FloatArray, positions: FloatArray
     rows = part.rows.copy()
     known = np.nan_to_num(positions, nan=0.0)
     problem = problem_of(scene, rows, part.keyframes, part.landmarks, origin, known, config)
-    norm = _norms(problem, problem.start)
+    norm = residual_norms(problem, problem.start)
     placed = ~np.isnan(positions[problem.observations.point, 0])
     counted = placed & usable[rows]
     gate = np.empty(len(part.keyframes))
@@ -300,13 +261,7 @@ def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     return part.landmarks[lost[part.landmarks]]
 
 
-def _displace(scene: Scene, landmarks: IntArray) -> None:
-    """Take the position of landmarks away; all their views are heard again when they are next placed."""
-    scene.landmarks.has_position[landmarks] = False
-    scene.sightings.outlier[scene.views_of(landmarks)] = False
-
-
-def _norms(problem: Problem, state: State) -> FloatArray:
+def residual_norms(problem: Problem, state: State) -> FloatArray:
     """Return the size of each residual in sigmas, inf for points on or behind the camera plane."""
     error = objective.reprojection_errors(problem, state)
     return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
@@ -344,35 +299,6 @@ def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
     keep = np.zeros(len(known), bool)
     keep[np.argsort(np.where(known, -views, 1), kind="stable")[:limit]] = True
     return keep
-
-
-def _judge(scene: Scene, selection: Selection, state: State, outlier_px: float) -> None:
-    """Mark the observations to leave out next time, and note the error of each point.
-
-    The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point with
-    fewer than two good views (or one with a measured depth) is in the wrong place, or its track is: it loses its
-    position, and all its views are heard again when it is next placed.
-    """
-    problem = dataclasses.replace(selection.problem, observations=selection.sightings)
-    obs = selection.sightings
-    norm = _norms(problem, state)
-    outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
-    scene.sightings.outlier[selection.rows] = outlier
-    if outlier_px > 0:
-        measured = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(norm), bool)
-        good = np.bincount(obs.point, ~outlier * np.where(measured, 2, 1), problem.n_points)
-        _displace(scene, selection.landmarks[good < 2])
-    error = norm * obs.sigma_px
-    scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, problem.n_points)
-
-
-def _rms_by_point(squared: FloatArray, point: IntArray, believed: BoolArray, n_points: int) -> FloatArray:
-    """Return the root mean square error per coordinate of each point's believed observations, px."""
-    good = np.asarray(believed & np.isfinite(squared))
-    total = np.bincount(point[good], squared[good], n_points)
-    count = np.bincount(point[good], minlength=n_points)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.sqrt(total / (2 * count)))
 
 
 def _number(rows: IntArray, n: int) -> IntArray:

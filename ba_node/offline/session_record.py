@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ba_node import quality
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Poses
 from ba_node.measurements import Keyframe
-from ba_node.scene import Scene
+from ba_node.scene.scene import Scene
+from ba_node.window import quality
 
 
 @dataclass

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.message_factory import (
+from ba_node.messages.factory import (
     ConversionError,
     MessageFactory,
     float32,
@@ -23,7 +23,7 @@ from ba_node.message_factory import (
     pose_message,
     stamp_ns_from_message,
 )
-from ba_node.output_messages import OUTPUT_TYPES, output_messages
+from ba_node.messages.outputs import OUTPUT_TYPES, output_messages
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node import ingest
 from ba_node.core import geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.records import Block, Keyframes, Landmarks, Sightings
-from ba_node.rejections import RejectionLog
-from ba_node.tables import BoolArray, FloatArray, IdArray, IdIndex, IntArray
+from ba_node.scene import ingest
+from ba_node.scene.records import Block, Keyframes, Landmarks, Sightings
+from ba_node.scene.rejections import RejectionLog
+from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IdIndex, IntArray
 
 if TYPE_CHECKING:
     from ba_node.config import SceneConfig

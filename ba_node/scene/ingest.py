@@ -19,7 +19,7 @@ from ba_node.core.problem import Cameras
 
 if TYPE_CHECKING:
     from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-    from ba_node.rejections import RejectionLog
+    from ba_node.scene.rejections import RejectionLog
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -11,12 +11,12 @@ import numpy as np
 
 from ba_node.core import geometry, objective, triangulation
 from ba_node.core.problem import Problem, State
-from ba_node.window import problem_of
+from ba_node.window.selection import problem_of
 
 if TYPE_CHECKING:
     from ba_node.config import Config
-    from ba_node.scene import Scene
-    from ba_node.tables import FloatArray
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import FloatArray
 
 STATES = ("input", "refined")
 

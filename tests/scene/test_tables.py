@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.tables import Column, IdArray, IdIndex, Table
+from ba_node.scene.tables import Column, IdArray, IdIndex, Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

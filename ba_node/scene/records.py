@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.tables import BoolArray, Column, FloatArray, IdArray, IntArray, Table
+from ba_node.scene.tables import BoolArray, Column, FloatArray, IdArray, IntArray, Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -16,9 +16,9 @@ from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
 
 pytest.importorskip("ba_msgs")
-demo = pytest.importorskip("ba_node.demo", reason="needs ROS 2")
+demo = pytest.importorskip("ba_node.offline.demo", reason="needs ROS 2")
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def run_demo(out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

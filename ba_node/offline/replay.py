@@ -16,7 +16,6 @@ from typing import Any
 
 from ba_node.backend import Backend
 from ba_node.config import Config
-from ba_node.conversion import output_messages
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
@@ -27,9 +26,10 @@ from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import Keyframe, Measurement
-from ba_node.recording import read_truth
-from ba_node.scene import Scene
-from ba_node.session_record import SessionRecord
+from ba_node.messages.conversion import output_messages
+from ba_node.offline.recording import read_truth
+from ba_node.offline.session_record import SessionRecord
+from ba_node.scene.scene import Scene
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
 # leave a file that grows with the square of its length.

@@ -14,8 +14,8 @@ from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
 from ba_node.core.solver import SolverOptions, solve
 from ba_node.io.bal import BalProblem, from_state, read_bal, to_problem
-from ba_node.quality import problem_rms_px
-from ba_node.solver_settings import describe
+from ba_node.offline.solver_settings import describe
+from ba_node.window.quality import problem_rms_px
 
 
 @dataclass(frozen=True)

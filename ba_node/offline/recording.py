@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_node.conversion import INPUT_TYPES, guesses_message, keyframe_message, rig_message, tracks_message
 from ba_node.estimate import Poses
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses, Measurement
-from ba_node.message_factory import header_message, pose_message, stamp_ns_from_message
+from ba_node.messages.conversion import INPUT_TYPES, guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message
 
 TRUTH_TOPIC = "ground_truth/pose"
 TRUTH_TYPE = "geometry_msgs/msg/PoseStamped"

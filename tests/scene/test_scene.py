@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from ba_node.config import SceneConfig
 from ba_node.core import geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.rejections import NOTES_KEPT, REASONS
-from ba_node.scene import Scene
+from ba_node.scene.rejections import NOTES_KEPT, REASONS
+from ba_node.scene.scene import Scene
 
 IDS = np.array([0, 1, 2**53 + 1, 2**63, 2**64 - 2, 2**64 - 1], np.uint64)
 

@@ -14,7 +14,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, objective
 from ba_node.core.result import Result, Status
 from ba_node.measurements import FeatureTracks, Keyframe, Measurement
-from ba_node.scene import Scene
+from ba_node.scene.scene import Scene
 from ba_node.synthetic import SyntheticOptions, generate
 
 QUIET: dict[str, Any] = {

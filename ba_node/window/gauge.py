@@ -22,7 +22,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from ba_node.core.problem import Observations, Problem
-    from ba_node.tables import BoolArray, FloatArray, IntArray
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
 # A fixed keyframe with fewer observations takes part, but is not relied on to hold anything.
 _ANCHOR_OBSERVATIONS = 10

@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ba_node.config import OutputConfig
-from ba_node.conversion import (
+from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.messages.conversion import (
     INPUT_TYPES,
     OUTPUT_TYPES,
     ConversionError,
@@ -27,9 +29,7 @@ from ba_node.conversion import (
     stamp_ns_from_message,
     tracks_message,
 )
-from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.output_messages import POINT_DTYPE
+from ba_node.messages.outputs import POINT_DTYPE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

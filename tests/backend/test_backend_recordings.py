@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from ba_node import quality
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.core import geometry, objective
 from ba_node.io.bal import BalProblem, read_bal, to_problem
 from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.window import quality
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

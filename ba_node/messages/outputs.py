@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport
-from ba_node.message_factory import MessageFactory, float32, header_message, pose_message
+from ba_node.messages.factory import MessageFactory, float32, header_message, pose_message
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -23,8 +23,8 @@ from ba_node.io.mcap import BagReader
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import Keyframe
-from ba_node.message_factory import stamp_ns_from_message
-from ba_node.recording import read_truth
+from ba_node.messages.factory import stamp_ns_from_message
+from ba_node.offline.recording import read_truth
 from ba_node.ros.domain import free_domain, isolation
 from ba_node.ros.listen import NodeListener
 
@@ -73,7 +73,7 @@ def shipped_bag() -> Path:
     """
     prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     shares = [Path(prefix) / "share" / "ba_node" for prefix in prefixes if prefix]
-    folders = [folder / "bags" for folder in (Path(__file__).resolve().parent.parent, *shares)]
+    folders = [folder / "bags" for folder in (Path(__file__).resolve().parents[2], *shares)]
     found = [folder / SHIPPED for folder in folders if (folder / SHIPPED).is_file()]
     if not found:
         searched = ", ".join(map(str, folders))

@@ -10,7 +10,7 @@ import pytest
 from ba_node.config import TracksConfig
 from ba_node.core import cameras, objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.initial_points import initial_points
+from ba_node.window.initial_points import initial_points
 
 GATES = TracksConfig(min_parallax_deg=1.0, max_triangulation_px=12.0)
 POINT = np.array([0.5, -0.3, 10.0])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ba_node import gauge
 from ba_node.core.problem import Cameras, Observations, Problem, State
+from ba_node.window import gauge
 
 # (keyframe, camera, point) of each observation
 Views = list[tuple[int, int, int]]

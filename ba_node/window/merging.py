@@ -1,0 +1,94 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Put the solution of a window back into the scene, and judge its observations and points anew."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.window import gauge
+from ba_node.window.initial_points import widened
+from ba_node.window.selection import residual_norms
+
+if TYPE_CHECKING:
+    from ba_node.core.problem import State
+    from ba_node.core.result import Result
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+    from ba_node.window.selection import Selection
+
+
+def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float) -> None:
+    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
+    state = result.state
+    if not result.status.usable or not state.is_finite():
+        return
+    state = _scaled(scene, selection, state)
+    free = ~selection.problem.fixed
+    rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
+    rows = selection.keyframes[free]
+    scene.keyframes.rotation[rows] = geometry.nearest_rotation(rotation)
+    scene.keyframes.position[rows] = position + selection.origin
+    scene.keyframes.refined[selection.keyframes] = True
+    scene.landmarks.position[selection.landmarks] = state.points + selection.origin
+    scene.landmarks.has_position[selection.landmarks] = True
+    _judge(scene, selection, state, outlier_px)
+    _displace(scene, selection.lost)
+
+
+def _scaled(scene: Scene, selection: Selection, state: State) -> State:
+    """Give the parts whose scale floats the scale of the front-end's steps."""
+    obs = selection.problem.observations
+    anchor_of_point = np.full(selection.problem.n_points, -1)
+    anchor_of_point[obs.point] = selection.unscaled[obs.keyframe]
+    measured = scene.keyframes.input_position[selection.keyframes]
+    rotation, position = geometry.inverse(state.rotation, state.translation)
+    points = state.points.copy()
+    for anchor in np.unique(selection.unscaled[selection.unscaled >= 0]):
+        members = selection.unscaled == anchor
+        centre = position[anchor].copy()
+        scale = gauge.step_ratio(measured[members], position[members])
+        position[members] = centre + scale * (position[members] - centre)
+        hanging = anchor_of_point == anchor
+        points[hanging] = centre + scale * (points[hanging] - centre)
+    _, translation = geometry.inverse(rotation, position)
+    return dataclasses.replace(state, translation=translation, points=points)
+
+
+def _judge(scene: Scene, selection: Selection, state: State, outlier_px: float) -> None:
+    """Mark the observations to leave out next time, and note the error of each point.
+
+    The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point with
+    fewer than two good views (or one with a measured depth) is in the wrong place, or its track is: it loses its
+    position, and all its views are heard again when it is next placed.
+    """
+    problem = dataclasses.replace(selection.problem, observations=selection.sightings)
+    obs = selection.sightings
+    norm = residual_norms(problem, state)
+    outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
+    scene.sightings.outlier[selection.rows] = outlier
+    if outlier_px > 0:
+        measured = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(norm), bool)
+        good = np.bincount(obs.point, ~outlier * np.where(measured, 2, 1), problem.n_points)
+        _displace(scene, selection.landmarks[good < 2])
+    error = norm * obs.sigma_px
+    scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, problem.n_points)
+
+
+def _displace(scene: Scene, landmarks: IntArray) -> None:
+    """Take the position of landmarks away; all their views are heard again when they are next placed."""
+    scene.landmarks.has_position[landmarks] = False
+    scene.sightings.outlier[scene.views_of(landmarks)] = False
+
+
+def _rms_by_point(squared: FloatArray, point: IntArray, believed: BoolArray, n_points: int) -> FloatArray:
+    """Return the root mean square error per coordinate of each point's believed observations, px."""
+    good = np.asarray(believed & np.isfinite(squared))
+    total = np.bincount(point[good], squared[good], n_points)
+    count = np.bincount(point[good], minlength=n_points)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(total / (2 * count)))
