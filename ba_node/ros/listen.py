@@ -1,0 +1,105 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Listen to a node: collect what it publishes about keyframes, points and solves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from ba_node.estimate import Poses
+from ba_node.messages.conversion import OUTPUT_TYPES, stamp_ns_from_message
+from ba_node.messages.outputs import POINT_DTYPE
+from ba_node.ros import qos
+from ba_node.ros.convert import message_class
+
+_POLL_S = 0.05
+
+
+class NodeListener:
+    """Subscribe to the outputs of a node in a ROS context of its own. Use it as a context manager.
+
+    Args:
+        node_name: full name of the node.
+        domain: ROS_DOMAIN_ID; None for that of the environment.
+
+    Attributes:
+        reports: ``ba_msgs/SolverReport`` of every solve, oldest first.
+        points: newest cloud as ``POINT_DTYPE`` records.
+        points_stamp_ns: its stamp, ns.
+    """
+
+    def __init__(self, node_name: str, domain: int | None = None) -> None:
+        self.reports: list[Any] = []
+        self.points: NDArray[np.void] = np.empty(0, dtype=POINT_DTYPE)
+        self.points_stamp_ns: int | None = None
+        self._node_name = node_name
+        self._domain = domain
+        self._poses: dict[int, tuple[int, NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    def __enter__(self) -> NodeListener:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=self._domain)
+        self._node = Node("ba_listener", context=self._context, start_parameter_services=False, enable_rosout=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        receivers = {"refined_keyframes": self._on_keyframes, "points": self._on_points, "report": self.reports.append}
+        self._subscriptions = [
+            self._node.create_subscription(
+                message_class(OUTPUT_TYPES[topic]), f"{self._node_name}/{topic}", receive, qos.for_output(topic)
+            )
+            for topic, receive in receivers.items()
+        ]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    @property
+    def connected(self) -> bool:
+        """Return True if every subscription has found its publisher."""
+        return all(subscription.get_publisher_count() for subscription in self._subscriptions)
+
+    @property
+    def keyframe_ids(self) -> set[int]:
+        """Return the keyframes that have come back so far."""
+        return set(self._poses)
+
+    def poses(self) -> Poses:
+        """Return the newest pose of every keyframe that came back, by time."""
+        ids = sorted(self._poses, key=lambda key: self._poses[key][0])
+        rows = [self._poses[key] for key in ids]
+        return Poses(
+            np.array(ids, dtype=np.uint64),
+            np.array([row[0] for row in rows], dtype=np.int64),
+            np.array([row[1] for row in rows]).reshape(-1, 3),
+            np.array([row[2] for row in rows]).reshape(-1, 4),
+        )
+
+    def spin_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Receive until ``done()``; return False if that took longer than the timeout."""
+        end = time.monotonic() + timeout_s
+        while not done():
+            if time.monotonic() > end:
+                return False
+            self._executor.spin_once(timeout_sec=_POLL_S)
+        return True
+
+    def _on_keyframes(self, message: Any) -> None:
+        positions = np.asarray(message.position).reshape(-1, 3)
+        orientations = np.asarray(message.orientation).reshape(-1, 4)
+        for row, (key, stamp_ns) in enumerate(zip(message.keyframe_id, message.stamp_ns, strict=True)):
+            self._poses[int(key)] = (int(stamp_ns), positions[row], orientations[row])
+
+    def _on_points(self, message: Any) -> None:
+        self.points = np.frombuffer(bytes(message.data), dtype=POINT_DTYPE)
+        self.points_stamp_ns = stamp_ns_from_message(message.header.stamp)

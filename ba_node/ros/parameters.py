@@ -1,0 +1,103 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Declare the parameters of ``config.py`` on a node, and keep the two in step."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.parameter import Parameter as RclpyParameter
+
+from ba_node.config import Config, ConfigError, Parameter, declarations
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_TYPES = {
+    bool: RclpyParameter.Type.BOOL,
+    int: RclpyParameter.Type.INTEGER,
+    float: RclpyParameter.Type.DOUBLE,
+    str: RclpyParameter.Type.STRING,
+}
+_INT64_MAX = 2**63 - 1
+
+
+def describe(parameter: Parameter) -> Any:
+    """Return the rclpy descriptor of a parameter."""
+    descriptor = ParameterDescriptor(
+        name=parameter.name,
+        type=_TYPES[parameter.kind].value,
+        description=f"{parameter.doc} [{parameter.unit}]" if parameter.unit else parameter.doc,
+        read_only=not parameter.live,
+    )
+    if parameter.choices:
+        descriptor.additional_constraints = f"one of: {', '.join(parameter.choices)}"
+    low, high = parameter.minimum, parameter.maximum
+    if low is None and high is None:
+        return descriptor
+    if parameter.kind is int:
+        bounds = (-_INT64_MAX if low is None else int(low), _INT64_MAX if high is None else int(high))
+        descriptor.integer_range = [IntegerRange(from_value=bounds[0], to_value=bounds[1])]
+    else:
+        limit = sys.float_info.max
+        ends = (-limit if low is None else float(low), limit if high is None else float(high))
+        descriptor.floating_point_range = [FloatingPointRange(from_value=ends[0], to_value=ends[1])]
+    return descriptor
+
+
+class Parameters:
+    """The parameters of a node: declared once, then changed as a whole or not at all.
+
+    Args:
+        node: the rclpy node.
+        changed: called with the new Config after a change was made.
+
+    Raises:
+        ConfigError: a parameter file or the command line names a parameter that does not exist or a wrong value.
+    """
+
+    def __init__(self, node: Any, changed: Callable[[Config], None]) -> None:
+        self._changed = changed
+        self._declared = {parameter.name: parameter for parameter in declarations()}
+        # rclpy has no public way to see overrides of parameters that nobody declared, and those are the typing errors.
+        overrides: dict[str, Any] = node._parameter_overrides
+        self.config = Config().with_values(
+            {name: given.value for name, given in overrides.items() if not node.has_parameter(name)}
+        )
+        # Declared with checked values: rclpy itself would refuse an int for a double, which YAML makes of "5".
+        for name, value in self.config.values().items():
+            node.declare_parameter(name, value, describe(self._declared[name]), ignore_override=True)
+        node.add_pre_set_parameters_callback(self._coerce)
+        node.add_on_set_parameters_callback(self._validate)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _coerce(self, given: list[Any]) -> list[Any]:
+        """Turn ints given for doubles into doubles."""
+        return [
+            RclpyParameter(item.name, RclpyParameter.Type.DOUBLE, float(item.value))
+            if item.type_ is RclpyParameter.Type.INTEGER and self._kind(item.name) is float
+            else item
+            for item in given
+        ]
+
+    def _kind(self, name: str) -> type | None:
+        return self._declared[name].kind if name in self._declared else None
+
+    def _own(self, given: list[Any]) -> dict[str, object]:
+        return {item.name: item.value for item in given if item.name in self._declared}
+
+    def _validate(self, given: list[Any]) -> Any:
+        """Accept or reject a set of changes, without side effects."""
+        try:
+            self.config.with_values(self._own(given))
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, given: list[Any]) -> None:
+        changes = self._own(given)
+        if changes:
+            self.config = self.config.with_values(changes)
+            self._changed(self.config)

@@ -1,0 +1,232 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Publish a recording on live topics, where `ros2 bag play` is not at hand.
+
+The recorded bytes go out as they are. Play begins when someone listens, repeats what gets lost on the way, and ends
+when everything has been acknowledged. Writers keep all that is not acknowledged: a subscriber with history keep_all
+slows the play down when it falls behind. One with a queue of limited depth drops the oldest from it, which is to be
+expected at rate 0.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+
+from ba_node.io.mcap import BagReader
+from ba_node.messages.conversion import INPUT_TYPES
+from ba_node.ros import qos
+from ba_node.ros.convert import message_class
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping
+    from pathlib import Path
+
+_WRONG_OPTIONS = (
+    rclpy_implementation.RCLError,
+    rclpy_implementation.UnknownROSArgsError,
+    InvalidNamespaceException,
+)
+_POLL_S = 0.02
+# Fast DDS asks for acknowledgements every 3 s.
+_ACK_TIMEOUT_S = 10.0
+_LATCHED_DEPTH = 10
+_LATCHED_TYPES = (INPUT_TYPES["camera_rig"], INPUT_TYPES["camera_info"])
+
+
+class PlayError(ValueError):
+    """Options that cannot be used, or a recording without anything to play."""
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How to play.
+
+    Attributes:
+        rate: times real time; 0 for as fast as the middleware takes it.
+        wait_s: how long to wait for a subscriber of each input of the node before the first message, s.
+        namespace: put in front of every topic.
+        topics: play only these; all if None.
+        ros_args: as on the command line, for example ("--ros-args", "-r", "keyframes:=front/keyframes").
+    """
+
+    rate: float = 1.0
+    wait_s: float = 10.0
+    namespace: str = ""
+    topics: Collection[str] | None = None
+    ros_args: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "wait_s"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value < 0:
+                raise PlayError(f"{name} = {value!r}: expected a finite number, 0 or more")
+
+
+@dataclass(frozen=True)
+class PlaySummary:
+    """What was played.
+
+    Attributes:
+        published: messages by topic, as resolved.
+        skipped: type by topic of what this Python environment has no message class for.
+        unheard: topics that had no subscriber when play began.
+        unconfirmed: topics with messages that were not acknowledged in time.
+        duration_s: from the first message to the last, s.
+    """
+
+    published: Mapping[str, int]
+    skipped: Mapping[str, str]
+    unheard: tuple[str, ...]
+    unconfirmed: tuple[str, ...]
+    duration_s: float
+
+
+def _nothing(*_: object) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Who is told about the play.
+
+    Attributes:
+        progress: called with the number of messages done and of all messages.
+        notice: called with a line of text.
+    """
+
+    progress: Callable[[int, int], None] = field(default=_nothing)
+    notice: Callable[[str], None] = field(default=_nothing)
+
+
+def play(bag: Path | str, options: PlayOptions = PlayOptions(), listener: Listener = Listener()) -> PlaySummary:
+    """Publish the messages of a recording at the times they were recorded.
+
+    Raises:
+        BagError: the recording cannot be read.
+        PlayError: none of its topics can be published, or a subscriber hangs.
+    """
+    with BagReader(bag) as reader, _node(options) as node:
+        player = _Player(reader, node, options, listener)
+        player.wait()
+        return player.run()
+
+
+@contextlib.contextmanager
+def _node(options: PlayOptions) -> Iterator[Any]:
+    """Make a node in a ROS context of its own, which leaves the signal handlers of the process alone."""
+    context = rclpy.Context()
+    try:
+        try:
+            rclpy.init(args=list(options.ros_args), context=context)
+            node = Node(
+                "ba_play",
+                context=context,
+                namespace=options.namespace,
+                start_parameter_services=False,
+                enable_rosout=False,
+            )
+        except _WRONG_OPTIONS as error:
+            raise PlayError(f"namespace or remapping: {error}") from error
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+
+
+class _Player:
+    def __init__(self, reader: BagReader, node: Any, options: PlayOptions, listener: Listener) -> None:
+        self._reader = reader
+        self._options = options
+        self._listener = listener
+        self._skipped: dict[str, str] = {}
+        self._publishers: dict[str, Any] = {}
+        for topic, kind in reader.topics.items():
+            if options.topics is not None and topic not in options.topics:
+                continue
+            try:
+                cls = message_class(kind)
+            except LookupError as error:
+                self._skipped[topic] = kind
+                listener.notice(f"{topic} is skipped: {error}")
+                continue
+            profile = qos.latched(_LATCHED_DEPTH) if kind in _LATCHED_TYPES else qos.lossless()
+            # Without the leading slash, so that a namespace moves it.
+            self._publishers[topic] = node.create_publisher(cls, topic.removeprefix("/"), profile)
+        if not self._publishers:
+            there = ", ".join(f"{topic} ({kind})" for topic, kind in reader.topics.items())
+            raise PlayError(f"{reader.path}: no topic can be played; topics in the recording: {there}")
+
+    def wait(self) -> None:
+        """Wait for subscribers of the node's inputs, or if the recording has none of these, for any subscriber."""
+        inputs = [topic for topic in self._publishers if self._reader.topics[topic] in INPUT_TYPES.values()]
+        needed = all if inputs else any
+        candidates = inputs or list(self._publishers)
+        end = time.monotonic() + self._options.wait_s
+        while not needed(self._heard(topic) for topic in candidates) and time.monotonic() < end:
+            time.sleep(_POLL_S)
+        self._unheard = tuple(self._publishers[topic].topic_name for topic in candidates if not self._heard(topic))
+        if inputs and self._unheard:
+            self._listener.notice(f"nobody listens to {', '.join(self._unheard)}")
+        elif len(self._unheard) == len(candidates):
+            self._listener.notice("nobody listens to any of the topics")
+
+    def _heard(self, topic: str) -> bool:
+        return bool(self._publishers[topic].get_subscription_count())
+
+    def run(self) -> PlaySummary:
+        """Publish everything."""
+        published: Counter[str] = Counter()
+        total = self._reader.message_count
+        first_ns: int | None = None
+        start = time.monotonic()
+        for done, (topic, _, log_time_ns, data) in enumerate(self._reader.messages(), start=1):
+            first_ns = log_time_ns if first_ns is None else first_ns
+            if topic in self._publishers:
+                self._sleep_until(start, log_time_ns - first_ns)
+                self._publish(self._publishers[topic], data)
+                published[self._publishers[topic].topic_name] += 1
+            self._listener.progress(done, total)
+        duration_s = time.monotonic() - start
+        return PlaySummary(dict(published), self._skipped, self._unheard, self._confirm(), duration_s)
+
+    def _publish(self, publisher: Any, data: bytes) -> None:
+        """Publish, waiting for a subscriber that is behind."""
+        end = time.monotonic() + _ACK_TIMEOUT_S
+        while (error := _try_to_publish(publisher, data)) is not None:
+            if time.monotonic() > end:
+                where = f"{publisher.topic_name}: a subscriber takes no messages any more"
+                raise PlayError(f"{where} (waited {_ACK_TIMEOUT_S:g} s): {error}")
+
+    def _sleep_until(self, start: float, elapsed_ns: int) -> None:
+        if self._options.rate:
+            time.sleep(max(0.0, start + elapsed_ns * 1e-9 / self._options.rate - time.monotonic()))
+
+    def _confirm(self) -> tuple[str, ...]:
+        """Wait until the subscribers have got what was sent; return the topics where they have not."""
+        timeout = Duration(seconds=_ACK_TIMEOUT_S)
+        late = [publisher for publisher in self._publishers.values() if not publisher.wait_for_all_acked(timeout)]
+        for publisher in late:
+            self._listener.notice(f"{publisher.topic_name}: a subscriber has not confirmed everything that was sent")
+        return tuple(publisher.topic_name for publisher in late)
+
+
+def _try_to_publish(publisher: Any, data: bytes) -> Exception | None:
+    """Publish; return the error if the writer is full, which it reports after 0.1 s."""
+    try:
+        publisher.publish(data)
+    except rclpy_implementation.RCLError as error:
+        return error  # type: ignore[no-any-return]  # rclpy is not typed
+    return None

@@ -1,0 +1,187 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run the back-end on a thread of its own, fed by the inbox. Nothing here calls ROS.
+
+The worker takes everything that waits, gives it to the back-end, and solves at most once: keyframes that came while
+it was solving are solved together with the newest of them. With no message for ``node.settle_time_s`` the newest
+keyframe counts as complete with what has arrived.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+import traceback
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ba_node.estimate import Estimate
+from ba_node.measurements import Keyframe
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.backend import Backend
+    from ba_node.ros.inbox import Arrival, Inbox
+
+# Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
+_MAX_OUTPUTS = 20
+# Reasons that count keyframes.
+_KEYFRAME_REASONS = ("bad_pose", "duplicate_keyframe", "malformed", "stale_session")
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something to log.
+
+    Attributes:
+        key: what it is about; the reader may limit how often each is logged.
+        text: one line, or several with a traceback.
+        is_error: a fault of ours, not of the input.
+    """
+
+    key: str
+    text: str
+    is_error: bool = False
+
+
+Output = Estimate | Notice
+
+
+class Worker:
+    """The solver's thread.
+
+    Args:
+        backend: used by this thread alone from :meth:`start` on.
+        inbox: where measurements and commands come from.
+        settle_time_s: silence after which the newest keyframe is complete.
+        notify: called, on this thread, when :meth:`outputs` has something new.
+        clock: steady clock, s.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        inbox: Inbox,
+        settle_time_s: float,
+        notify: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._backend = backend
+        self._inbox = inbox
+        self._settle_time_s = settle_time_s
+        self._notify = notify
+        self._clock = clock
+        self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
+        # Arrival time of each keyframe that was not refined yet, by session and id, s.
+        self._waiting: dict[tuple[int, int], float] = {}
+        self._told: Counter[str] = Counter()
+        self._settled = True
+        self._behind = False
+        self._coalesced = 0
+        self._failures: Counter[str] = Counter()
+        self.refined = 0
+        self._thread = threading.Thread(target=self._run, name="solver", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 10.0) -> bool:
+        """End, after at most the current iteration of a solve; return False if that took longer than the timeout."""
+        self._inbox.close()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def outputs(self) -> list[Output]:
+        """Return what has come out since the last call, oldest first."""
+        taken = []
+        while self._outputs:
+            taken.append(self._outputs.popleft())
+        return taken
+
+    def _run(self) -> None:
+        while True:
+            arrivals = self._inbox.drain(0.0 if self._behind else None if self._settled else self._settle_time_s)
+            if self._inbox.closed:
+                return
+            self.step(arrivals)
+
+    def step(self, arrivals: list[Arrival]) -> None:
+        """Take in what arrived (nothing means silence, unless there is more to solve), and solve if there is need."""
+        for arrival in arrivals:
+            self._guard(self._take, arrival)
+        self._settled = not arrivals and not self._behind
+        if self._settled:
+            self._guard(self._backend.flush)
+        self._behind = False
+        if self._backend.ready:
+            self._guard(self._solve)
+        self._tell_rejections()
+
+    def _take(self, arrival: Arrival) -> None:
+        if callable(arrival.content):
+            arrival.content(self._backend)
+            return
+        before = self._rejected_keyframes()
+        self._backend.add(arrival.content)
+        # Fewer than before: a new session has begun.
+        if isinstance(arrival.content, Keyframe) and self._rejected_keyframes() <= before:
+            self._waiting[arrival.content.session_id, arrival.content.keyframe_id] = arrival.time_s
+
+    def _rejected_keyframes(self) -> int:
+        return sum(self._backend.rejected[reason] for reason in _KEYFRAME_REASONS)
+
+    def _solve(self) -> None:
+        start_s = self._clock()
+        before = int(self._backend.scene.keyframes.solved.sum())
+        estimate = self._backend.solve(on_iteration=lambda _: not self._inbox.closed)
+        n_solved = int(self._backend.scene.keyframes.solved.sum()) - before
+        self._coalesced += max(0, n_solved - 1)
+        # More keyframes than a window holds take several solves; without progress the next try waits for new data.
+        self._behind = n_solved > 0 and self._backend.ready
+        if estimate is not None and not self._inbox.closed:
+            self._put(self._finished(estimate, start_s))
+
+    def _finished(self, estimate: Estimate, start_s: float) -> Estimate:
+        """Add to the report what only the worker knows."""
+        report = estimate.report
+        arrived_s = self._waiting.get((report.session_id, report.newest_keyframe_id), start_s)
+        self._count_refined(estimate)
+        report = dataclasses.replace(
+            report,
+            rejected={**report.rejected, **self._failures},
+            queue_wait_s=start_s - arrived_s,
+            dropped=self._inbox.dropped,
+            coalesced=self._coalesced,
+        )
+        return dataclasses.replace(estimate, report=report)
+
+    def _count_refined(self, estimate: Estimate) -> None:
+        refined = set(estimate.refined.keyframe_id.tolist()) if estimate.report.status.usable else set()
+        known = set(estimate.trajectory.keyframe_id.tolist())
+        mine = {key: time_s for key, time_s in self._waiting.items() if key[0] == estimate.report.session_id}
+        self.refined += sum(1 for _, keyframe in mine if keyframe in refined)
+        self._waiting = {key: time_s for key, time_s in mine.items() if key[1] in known and key[1] not in refined}
+
+    def _tell_rejections(self) -> None:
+        rejected = Counter(self._backend.rejected)
+        for reason in sorted(rejected - self._told):
+            notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
+            self._put(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
+        self._told = rejected
+
+    def _guard(self, action: Callable[..., None], *arguments: object) -> None:
+        """Run one step of the work; a fault in it is reported and costs that step only."""
+        try:
+            action(*arguments)
+        except Exception as error:
+            self._failures["internal_error"] += 1
+            text = f"internal error, going on: {type(error).__name__}: {error}\n{traceback.format_exc()}"
+            self._put(Notice(f"failure {type(error).__name__}", text, is_error=True))
+
+    def _put(self, output: Output) -> None:
+        self._outputs.append(output)
+        self._notify()

@@ -1,0 +1,193 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the tests with ROS share: a domain of their own, the node as a process, and a node to talk to it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages import conversion
+from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.ros import qos
+from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.domain import free_domain, isolation
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT_S = 30.0
+FACTORY = RclpyFactory()
+
+
+@pytest.fixture(scope="session")
+def domain() -> Iterator[int]:
+    """Keep these tests away from every other ROS program."""
+    with pytest.MonkeyPatch.context() as patch:
+        number = free_domain()
+        for name, value in isolation(number).items():
+            patch.setenv(name, value)
+        yield number
+
+
+class NodeProcess:
+    """The node, as a process of its own."""
+
+    def __init__(self, *arguments: str, python: str | None = None) -> None:
+        code = ["-c", python] if python else ["-m", "ba_node.ros.main"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-X", "faulthandler", *code, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "RCUTILS_COLORIZED_OUTPUT": "0"},
+        )
+        self.out, self.err = "", ""
+        self._readers = [threading.Thread(target=self._read, args=(name,)) for name in ("out", "err")]
+        for reader in self._readers:
+            reader.start()
+
+    def _read(self, name: str) -> None:
+        stream = self.process.stdout if name == "out" else self.process.stderr
+        assert stream is not None
+        for line in stream:
+            setattr(self, name, getattr(self, name) + line)
+        stream.close()
+
+    def wait(self, timeout_s: float = TIMEOUT_S) -> int:
+        """Return the exit code; if it does not come in time, fail with the stacks of all threads."""
+        try:
+            code = self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)
+            self.process.wait()
+            pytest.fail(f"the node did not end in {timeout_s} s:\n{self.out}\n{self.err}")
+        for reader in self._readers:
+            reader.join(timeout_s)
+        return code
+
+    def stop(self, number: int = signal.SIGINT, timeout_s: float = TIMEOUT_S) -> int:
+        """Send a signal and return the exit code."""
+        self.process.send_signal(number)
+        return self.wait(timeout_s)
+
+    @property
+    def alive(self) -> bool:
+        return self.process.poll() is None
+
+    def kill(self) -> None:
+        if self.alive:
+            self.process.kill()
+        self.wait()
+
+
+class Peer:
+    """What stands in for the front-end and for whoever listens to the node."""
+
+    def __init__(self, namespace: str = "") -> None:
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context)
+        self.node = Node("peer", namespace=namespace, context=self.context, start_parameter_services=False)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.received: dict[str, list[Any]] = defaultdict(list)
+        self.publishers: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+
+    def advertise(self, depth: int = 1000) -> None:
+        """Make a publisher for each input but camera_info."""
+        for topic, kind in INPUT_TYPES.items():
+            if topic != "camera_info":
+                profile = qos.latched() if topic in qos.LATCHED_INPUTS else qos.reliable(depth)
+                self.publishers[topic] = self.node.create_publisher(message_class(kind), topic, profile)
+
+    def listen(self, *topics: str) -> None:
+        """Subscribe to outputs of the node; all if none are named."""
+        for topic in topics or OUTPUT_TYPES:
+            take = self.received[topic].append
+            cls = message_class(OUTPUT_TYPES[topic])
+            self.node.create_subscription(cls, f"ba_node/{topic}", take, qos.for_output(topic))
+
+    def connect(self) -> None:
+        """Wait until the node hears every publisher and is heard by every subscription."""
+        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()), "the node to subscribe")
+        topics = [s.topic_name for s in self.node.subscriptions]
+        self.until(lambda: all(self.node.count_publishers(topic) for topic in topics), "the node to publish")
+
+    def publish(self, measurement: Measurement, stamp_ns: int = 0) -> None:
+        """Send a measurement on its topic."""
+        if isinstance(measurement, Keyframe):
+            self.publishers["keyframes"].publish(conversion.keyframe_message(FACTORY, measurement))
+        elif isinstance(measurement, FeatureTracks):
+            message = conversion.tracks_message(FACTORY, measurement, stamp_ns, "camera")
+            self.publishers["feature_tracks"].publish(message)
+        elif isinstance(measurement, LandmarkGuesses):
+            message = conversion.guesses_message(FACTORY, measurement, stamp_ns, "odom")
+            self.publishers["landmark_guesses"].publish(message)
+        else:
+            self.publishers["camera_rig"].publish(conversion.rig_message(FACTORY, measurement, stamp_ns))
+
+    def until(self, condition: Callable[[], Any], what: str, timeout_s: float = TIMEOUT_S) -> None:
+        """Take messages until a condition holds."""
+        end = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < end, f"waited {timeout_s} s in vain for {what}"
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def send(self, kind: Any, service: str, request: Any) -> Any:
+        """Send a request to a service of the node and return the future of its response."""
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(kind, service)
+        self.until(self._clients[service].service_is_ready, f"service {service}")
+        return self._clients[service].call_async(request)
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service of the node and return the response."""
+        future = self.send(kind, service, request)
+        self.until(future.done, f"an answer of {service}")
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+@pytest.fixture
+def start_node(domain: int) -> Iterator[Callable[..., NodeProcess]]:  # noqa: ARG001
+    """Return a function that starts a node with the given arguments."""
+    started: list[NodeProcess] = []
+
+    def start(*arguments: str, **options: Any) -> NodeProcess:
+        started.append(NodeProcess(*arguments, **options))
+        return started[-1]
+
+    yield start
+    for node in started:
+        node.kill()
+
+
+@pytest.fixture
+def make_peer(domain: int) -> Iterator[Callable[..., Peer]]:  # noqa: ARG001
+    """Return a function that makes a peer."""
+    made: list[Peer] = []
+
+    def make(**options: Any) -> Peer:
+        made.append(Peer(**options))
+        return made[-1]
+
+    yield make
+    for peer in made:
+        peer.close()

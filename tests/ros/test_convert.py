@@ -1,0 +1,97 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import array
+import time
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+
+from ba_node.config import Config
+from ba_node.estimate import Estimate
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.messages.conversion import (
+    INPUT_TYPES,
+    guesses_message,
+    keyframe_message,
+    measurement_from_message,
+    output_messages,
+    rig_message,
+    tracks_message,
+)
+from ba_node.ros.convert import RclpyFactory, message_class
+
+FACTORY = RclpyFactory()
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i4", "u4", "i8", "u8", "f4", "f8"])
+@pytest.mark.parametrize("n", [0, 1, 1000])
+def test_array_keeps_every_bit(dtype: str, n: int) -> None:
+    values = np.random.default_rng(n).integers(0, 256, n * np.dtype(dtype).itemsize, np.uint8).view(dtype)
+    made = FACTORY.array(values)
+    assert isinstance(made, array.array)
+    assert made.tobytes() == values.tobytes()
+
+
+def test_array_takes_what_is_not_contiguous() -> None:
+    assert FACTORY.array(np.arange(10, dtype=np.uint64)[::3]).tolist() == [0, 3, 6, 9]
+
+
+@pytest.mark.parametrize("name", ["no_such_msgs/msg/Thing", "std_msgs/msg/NoSuchThing", "Header", ""])
+def test_an_unknown_type_is_named(name: str) -> None:
+    with pytest.raises(LookupError, match=f"message type '{name}'"):
+        message_class(name)
+
+
+def test_inputs_survive_the_wire(
+    keyframe: Keyframe, tracks: FeatureTracks, guesses: LandmarkGuesses, rig: CameraRig
+) -> None:
+    sent = {
+        "keyframes": (keyframe, keyframe_message(FACTORY, keyframe)),
+        "feature_tracks": (tracks, tracks_message(FACTORY, tracks, 5, "left_optical")),
+        "landmark_guesses": (guesses, guesses_message(FACTORY, guesses, 5, "map")),
+        "camera_rig": (rig, rig_message(FACTORY, rig, 5)),
+    }
+    for topic, (measurement, message) in sent.items():
+        kind = INPUT_TYPES[topic]
+        received = deserialize_message(serialize_message(message), message_class(kind))
+        got = measurement_from_message(kind, received)
+        for name, value in vars(measurement).items():
+            np.testing.assert_equal(getattr(got, name), value, err_msg=f"{topic}.{name}")
+
+
+def test_outputs_survive_the_wire(estimate: Estimate) -> None:
+    messages = output_messages(FACTORY, estimate, Config().output)
+    received = {
+        topic: deserialize_message(serialize_message(message), message_class(kind)) for topic, kind, message in messages
+    }
+    assert sorted(received) == ["path", "points", "pose", "refined_keyframes", "report"]
+    np.testing.assert_array_equal(np.asarray(received["refined_keyframes"].keyframe_id), estimate.refined.keyframe_id)
+    np.testing.assert_array_equal(
+        np.asarray(received["refined_keyframes"].position).reshape(-1, 3), estimate.refined.position
+    )
+    assert len(received["path"].poses) == len(estimate.trajectory)
+    points = np.frombuffer(bytes(received["points"].data), "<f4").reshape(-1, 5)
+    np.testing.assert_allclose(points[:, :3], estimate.cloud.position, rtol=1e-6)
+    report = received["report"]
+    assert dict(zip(report.rejected_reason, report.rejected_count, strict=True)) == dict(estimate.report.rejected)
+    for name in ("solve_count", "status", "coalesced", "dropped", "queue_wait_s", "rms_px_after", "newest_keyframe_id"):
+        assert getattr(report, name) == getattr(estimate.report, name), name
+
+
+def test_a_thousand_tracks_are_taken_in_well_under_a_millisecond() -> None:
+    rng = np.random.default_rng(0)
+    n = 1000
+    tracks = FeatureTracks(0, 1, 0, np.arange(n, dtype=np.uint64), rng.random((n, 2)), np.ones(n), np.ones(n))
+    kind = INPUT_TYPES["feature_tracks"]
+    wire = serialize_message(tracks_message(FACTORY, tracks, 0, "camera"))
+    cls = message_class(kind)
+    times = []
+    for _ in range(20):
+        start = time.perf_counter()
+        measurement_from_message(kind, deserialize_message(wire, cls))
+        times.append(time.perf_counter() - start)
+    best_ms = 1e3 * min(times)
+    assert best_ms < 1.0, f"{best_ms:.2f} ms to deserialise and convert {n} tracks"

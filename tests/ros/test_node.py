@@ -1,0 +1,376 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The node as a process of its own, over a real middleware."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.parameter import Parameter as RclpyParameter
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo
+
+from ba_node.config import Config
+from ba_node.estimate import Status
+from ba_node.measurements import Keyframe
+from ba_node.messages import conversion
+from ba_node.messages.conversion import OUTPUT_TYPES
+from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+
+pytestmark = pytest.mark.dds
+
+StartNode = Callable[..., Any]
+MakePeer = Callable[..., Any]
+KEYFRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticData:
+    return generate(SyntheticOptions(seed=3, keyframes=KEYFRAMES, length_m=12.0, path="line", outlier_share=0.0))
+
+
+def _refined_ids(peer: Any) -> set[int]:
+    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
+
+
+def _newest(peer: Any) -> int | None:
+    """Return the keyframe of the last report."""
+    reports = peer.received["report"]
+    return int(reports[-1].newest_keyframe_id) if reports else None
+
+
+def _in_solve(peer: Any) -> int:
+    """Return the number of keyframes that took part in the last solve."""
+    reports = peer.received["report"]
+    return int(reports[-1].keyframes + reports[-1].fixed_keyframes) if reports else 0
+
+
+def _play(peer: Any, scene: SyntheticData) -> None:
+    """Publish a scene, each keyframe when the one before was solved, and wait until every one came back."""
+    peer.publish(scene.rig)
+    for keyframe, tracks in zip(scene.keyframes, scene.tracks, strict=True):
+        peer.publish(keyframe)
+        for image in tracks:
+            peer.publish(image, keyframe.stamp_ns)
+        peer.until(lambda key=keyframe.keyframe_id: _newest(peer) == key, f"a report on {keyframe.keyframe_id}")
+    wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
+    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+
+
+def _burst(peer: Any, scene: SyntheticData) -> None:
+    """Publish a scene at once, and wait until every keyframe came back."""
+    for _, stamp_ns, measurement in scene.timeline():
+        peer.publish(measurement, stamp_ns)
+    wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
+    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+
+
+def _position_rms(positions: Any, truth: Any) -> float:
+    return float(np.sqrt(np.mean(np.sum((positions - truth) ** 2, axis=1))))
+
+
+def _rejected(peer: Any) -> dict[str, int]:
+    if not peer.received["report"]:
+        return {}
+    last = peer.received["report"][-1]
+    return dict(zip(last.rejected_reason, (int(n) for n in last.rejected_count), strict=True))
+
+
+@pytest.mark.parametrize("send", [_play, _burst])
+def test_keyframes_come_back_refined(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, send: Callable[[Any, SyntheticData], None]
+) -> None:
+    node, peer = start_node(), make_peer()
+    peer.advertise()
+    peer.listen()
+    peer.connect()
+    send(peer, scene)
+    newest_ns = scene.keyframes[-1].stamp_ns
+    # In a burst a keyframe may overtake its tracks, which then take part in the next solve.
+    peer.until(lambda: _in_solve(peer) == KEYFRAMES, "a solve with all keyframes")
+    last = peer.received["refined_keyframes"][-1]
+    assert list(last.keyframe_id) == list(range(KEYFRAMES))
+    assert last.header.frame_id == "odom"
+    position = np.asarray(last.position).reshape(-1, 3)
+    orientation = np.asarray(last.orientation).reshape(-1, 4)
+    assert np.isfinite(position).all()
+    np.testing.assert_allclose(np.linalg.norm(orientation, axis=1), 1.0, rtol=1e-9)
+    before = _position_rms(scene.odometry.position, scene.truth.position)
+    after = _position_rms(position, scene.truth.position)
+    assert after < before / 4, f"position error {after:.3f} m after, {before:.3f} m before"
+
+    report = peer.received["report"][-1]
+    assert Status(report.status).usable, report.reason
+    assert report.dropped == 0
+    assert report.rms_px_after < report.rms_px_before
+    assert (report.landmarks > 100, report.observations > 1000) == (True, True)
+    counts = [message.solve_count for message in peer.received["report"]]
+    assert counts == list(range(1, len(counts) + 1)), "no report is lost"
+    assert len(counts) + report.coalesced >= KEYFRAMES, "every keyframe is solved, alone or with others"
+
+    # Everything of the last solve is there, and belongs together.
+    stamp_of = conversion.stamp_ns_from_message
+    peer.until(lambda: peer.received["points"] and stamp_of(peer.received["points"][-1].header.stamp) == newest_ns, "")
+    peer.until(lambda: peer.received["path"] and stamp_of(peer.received["path"][-1].header.stamp) == newest_ns, "")
+    n_poses = sum(len(message.keyframe_id) for message in peer.received["refined_keyframes"])
+    peer.until(lambda: len(peer.received["pose"]) == n_poses, f"{n_poses} poses")
+    assert len(peer.received["path"][-1].poses) == KEYFRAMES
+    points = peer.received["points"][-1]
+    assert [field.name for field in points.fields] == ["x", "y", "z", "rms_px", "views"]
+    assert points.width > 100
+    assert np.isfinite(np.frombuffer(bytes(points.data), "<f4").reshape(-1, 5)[:, :3]).all()
+
+    # Someone who comes late still gets the map.
+    late = make_peer()
+    late.listen("points", "path")
+    late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
+    assert late.received["points"][0].width == points.width
+
+    assert node.stop() == 0, node.err
+    assert node.out == f"stopped: {KEYFRAMES} keyframes refined\n"
+
+
+def test_bad_input_is_counted_and_nothing_is_lost(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
+) -> None:
+    node, peer = start_node("--ros-args", "-p", "scene.max_pending:=2"), make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    peer.connect()
+    factory = RclpyFactory()
+    good = scene.tracks[0][0]
+    message = conversion.tracks_message(factory, good, 0, "camera")
+    message.u = message.u[:-1]
+    short_rig = conversion.rig_message(factory, scene.rig, 0)
+    short_rig.body_from_camera = []
+    nan = np.full(3, np.nan)
+    storm = [
+        dataclasses.replace(good, uv=np.full_like(good.uv, np.nan)),
+        dataclasses.replace(good, camera_index=7),
+        *[dataclasses.replace(good, keyframe_id=2**64 - 1 - i) for i in range(5)],
+        dataclasses.replace(scene.keyframes[0], keyframe_id=999, position=nan),
+        scene.keyframes[0],
+        good,
+    ]
+    # Topics have no order among each other: the rig must be there before the tracks of which only two may wait.
+    peer.publish(scene.rig)
+    peer.publish(scene.keyframes[0])
+    for image in scene.tracks[0]:
+        peer.publish(image)
+    peer.until(lambda: peer.received["report"], "a report on the first keyframe")
+    peer.publishers["camera_rig"].publish(short_rig)
+    peer.publishers["feature_tracks"].publish(message)
+    for measurement in storm:
+        peer.publish(measurement)
+    _play(peer, scene)
+    expected = {
+        "bad_pose": 1,
+        "duplicate_keyframe": 2,
+        # From the storm, and from the scene that is played as a whole after its first keyframe was sent.
+        "duplicate_observation": len(good.track_id) + sum(len(image.track_id) for image in scene.tracks[0]),
+        "malformed": 1,
+        "non_finite": len(good.track_id),
+        "unknown_camera": 1,
+        "unknown_keyframe": 3,
+        "unreadable": 1,
+    }
+    peer.until(lambda: _newest(peer) == KEYFRAMES - 1, "the last report")
+    assert _rejected(peer) == expected
+    assert node.alive
+    assert node.stop() == 0
+    for words in ("unknown_camera = 1", "keyframe 999", "body_from_camera 0"):
+        assert words in node.err, node.err
+
+
+def test_an_unknown_distortion_model_is_named(start_node: StartNode, make_peer: MakePeer, scene: SyntheticData) -> None:
+    node, peer = start_node(), make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    peer.connect()
+    peer.publish(dataclasses.replace(scene.rig, models=("my_lens", "my_lens")))
+    peer.until(lambda: "my_lens" in node.err, "a warning that names the model")
+    _play(peer, scene)
+    assert _rejected(peer)["unknown_model"] == 1
+    assert "plumb_bob" in node.err, "what is supported is said too"
+
+
+@pytest.mark.parametrize("profile", [10, qos_profile_sensor_data], ids=["volatile", "best_effort"])
+def test_a_camera_driver_is_heard(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, profile: Any
+) -> None:
+    """Drivers publish camera_info unlatched with every image."""
+    del scene
+    mono = generate(SyntheticOptions(seed=4, keyframes=4, length_m=10.0, path="line", baseline_m=0.0, tracks=100))
+    start_node()
+    peer = make_peer()
+    peer.advertise()
+    del peer.publishers["camera_rig"]
+    peer.listen("refined_keyframes", "report")
+    camera = peer.node.create_publisher(CameraInfo, "camera_info", profile)
+    peer.publishers["camera_info"] = camera
+    peer.connect()
+    info = conversion.rig_message(RclpyFactory(), mono.rig, 0).cameras[0]
+    timer = peer.node.create_timer(0.03, lambda: camera.publish(info))
+    for _, stamp_ns, measurement in list(mono.timeline())[1:]:
+        peer.publish(measurement, stamp_ns)
+    wanted = {keyframe.keyframe_id for keyframe in mono.keyframes}
+    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.node.destroy_timer(timer)
+    assert "rig_changed" not in _rejected(peer)
+
+
+def _set(peer: Any, name: str, value: Any) -> Any:
+    parameter: ParameterMessage = RclpyParameter(name, value=value).to_parameter_msg()
+    request = SetParameters.Request(parameters=[parameter])
+    return peer.call(SetParameters, "ba_node/set_parameters", request).results[0]
+
+
+def test_parameters_over_services(start_node: StartNode, make_peer: MakePeer, scene: SyntheticData) -> None:
+    start_node()
+    peer = make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    peer.connect()
+    names = list(Config().values())
+    values = peer.call(GetParameters, "ba_node/get_parameters", GetParameters.Request(names=names)).values
+    assert len(values) == len(names)
+    request = DescribeParameters.Request(names=["window.max_keyframes"])
+    (descriptor,) = peer.call(DescribeParameters, "ba_node/describe_parameters", request).descriptors
+    assert (descriptor.integer_range[0].from_value, descriptor.integer_range[0].to_value) == (2, 100_000)
+
+    refused = _set(peer, "solver.method", "magic")
+    assert not refused.successful
+    assert "parameter solver.method = 'magic': choose one of auto, local_dinm" in refused.reason
+    assert not _set(peer, "window.max_keyframes", 1).successful
+    assert not _set(peer, "node.inbox_size", 100).successful
+    senseless = SetParameters.Request(parameters=[ParameterMessage(name="solver.loss", value=ParameterValue(type=42))])
+    peer.send(SetParameters, "ba_node/set_parameters", senseless)
+    assert _set(peer, "solver.loss_scale_px", 2).successful, "an int is taken for a double"
+    for name, value in (("window.max_keyframes", 3), ("window.max_fixed_keyframes", 0)):
+        result = _set(peer, name, value)
+        assert result.successful, result.reason
+    _play(peer, scene)
+    assert _in_solve(peer) == 3, "the window has the size that was set"
+
+
+def test_starts_with_a_file_and_a_namespace(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, tmp_path: Any
+) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        "/**:\n  ros__parameters:\n    window:\n      max_keyframes: 4\n    solver:\n      loss_scale_px: 2\n"
+    )
+    arguments = ["--ros-args", "-r", "__ns:=/car", "--params-file", str(file), "-p", "window.max_fixed_keyframes:=0"]
+    node, peer, stranger = start_node(*arguments), make_peer(namespace="car"), make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    peer.connect()
+    _play(peer, scene)
+    assert _in_solve(peer) == 4
+    types = dict(stranger.node.get_topic_names_and_types())
+    for topic, kind in OUTPUT_TYPES.items():
+        assert types[f"/car/ba_node/{topic}"] == [kind], message_class(kind)
+    assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
+    assert node.stop(signal.SIGTERM) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("-p", "window.max_keyfames:=5"), "did you mean 'window.max_keyframes'"),
+        (("-p", "window.max_keyframes:=0"), "expected a number in [2, 100000]"),
+        (("-p", "solver.loss:=cubic"), "choose one of squared, huber"),
+        (("-p", "window.max_keyframes:=[]"), "expected int"),
+        (("-r", "__ns:=9 lives"), "9 lives"),
+        (("--params-file", "no/such/file.yaml"), "no/such/file.yaml"),
+        (("--nonsense",), "--nonsense"),
+    ],
+)
+def test_wrong_arguments_end_with_one_line(start_node: StartNode, arguments: tuple[str, ...], words: str) -> None:
+    node = start_node("--ros-args", *arguments)
+    assert node.wait() == 2, node.err
+    own = [line for line in node.err.splitlines() if "[rcl]" not in line]
+    assert len(own) == 1, node.err
+    assert words in own[0]
+    assert "Traceback" not in node.err
+
+
+SLOW_SOLVE = """
+import sys, time
+from ba_node import backend
+
+def solve(self, on_iteration):
+    print("solving", flush=True)
+    while on_iteration(None):
+        time.sleep(0.01)
+
+backend.Backend.solve = solve
+backend.Backend.ready = property(lambda self: len(self.scene.keyframes) > 0)
+from ba_node.ros.main import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_quickly_during_a_solve(start_node: StartNode, make_peer: MakePeer, number: int) -> None:
+    node, peer = start_node(python=SLOW_SOLVE), make_peer()
+    peer.advertise()
+    peer.connect()
+    peer.publish(Keyframe(0, 1, 1, "odom", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
+    peer.until(lambda: "solving" in node.out, "the solve to begin")
+    start = time.monotonic()
+    assert node.stop(number) == 0, node.err
+    assert time.monotonic() - start < 3.0
+    assert node.out.endswith("stopped: 0 keyframes refined\n")
+    assert "Traceback" not in node.err
+
+
+BROKEN_SOLVE = """
+import sys
+from ba_node import backend
+
+solve = backend.Backend.solve
+calls = []
+
+def sometimes(self, on_iteration):
+    calls.append(1)
+    if len(calls) == 2:
+        raise RuntimeError("a fault nobody thought of")
+    return solve(self, on_iteration)
+
+backend.Backend.solve = sometimes
+from ba_node.ros.main import main
+sys.exit(main())
+"""
+
+
+def test_a_fault_in_a_solve_does_not_end_the_node(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
+) -> None:
+    node, peer = start_node(python=BROKEN_SOLVE), make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    peer.connect()
+    for image in scene.tracks[0]:
+        peer.publish(image)
+    peer.publish(scene.rig)
+    peer.publish(scene.keyframes[0])
+    peer.until(lambda: peer.received["report"], "a report on the first keyframe")
+    peer.publish(scene.keyframes[1])
+    for image in scene.tracks[1]:
+        peer.publish(image)
+    peer.until(lambda: "nobody thought of" in node.err, "the fault")
+    _burst(peer, scene)
+    assert "RuntimeError: a fault nobody thought of" in node.err
+    peer.until(lambda: _rejected(peer).get("internal_error") == 1, "a report that counts the fault")
+    assert node.stop() == 0

@@ -1,0 +1,141 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters on a real rclpy node, without an executor and without a second process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from rcl_interfaces.msg import ParameterType
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RclpyParameter
+
+from ba_node.config import Config, ConfigError, declarations
+from ba_node.ros.parameters import Parameters
+
+MakeNode = Callable[..., Any]
+
+
+@pytest.fixture
+def make_node(domain: int) -> Iterator[MakeNode]:  # noqa: ARG001
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    nodes = []
+
+    def make(**overrides: Any) -> Any:
+        given = [RclpyParameter(name.replace("__", "."), value=value) for name, value in overrides.items()]
+        nodes.append(Node("parameters", context=context, parameter_overrides=given, enable_rosout=False))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def _set(node: Any, **values: Any) -> Any:
+    return node.set_parameters_atomically(
+        [RclpyParameter(name.replace("__", "."), value=value) for name, value in values.items()]
+    )
+
+
+def _other_value(parameter: Any) -> Any:
+    """Return a valid value that is not the default."""
+    if parameter.kind is bool:
+        return not parameter.default
+    if parameter.kind is str:
+        return next(choice for choice in parameter.choices if choice != parameter.default)
+    value = parameter.kind(parameter.minimum)
+    return value if value != parameter.default else parameter.kind(parameter.maximum)
+
+
+def test_every_parameter_is_declared_with_default_and_descriptor(make_node: MakeNode) -> None:
+    node = make_node()
+    Parameters(node, lambda _: None)
+    types = {bool: "BOOL", int: "INTEGER", float: "DOUBLE", str: "STRING"}
+    for parameter in declarations():
+        assert node.get_parameter(parameter.name).value == parameter.default
+        descriptor = node.describe_parameter(parameter.name)
+        assert descriptor.type == getattr(ParameterType, f"PARAMETER_{types[parameter.kind]}")
+        assert descriptor.description.startswith(parameter.doc)
+        assert descriptor.read_only == (not parameter.live)
+        assert parameter.unit in descriptor.description
+        ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
+        expected = [] if parameter.minimum is None else [(parameter.minimum, parameter.maximum)]
+        assert [(r.from_value, r.to_value) for r in ranges] == expected, parameter.name
+        assert all(choice in descriptor.additional_constraints for choice in parameter.choices)
+
+
+@pytest.mark.parametrize("name", [p.name for p in declarations() if p.live])
+def test_each_live_parameter_takes_effect(make_node: MakeNode, name: str) -> None:
+    node = make_node()
+    seen: list[Config] = []
+    parameters = Parameters(node, seen.append)
+    value = _other_value(next(p for p in declarations() if p.name == name))
+    result = _set(node, **{name: value})
+    assert result.successful, result.reason
+    assert seen == [Config().with_values({name: value})]
+    assert parameters.config == seen[0]
+    assert node.get_parameter(name).value == value
+
+
+@pytest.mark.parametrize("name", [p.name for p in declarations() if not p.live])
+def test_each_read_only_parameter_is_set_at_start_only(make_node: MakeNode, name: str) -> None:
+    value = _other_value(next(p for p in declarations() if p.name == name))
+    node = make_node(**{name: value})
+    parameters = Parameters(node, lambda _: None)
+    assert parameters.config.values()[name] == value
+    result = _set(node, **{name: value})
+    assert not result.successful
+    assert "read-only" in result.reason
+
+
+def test_int_is_taken_for_double(make_node: MakeNode) -> None:
+    node = make_node(solver__loss_scale_px=2)
+    parameters = Parameters(node, lambda _: None)
+    assert node.get_parameter("solver.loss_scale_px").value == 2.0
+    assert _set(node, solver__loss_scale_px=3).successful
+    assert parameters.config.solver.loss_scale_px == 3.0
+    assert isinstance(node.get_parameter("solver.loss_scale_px").value, float)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("window.max_keyfames", 5, "did you mean 'window.max_keyframes'"),
+        ("window.max_keyframes", 1, "expected a number in [2, 100000]"),
+        ("window.max_keyframes", 2.5, "expected int, got float"),
+        ("window.max_keyframes", [1, 2], "expected int"),
+        ("solver.loss", "cubic", "choose one of squared, huber"),
+        ("tracks.outlier_px", float("nan"), "expected a number in"),
+    ],
+)
+def test_wrong_values_at_start_name_the_parameter(make_node: MakeNode, name: str, value: Any, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Parameters(make_node(**{name: value}), lambda _: None)
+    assert name in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_a_rejected_set_changes_nothing(make_node: MakeNode) -> None:
+    node = make_node()
+    seen: list[Config] = []
+    parameters = Parameters(node, seen.append)
+    result = _set(node, window__max_keyframes=7, solver__loss="cubic")
+    assert not result.successful
+    assert "solver.loss" in result.reason
+    assert "choose one of squared, huber" in result.reason
+    assert seen == []
+    assert parameters.config == Config()
+    assert node.get_parameter("window.max_keyframes").value == Config().window.max_keyframes
+
+
+def test_parameters_of_rclpy_itself_are_left_alone(make_node: MakeNode) -> None:
+    node = make_node(use_sim_time=False)
+    seen: list[Config] = []
+    Parameters(node, seen.append)
+    assert _set(node, use_sim_time=False).successful
+    assert seen == []
