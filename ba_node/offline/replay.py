@@ -111,7 +111,7 @@ class _Run:
             self._add(measurement)
             self._watch.progress(done, total)
         self.backend.flush(final=True)
-        if self.backend.ready:
+        while self.backend.ready:
             self._solve()
         self._close(self.backend.scene)
 

@@ -230,3 +230,17 @@ def test_ladybug_as_a_recording(shared_data: Path, tmp_path: Path) -> None:
     assert report["rms_px"]["input"] == pytest.approx(5.1715, rel=1e-3)
     # The rms of all is ruled by the few observations that are wrong; intrinsics are those of the file.
     assert report["median_px"]["refined"] < 0.4 * report["median_px"]["input"]
+
+
+def test_a_recording_in_which_all_poses_come_first_is_refined_whole(tmp_path: Path) -> None:
+    """As when topics were merged one after the other: more keyframes wait at once than a window holds."""
+    bag = tmp_path / "sorted.mcap"
+    rows = list(generate(small(keyframes=30, length_m=40.0, landmarks=2000)).timeline())
+    first = min(stamp_ns for _, stamp_ns, _ in rows)
+    ranks = {
+        topic: rank for rank, topic in enumerate(("feature_tracks", "landmark_guesses", "keyframes", "camera_rig"))
+    }
+    order = sorted(rows, key=lambda row: -ranks[row[0]])
+    record(bag, [(topic, first + place, measurement) for place, (topic, _, measurement) in enumerate(order)])
+    report = replay(bag, tmp_path / "out", Config().with_values({"window.max_keyframes": 8}))
+    assert report["keyframes_refined"] == report["keyframes"] == 30

@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ba_node.config import Config
+from ba_node.io.bal import read_bal
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.conversion import INPUT_TYPES
+from ba_node.offline.bal_timeline import timeline
+from ba_node.offline.recording import record
+from ba_node.offline.replay import replay
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 from ba_node.ros.play import Listener, PlayError, PlayOptions, PlaySummary, play
@@ -182,5 +187,35 @@ def test_real_stereo_sequence_through_the_node(
 
     peer.until(lambda: len(refined()) == 26, "26 refined keyframes")
     assert peer.received["report"][-1].rms_px_after < 0.5
+    assert peer.received["report"][-1].dropped == 0
+    assert node.stop() == 0
+
+
+@pytest.mark.dds
+@pytest.mark.slow
+def test_a_whole_map_comes_back_as_in_a_replay(
+    start_node: Callable[..., Any], make_peer: MakePeer, shared_data: Path, tmp_path: Path
+) -> None:
+    """Ladybug-49: 49 cameras, one a keyframe. The node gives the topics of a replay, and every keyframe finite."""
+    bag = tmp_path / "ladybug.mcap"
+    record(bag, timeline(read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt")))
+    assert replay(bag, tmp_path / "out", Config())["keyframes_refined"] == 49
+    with BagReader(tmp_path / "out" / "refined.mcap") as offline:
+        wanted = dict(offline.topics)
+    node, peer = start_node(), make_peer()
+    peer.listen("refined_keyframes", "pose", "path", "points", "report")
+    peer.connect()
+    _play(peer, bag, PlayOptions(rate=1.0))
+    poses: dict[int, tuple[float, ...]] = {}
+
+    def all_back() -> bool:
+        for message in peer.received["refined_keyframes"]:
+            rows = np.asarray(message.position).reshape(-1, 3)
+            poses.update(zip(message.keyframe_id, map(tuple, rows), strict=True))
+        return len(poses) == 49
+
+    peer.until(all_back, "49 refined keyframes")
+    assert np.isfinite(list(poses.values())).all()
+    assert all(peer.received[topic.rsplit("/", 1)[-1]] for topic in wanted), f"of {sorted(wanted)}"
     assert peer.received["report"][-1].dropped == 0
     assert node.stop() == 0
