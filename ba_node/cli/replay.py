@@ -19,11 +19,10 @@ from typing import Any
 from ba_node.cli.console import facts, progress_bar
 
 SUMMARY = "run the back-end on a recording, without a middleware"
-EXAMPLE = "ba replay bags/loop.mcap --out out/replay --set window.max_keyframes=30"
+EXAMPLE = "ba replay bags/stereo_loop.mcap --out out/replay --set window.max_keyframes=30"
 
 _ERRORS = (
     ("rms, all observations", "rms_px"),
-    ("rms without outliers", "rms_px_without_outliers"),
     ("median residual", "median_px"),
 )
 
@@ -63,6 +62,7 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
         *((label, f"{_short(report[key]['input'])} -> {_short(report[key]['refined'])} px") for label, key in _ERRORS),
+        ("rms without outliers", f"{_short(report['rms_px_without_outliers']['refined'])} px"),
         ("solves", f"{report['solves']} ({', '.join(f'{n} {name.lower()}' for name, n in statuses.items())})"),
         ("time in the solver", f"{report['solver_time_s']:.2f} s, slowest {1e3 * report['slowest_solve_s']:.0f} ms"),
         ("outliers left out", str(report["outliers"])),
