@@ -14,7 +14,7 @@ from pathlib import Path
 from ba_node.cli.console import progress_bar
 
 SUMMARY = "publish a recording on live topics"
-EXAMPLE = "ba play bags/loop.mcap --rate 2 --remap keyframes:=front/keyframes"
+EXAMPLE = "ba play bags/stereo_loop.mcap --rate 2 --remap keyframes:=front/keyframes"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
