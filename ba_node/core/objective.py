@@ -81,10 +81,12 @@ class Objective:
         obs, cams = problem.observations, problem.cameras
         n_cam = max(len(cams.model), 1)
         key = obs.keyframe * n_cam + obs.camera
-        images, self._image = np.unique(key, return_inverse=True)
+        used = np.zeros(problem.n_keyframes * n_cam, dtype=bool)
+        used[key] = True
+        images, self._image = np.flatnonzero(used), (np.cumsum(used) - 1).take(key)
         self._image_keyframe, self._image_camera = images // n_cam, images % n_cam
         self._model = cams.model[obs.camera]
-        self._params = cams.params[obs.camera]
+        self._params = cams.params.take(obs.camera, axis=0)
         self._has_depth = len(obs.depth_m) > 0
         self._ignored: BoolArray | None = None
         if rules.cheirality == "drop":
@@ -93,8 +95,13 @@ class Objective:
     def in_camera(self, state: State) -> FloatArray:
         """Return the observed points in their camera's optical frame, (n_obs, 3), m."""
         rotation, translation = self._image_poses(state)
-        points = state.points[self.problem.observations.point]
-        return (rotation[self._image] @ points[:, :, None])[..., 0] + translation[self._image]
+        # By columns: three times as fast as a product of small matrices for each row.
+        x, y, z = (state.points[:, j].take(self.problem.observations.point) for j in range(3))
+        out = np.empty((len(self._image), 3))
+        for i in range(3):
+            a, b, c = (rotation[:, i, j].take(self._image) for j in range(3))
+            out[:, i] = a * x + b * y + c * z + translation[:, i].take(self._image)
+        return out
 
     def errors(self, state: State) -> FloatArray:
         """Return predicted minus measured, (n_obs, 2) px, NaN for points on or behind the camera plane."""
