@@ -8,11 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 
 _ROOT = Path(__file__).resolve().parent.parent
+
+# The same examples in every run, and no verdict by the clock: a loaded machine is not a fault.
+settings.register_profile("ba_node", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("ba_node")
 
 
 @pytest.fixture(scope="session")

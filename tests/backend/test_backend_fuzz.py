@@ -63,7 +63,7 @@ def spoiled(draw: st.DrawFn, m: Measurement) -> Measurement:
 
 
 # Shrinking a stream takes minutes, and the last lines of a failure tell as much.
-@settings(max_examples=40, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@settings(max_examples=40, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(streams())
 def test_no_stream_breaks_the_back_end(stream: list[Measurement]) -> None:
     backend = Backend(Config().with_values(SETTINGS))

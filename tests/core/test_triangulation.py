@@ -126,7 +126,7 @@ def test_pixels_outside_the_lens_are_left_out() -> None:
     assert np.isfinite(rays.direction).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 50.0))
 def test_any_rays_give_finite_points_or_nan_marks(seed: int, noise_px: float) -> None:
     problem = make_problem(seed, n_kf=3, n_pt=5, noise_px=noise_px)

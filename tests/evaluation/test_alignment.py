@@ -18,7 +18,7 @@ def cloud(seed: int, n: int = 20) -> FloatArray:
     return np.random.default_rng(seed).normal(size=(n, 3)) * [3.0, 2.0, 0.5]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(0.01, 100.0), n=st.integers(4, 50))
 def test_recovers_a_similarity(seed: int, scale: float, n: int) -> None:
     rng = np.random.default_rng(seed)
@@ -31,7 +31,7 @@ def test_recovers_a_similarity(seed: int, scale: float, n: int) -> None:
     assert found.scale == pytest.approx(scale, rel=1e-9)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_agrees_with_scipy_on_noisy_points(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -86,7 +86,7 @@ def test_mcap_ros2_support_reads_the_same(tmp_path: Path, messages: list[tuple[s
         assert message.log_time == message.publish_time
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(
     ids=st.lists(st.integers(0, 2**64 - 1), max_size=4),
     values=st.lists(st.floats(width=32), min_size=4, max_size=4),

@@ -64,7 +64,7 @@ def test_what_was_written_is_read_exactly(tmp_path: Path, suffix: str) -> None:
     assert path.read_bytes() == first
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=14, max_size=14))
 def test_any_float_survives(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
     path = tmp_path_factory.mktemp("bal") / "p.txt"

@@ -298,7 +298,7 @@ some_rig = st.sampled_from([rig(1), rig(2), rig(3), rig(0), rig(models=("plumb_b
 some_measurement = some_tracks() | some_keyframe() | some_guesses() | some_rig
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.lists(some_measurement, max_size=25))
 def test_no_stream_raises_or_breaks_the_links(stream: list[Measurement]) -> None:
     scene = Scene(SceneConfig(max_pending=3))
@@ -314,7 +314,7 @@ def test_no_stream_raises_or_breaks_the_links(stream: list[Measurement]) -> None
     check_links(scene)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(some_measurement, max_size=15), st.randoms(use_true_random=False))
 def test_sending_everything_again_changes_only_counters(stream: list[Measurement], random: Any) -> None:
     scene = scene_of(*stream)
@@ -331,7 +331,7 @@ def test_sending_everything_again_changes_only_counters(stream: list[Measurement
     assert content(scene) == before
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.permutations(range(7)), st.integers(2, 7))
 def test_order_within_a_keyframe_does_not_matter(order: list[int], split: int) -> None:
     messages: list[Measurement] = [
