@@ -60,9 +60,9 @@ def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> t
     """Return model and parameter row of a camera given as in ``sensor_msgs/CameraInfo``.
 
     Args:
-        name: distortion_model.
+        name: distortion_model; empty, as many drivers of rectified cameras leave it, where there is no distortion.
         intrinsics: (4,) fx fy cx cy, px.
-        coefficients: d; all missing means no distortion.
+        coefficients: d; all missing means no distortion. Zeros beyond those of the model are let pass.
 
     Returns:
         The model and (12,) parameters.
@@ -70,10 +70,14 @@ def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> t
     Raises:
         CameraError: the model is unknown, or the numbers do not fit it.
     """
+    if name == "" and not np.any(coefficients):
+        name, coefficients = "plumb_bob", coefficients[:0]
     if name not in _NAMES:
         known = ", ".join(_NAMES)
         raise CameraError(f"distortion model {name!r} is not supported: rectify the images or use one of {known}")
     model, counts = _NAMES[name]
+    if len(coefficients) > max(counts) and not np.any(coefficients[max(counts) :]):
+        coefficients = coefficients[: max(counts)]
     if len(coefficients) not in counts:
         expected = " or ".join(str(c) for c in counts)
         raise CameraError(f"{name} has {len(coefficients)} coefficients, expected {expected}")

@@ -92,10 +92,20 @@ def test_pixels_without_a_ray_are_nan() -> None:
     assert np.isnan(far).all()
 
 
+def test_zeros_beyond_the_model_and_an_empty_name_are_let_pass() -> None:
+    model, params = cameras.parameters("rational_polynomial", K, np.arange(14.0) * (np.arange(14) < 8))
+    np.testing.assert_array_equal(params[4:], np.arange(8.0))
+    assert model == cameras.Model.RATIONAL
+    _, undistorted = cameras.parameters("", K, np.zeros(5))
+    np.testing.assert_array_equal(undistorted, [*K, *np.zeros(8)])
+
+
 @pytest.mark.parametrize(
     ("name", "k", "d", "words"),
     [
         ("thin_prism", K, [], "thin_prism"),
+        ("", K, [0.1, 0.0, 0.0, 0.0], "distortion model ''"),
+        ("rational_polynomial", K, [0.1] * 12, "12 coefficients"),
         ("plumb_bob", K, [0.1, 0.2, 0.3], "3 coefficients"),
         ("plumb_bob", [0.0, 500.0, 1.0, 1.0], [], "focal"),
         ("plumb_bob", [np.nan, 500.0, 1.0, 1.0], [], "not finite"),
