@@ -192,6 +192,7 @@ class Backend:
         )
         elapsed = self._clock() - began
         window.merge(self.scene, selection, result, self.config.tracks.outlier_px)
+        rms_before, rms_after = quality.problem_rms_px(problem, problem.start, result.state)
         return dataclasses.replace(
             self._base_report(newest, result.status, result.reason),
             method=result.method,
@@ -201,8 +202,8 @@ class Backend:
             objective_before=result.objective_before,
             objective_after=result.objective_after,
             gradient_norm=result.gradient_norm,
-            rms_px_before=quality.problem_rms_px(problem, problem.start),
-            rms_px_after=quality.problem_rms_px(problem, result.state),
+            rms_px_before=rms_before,
+            rms_px_after=rms_after,
             keyframes=int(np.count_nonzero(~problem.fixed)),
             fixed_keyframes=int(np.count_nonzero(problem.fixed)),
             landmarks=problem.n_points,

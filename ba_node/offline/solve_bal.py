@@ -47,6 +47,7 @@ class Solution:
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON; an infinite radius becomes null there."""
         result = self.result
+        rms_before, rms_after = problem_rms_px(self.problem, self.problem.start, result.state)
         return {
             "problem": {
                 "file": Path(self.source).name,
@@ -60,8 +61,8 @@ class Solution:
             "reason": result.reason,
             "objective_before": result.objective_before,
             "objective_after": result.objective_after,
-            "rms_px_before": problem_rms_px(self.problem, self.problem.start),
-            "rms_px_after": problem_rms_px(self.problem, result.state),
+            "rms_px_before": rms_before,
+            "rms_px_after": rms_after,
             "iterations": max(0, len(result.trace) - 1),
             "accepted_iterations": result.accepted_iterations,
             "linear_iterations": result.linear_iterations,

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 STATES = ("input", "refined")
 
 
-def problem_rms_px(problem: Problem, state: State) -> float:
-    """Return the rms over the observations of a problem whose point is in front of the camera; 0 without any."""
-    return _rms(_errors(problem, state))
+def problem_rms_px(problem: Problem, *states: State) -> list[float]:
+    """Return for each state the rms over the observations whose point is in front of the camera; 0 without any."""
+    measure = objective.Objective(problem, objective.Rules())
+    return [_rms(_in_front(measure.errors(state))) for state in states]
 
 
 def rms_px(scene: Scene, config: Config, state: str) -> float:
@@ -95,8 +96,11 @@ def _input_errors(scene: Scene, problem: Problem, guess: FloatArray, origin: Flo
 
 
 def _errors(problem: Problem, state: State) -> FloatArray:
-    error = objective.reprojection_errors(problem, state)
-    return error[~np.isnan(error).any(axis=1)]
+    return _in_front(objective.reprojection_errors(problem, state))
+
+
+def _in_front(error: FloatArray) -> FloatArray:
+    return error[~np.isnan(error[:, 0])]
 
 
 def _rms(error: FloatArray) -> float:

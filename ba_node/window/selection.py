@@ -241,12 +241,13 @@ def _usable(scene: Scene, part: _Part, origin: FloatArray, positions: FloatArray
     problem = problem_of(scene, rows, part.keyframes, part.landmarks, origin, known, config)
     norm = residual_norms(problem, problem.start)
     placed = ~np.isnan(positions[problem.observations.point, 0])
-    counted = placed & usable[rows]
-    gate = np.empty(len(part.keyframes))
-    for k in range(len(gate)):
-        # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
-        gate[k] = widened(_ABSURD * config.tracks.outlier_px, norm[counted & (problem.observations.keyframe == k)], 1)
-    usable[rows[norm > gate[problem.observations.keyframe]]] = False
+    gate = _ABSURD * config.tracks.outlier_px
+    far = norm > gate
+    # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
+    for k in np.unique(problem.observations.keyframe[far]):
+        own = problem.observations.keyframe == k
+        far[own] = norm[own] > widened(gate, norm[own & placed & usable[rows]], 1)
+    usable[rows[far]] = False
     return usable
 
 
