@@ -17,6 +17,12 @@ from typing import Any, cast, get_type_hints
 
 Value = bool | int | float | str
 
+# What core/methods.py and core/choices.py declare, as this file imports nothing; a test compares them.
+METHODS = ("auto", "lma_cd", "bal", "inm", "tnm", "dinm", "adinm", "local_dinm", "irls_huber", "irls_tq")
+LOSSES = ("squared", "huber", "truncated_quadratic", "cauchy", "geman_mcclure")
+BACKENDS = ("auto", "native", "numpy")
+CHEIRALITY = ("keep", "constant", "drop")
+
 
 class ConfigError(ValueError):
     """A parameter that is unknown, of the wrong type, out of range, or in conflict with another."""
@@ -161,14 +167,14 @@ class SolverConfig:
     method: str = _param(
         "auto",
         "Named method; auto takes dense Cholesky for windows and PCG for large maps. See docs/methods.md.",
-        choices=("auto", "local_dinm", "irls_huber"),
+        choices=METHODS,
     )
     backend: str = _param(
         "auto",
         "Kernels: native (C++), numpy, or auto, which takes native where it is built.",
-        choices=("auto", "native", "numpy"),
+        choices=BACKENDS,
     )
-    loss: str = _param("huber", "Robust loss on each residual.", choices=("squared", "huber"))
+    loss: str = _param("huber", "Robust loss on each residual.", choices=LOSSES)
     loss_scale_px: float = _param(
         1.0,
         "Residual, in units of sigma, where the robust loss leaves the square.",
@@ -193,7 +199,7 @@ class SolverConfig:
     cheirality: str = _param(
         "constant",
         "Points on or behind the camera plane: keep their plain residual, give them a constant cost, or drop them.",
-        choices=("keep", "constant", "drop"),
+        choices=CHEIRALITY,
     )
 
 

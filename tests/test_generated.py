@@ -11,6 +11,7 @@ from types import ModuleType
 import pytest
 
 from ba_node.config import Config, declarations
+from ba_node.core.choices import PARTS
 from ba_node.core.methods import METHODS
 from ba_node.io.parameters import configure
 
@@ -27,7 +28,7 @@ def generator() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["config/ba_node.yaml", "docs/parameters.md", "docs/topics.md"])
+@pytest.mark.parametrize("name", ["config/ba_node.yaml", "docs/methods.md", "docs/parameters.md", "docs/topics.md"])
 def test_file_is_up_to_date(name: str, generator: ModuleType) -> None:
     assert (ROOT / name).read_text() == generator.pages()[name], f"{name} is stale: run {generator.MADE_BY}"
 
@@ -48,8 +49,18 @@ def test_topics_are_latched_as_documented(generator: ModuleType) -> None:
     assert tuple(t for t, (service, _) in generator.INPUTS.items() if "latched" in service) == qos.LATCHED_INPUTS
 
 
+@pytest.mark.parametrize(
+    ("parameter", "names"),
+    [
+        ("method", tuple(METHODS)),
+        *((option, PARTS[option].names) for option in ("loss", "backend", "cheirality")),
+    ],
+)
+def test_config_names_what_the_core_declares(parameter: str, names: tuple[str, ...]) -> None:
+    declared = next(p.choices for p in declarations() if p.name == f"solver.{parameter}")
+    assert declared == names
+
+
 def test_every_method_is_described() -> None:
     text = (ROOT / "docs" / "methods.md").read_text()
-    choices = next(p.choices for p in declarations() if p.name == "solver.method")
-    assert set(choices) == set(METHODS)
     assert [name for name in METHODS if f"`{name}`" not in text] == []

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write config/ba_node.yaml, docs/parameters.md and docs/topics.md from config.py and the message definitions.
+"""Write config/ba_node.yaml, docs/parameters.md, docs/topics.md and the tables of docs/methods.md from the code.
 
 Run it without arguments to write them, with --check to learn whether they are up to date (exit code 1 if not).
 """
@@ -12,10 +12,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ba_node.config import Config
+from ba_node.config import Config, Value
+from ba_node.core.choices import PARTS
+from ba_node.core.methods import CATALOGUE
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
+
+# A page that is written by hand holds what is generated between these lines.
+BEGIN, END = "<!-- begin: written by `{made_by}` -->\n", "<!-- end -->\n"
 
 ROOT = Path(__file__).resolve().parent.parent
 LICENCE = "# Copyright 2026 The ba_node Authors\n# SPDX-License-Identifier: Apache-2.0\n"
@@ -93,6 +99,52 @@ def parameters_page() -> str:
     return PARAMETERS_INTRO + parameters_markdown()
 
 
+def methods_page() -> str:
+    """Return docs/methods.md with its tables renewed."""
+    text = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+    begin = BEGIN.format(made_by=MADE_BY)
+    before, found, rest = text.partition(begin)
+    _, closed, after = rest.partition(END)
+    if not (found and closed):
+        raise SystemExit(f"docs/methods.md: expected the lines {begin.strip()} and {END.strip()}")
+    return before + begin + "\n" + methods_tables() + "\n" + END + after
+
+
+def methods_tables() -> str:
+    """Return the named methods, what they choose, and what each part may be."""
+    about = ["| method | what | source |", "|---|---|---|"]
+    about += [f"| `{name}` | {method.doc} | {method.source} |" for name, method in CATALOGUE.items()]
+    names = list(CATALOGUE)
+    chosen = ["| option | " + " | ".join(f"`{name}`" for name in names) + " |", "|---" * (len(names) + 1) + "|"]
+    described = [describe(CATALOGUE[name].options) for name in names]
+    chosen += [
+        f"| {option} | " + " | ".join(_shown(option, values) for values in described) + " |"
+        for option in described[0]
+        if option not in ("method", "backend", "cheirality", "objective_tolerance")
+    ]
+    parts = ["| option | choice | what | source |", "|---|---|---|---|"]
+    for part in PARTS.values():
+        aliases = f" (also `{'`, `'.join(part.aliases)}`)" if part.aliases else ""
+        parts.append(f"| **`{part.option}`**{aliases} | | {part.doc} | |")
+        for choice in part.choices:
+            also = f" (`{'`, `'.join(choice.aliases)}`)" if choice.aliases else ""
+            parts.append(f"| | `{choice.name}`{also} | {choice.doc} | {choice.source} |")
+    return "\n".join([*about, "", *chosen, "", *parts]) + "\n"
+
+
+def _shown(option: str, values: dict[str, Value]) -> str:
+    """Return a value for the table, a dash where it has no meaning beside the other choices."""
+    idle = {
+        "initial_damping": values["damping"] == "none",
+        "damping_policy": values["damping"] == "none",
+        "initial_radius": values["trust_region"] == "none",
+        "loss_scale": values["loss"] == "squared",
+        **dict.fromkeys(("preconditioner", "t_eps", "max_linear_iterations"), values["linear_solver"] == "cholesky"),
+    }
+    value = values[option]
+    return "–" if idle.get(option) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def yaml_file() -> str:
     """Return config/ba_node.yaml."""
     return f"{LICENCE}# All parameters with their defaults; written by `{MADE_BY}`.\n{parameters_yaml(Config())}"
@@ -104,6 +156,7 @@ def pages() -> dict[str, str]:
     return {
         "config/ba_node.yaml": yaml_file(),
         "docs/parameters.md": note + parameters_page(),
+        "docs/methods.md": methods_page(),
         "docs/topics.md": note + topics_markdown(),
     }
 

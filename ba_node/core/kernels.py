@@ -19,24 +19,38 @@ DENSE_LIMIT = 3000
 
 
 class System(Protocol):
-    """A damped system after elimination of the points: ``S pc = rhs`` (see schur.py)."""
+    """A damped system ``S x = rhs`` after elimination of the points, of the keyframes, or of nothing.
+
+    Attributes:
+        rhs: (n,) right-hand side.
+        side: what was eliminated: points, cameras or none.
+        radius_factor: by what the radius of a trust region is multiplied on this side.
+    """
 
     rhs: FloatArray
+    side: str
+    radius_factor: float
 
     def dense(self) -> FloatArray:
         """Return S, (n, n)."""
 
-    def sparse(self) -> scipy.sparse.bsr_matrix:
-        """Return S, block-sparse."""
+    def sparse(self) -> scipy.sparse.spmatrix:
+        """Return S, sparse."""
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x without forming S."""
 
-    def diagonal_blocks(self) -> FloatArray:
-        """Return the diagonal blocks of S, (n_free, d, d)."""
+    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
+        """Return the diagonal blocks of S in runs of equal size, each (n, d, d)."""
 
-    def back_substitute(self, step_c: FloatArray) -> tuple[FloatArray, float]:
-        """Return the points' step (n_points, 3) and the reduction ``-g'p - 1/2 |J p|^2`` of the undamped model."""
+    def own_blocks(self) -> tuple[FloatArray, ...]:
+        """Return the diagonal blocks of the damped H that belong to the unknowns of S, as diagonal_blocks."""
+
+    def gather(self, of_keyframes: FloatArray, of_points: FloatArray) -> FloatArray:
+        """Return (n,) what belongs to the unknowns of S out of values (n_free, d) and (n_points, 3)."""
+
+    def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return steps (n_free, d), (n_points, 3) and the reduction ``-g'p - 1/2 |J p|^2`` of the undamped model."""
 
 
 class Kernels(Protocol):
@@ -46,6 +60,9 @@ class Kernels(Protocol):
     size: int
     gradient_norm: float
 
+    def graduate(self, graduation: float) -> None:
+        """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself. See annealing.py."""
+
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
 
@@ -53,7 +70,7 @@ class Kernels(Protocol):
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
-        """Add damping to the diagonals and eliminate the points."""
+        """Add damping to the diagonals and eliminate."""
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""

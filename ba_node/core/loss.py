@@ -1,40 +1,116 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Robust losses, as functions of the norm of a whitened residual.
+"""Robust losses, as functions of the norm of a whitened residual: each is declared once, with its formulas.
 
-The objective is ``1/2 sum Psi(|r|)`` with Psi(x) ~ x^2 near zero. IRLS (4.20-4.28) weighs each residual with
-``w = Psi'(x) / (2 x)``, the first-order weight: it is never negative, so the weighted normal equations stay positive
-semi-definite where the second-order (Triggs) correction does not.
+The objective is ``1/2 sum Psi(|r|)`` with Psi(x) ~ x^2 near zero (4.20-4.22, where Psi carries the half itself). IRLS
+(4.23-4.28) weighs each residual with ``w = Psi'(x) / (2 x)``, the first-order weight: it is never negative, so the
+weighted normal equations stay positive semi-definite where the second-order (Triggs) correction does not.
+
+A truncated quadratic pulls at nothing that starts outside ``scale``. Graduated non-convexity (GNC-TLS; Yang et al.,
+*Graduated Non-Convexity for Robust Spatial Perception*, RA-L 2020) puts a family of surrogates in its place, nearly
+convex for a small graduation mu and the loss itself for mu without end::
+
+    Psi_mu(x) = x^2                                             x^2 <= mu/(mu + 1) c^2
+              = 2 c x sqrt(mu (mu + 1)) - mu (c^2 + x^2)        between
+              = c^2                                             x^2 >= (mu + 1)/mu c^2
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+CostAndWeight = tuple[FloatArray, FloatArray]
 
-LOSSES = ("squared", "huber")
+
+@dataclass(frozen=True)
+class Loss:
+    """One loss.
+
+    Attributes:
+        name: how it is asked for.
+        doc: Psi and w, with c for the scale.
+        source: equation.
+        function: (norm, scale) -> (Psi, w).
+        aliases: other names.
+    """
+
+    name: str
+    doc: str
+    source: str
+    function: Callable[[FloatArray, float], CostAndWeight]
+    aliases: tuple[str, ...] = ()
 
 
-def evaluate(loss: str, norm: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
+def _squared(norm: FloatArray, _scale: float) -> CostAndWeight:
+    return norm * norm, np.ones_like(norm)
+
+
+def _huber(norm: FloatArray, scale: float) -> CostAndWeight:
+    inside = norm <= scale
+    cost = np.where(inside, norm * norm, 2.0 * scale * norm - scale * scale)
+    return cost, np.where(inside, 1.0, scale / np.where(inside, 1.0, norm))
+
+
+def _truncated_quadratic(norm: FloatArray, scale: float) -> CostAndWeight:
+    return np.minimum(norm * norm, scale * scale), np.where(norm <= scale, 1.0, 0.0)
+
+
+def _cauchy(norm: FloatArray, scale: float) -> CostAndWeight:
+    ratio = (norm / scale) ** 2
+    return scale * scale * np.log1p(ratio), 1.0 / (1.0 + ratio)
+
+
+def _geman_mcclure(norm: FloatArray, scale: float) -> CostAndWeight:
+    root = 1.0 / (1.0 + (norm / scale) ** 2)
+    return norm * norm * root, root * root
+
+
+LOSSES: dict[str, Loss] = {
+    loss.name: loss
+    for loss in (
+        Loss("squared", "Psi = x^2, w = 1", "2.26", _squared),
+        Loss("huber", "Psi = x^2 up to c, then 2 c x - c^2; w = min(1, c/x)", "4.21", _huber),
+        Loss(
+            "truncated_quadratic", "Psi = min(x^2, c^2); w = 1 up to c, then 0", "4.22", _truncated_quadratic, ("tq",)
+        ),
+        Loss("cauchy", "Psi = c^2 log(1 + x^2/c^2); w = 1/(1 + x^2/c^2)", "", _cauchy),
+        Loss("geman_mcclure", "Psi = x^2/(1 + x^2/c^2); w = 1/(1 + x^2/c^2)^2", "", _geman_mcclure),
+    )
+}
+
+
+def evaluate(loss: str, norm: FloatArray, scale: float, graduation: float = np.inf) -> CostAndWeight:
     """Return the cost and the IRLS weight of residuals.
 
     Args:
-        loss: one of LOSSES. Huber: x^2 up to ``scale``, then 2 scale x - scale^2.
+        loss: one of LOSSES.
         norm: (n,) norm of each whitened residual.
         scale: where the loss leaves the square.
+        graduation: mu of the surrogate of a truncated quadratic; infinite for the loss itself.
 
     Returns:
-        (n,) Psi and (n,) weights in (0, 1].
+        (n,) Psi and (n,) weights in [0, 1].
 
     Raises:
         ValueError: the loss is unknown.
     """
-    if loss == "squared":
-        return norm * norm, np.ones_like(norm)
-    if loss == "huber":
-        inside = norm <= scale
-        cost = np.where(inside, norm * norm, 2.0 * scale * norm - scale * scale)
-        return cost, np.where(inside, 1.0, scale / np.where(inside, 1.0, norm))
-    raise ValueError(f"loss {loss!r} does not exist: choose one of {', '.join(LOSSES)}")
+    if loss not in LOSSES:
+        raise ValueError(f"loss {loss!r} does not exist: choose one of {', '.join(LOSSES)}")
+    if loss == "truncated_quadratic" and np.isfinite(graduation):
+        return _surrogate(norm, scale, graduation)
+    return LOSSES[loss].function(norm, scale)
+
+
+def _surrogate(norm: FloatArray, scale: float, mu: float) -> CostAndWeight:
+    """Return Psi_mu and its weight ``c/x sqrt(mu (mu + 1)) - mu`` between the square and the plateau."""
+    root = np.sqrt(mu * (mu + 1.0))
+    inside, outside = norm <= scale * np.sqrt(mu / (mu + 1.0)), norm >= scale * np.sqrt((mu + 1.0) / mu)
+    between = 2.0 * scale * norm * root - mu * (scale * scale + norm * norm)
+    cost = np.where(inside, norm * norm, np.where(outside, scale * scale, between))
+    slope = scale * root / np.where(inside, 1.0, norm) - mu
+    return cost, np.where(inside, 1.0, np.where(outside, 0.0, np.clip(slope, 0.0, 1.0)))

@@ -5,31 +5,70 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 from ba_node.config import SolverConfig
 from ba_node.core.objective import Rules
-from ba_node.core.solver import SolverOptions
+from ba_node.core.options import SolverOptions
 
-_LOCAL_DINM = SolverOptions(
-    method="local_dinm",
-    damping="identity",
+
+@dataclass(frozen=True)
+class Method:
+    """A named method.
+
+    Attributes:
+        doc: what it is.
+        source: algorithm or section of the thesis; empty if it is not from there.
+        options: its choices.
+    """
+
+    doc: str
+    source: str
+    options: SolverOptions
+
+
+# What the methods of the thesis have in common. They stop by |g| or the objective alone, so function_tolerance is 0.
+_THESIS = SolverOptions(
+    rules=Rules(parameterisation="global"),
+    damping="none",
     damping_policy="nielsen",
-    initial_damping=1e3,
-    trust_region="inc",
-    initial_radius=100.0,
+    initial_damping=10.0,
+    initial_radius=1.0,
     linear_solver="pcg",
     preconditioner="none",
     polish_steps=0,
-    t_eps=0.1,
     max_linear_iterations=2000,
     function_tolerance=0.0,
 )
+_LMA_CD = dataclasses.replace(_THESIS, damping="identity", linear_solver="cholesky")
+_BAL = dataclasses.replace(_THESIS, damping="diag", preconditioner="b_block", initial_damping=1e-4)
+_INM = dataclasses.replace(_THESIS, trust_region="inc")
+_TNM = dataclasses.replace(_THESIS, damping="inc")
+_DINM = dataclasses.replace(_THESIS, damping="identity", trust_region="inc")
+_ADINM = dataclasses.replace(_DINM, schur="adaptive", max_linear_iterations=3000)
+_LOCAL_DINM = dataclasses.replace(_DINM, rules=Rules(parameterisation="local"))
+_HUBER = dataclasses.replace(_LOCAL_DINM, rules=Rules(loss="huber"))
+_TQ = dataclasses.replace(_LOCAL_DINM, rules=Rules(loss="truncated_quadratic"), annealing="gnc")
 
-METHODS: dict[str, SolverOptions] = {
-    "auto": SolverOptions(),
-    "local_dinm": _LOCAL_DINM,
-    "irls_huber": dataclasses.replace(_LOCAL_DINM, method="irls_huber", rules=Rules(loss="huber")),
+_DECLARED: dict[str, Method] = {
+    "auto": Method("the node's default: exact Marquardt steps, and points that follow each", "", SolverOptions()),
+    "lma_cd": Method("Levenberg-Marquardt with Cholesky decomposition, a baseline", "3.2.2, 3.2.3", _LMA_CD),
+    "bal": Method("Levenberg-Marquardt with PCG and M = B, a baseline (Agarwal et al. 2010)", "3.2.3", _BAL),
+    "inm": Method("inexact Newton: a scaled region, no damping", "Alg. 5", _INM),
+    "tnm": Method("truncated Newton: damping, no region", "Alg. 7, 8", _TNM),
+    "dinm": Method("damped inexact Newton: damping and a scaled region", "Alg. 9", _DINM),
+    "adinm": Method("dinm that eliminates points or cameras, whichever is better conditioned", "Alg. 10", _ADINM),
+    "local_dinm": Method("dinm with local parameterisation", "4.2", _LOCAL_DINM),
+    "irls_huber": Method("local_dinm with Huber's loss", "Alg. 11, 4.21", _HUBER),
+    "irls_tq": Method(
+        "local_dinm with a truncated quadratic, led up to by graduated non-convexity", "Alg. 11, 4.22", _TQ
+    ),
 }
+CATALOGUE: dict[str, Method] = {
+    name: dataclasses.replace(method, options=dataclasses.replace(method.options, method=name))
+    for name, method in _DECLARED.items()
+}
+METHODS: dict[str, SolverOptions] = {name: method.options for name, method in CATALOGUE.items()}
 
 
 def options(name: str) -> SolverOptions:
@@ -46,6 +85,7 @@ def options(name: str) -> SolverOptions:
 def from_config(config: SolverConfig) -> SolverOptions:
     """Return the choices that the parameters ``solver.*`` ask for."""
     chosen = options(config.method)
+    keeps_loss = config.loss == chosen.rules.loss
     rules = Rules(
         parameterisation=chosen.rules.parameterisation,
         loss=config.loss,
@@ -55,6 +95,7 @@ def from_config(config: SolverConfig) -> SolverOptions:
     return dataclasses.replace(
         chosen,
         rules=rules,
+        annealing=chosen.annealing if keeps_loss else "none",
         backend=config.backend,
         max_iterations=config.max_iterations,
         max_linear_iterations=config.max_linear_iterations,

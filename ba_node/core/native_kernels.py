@@ -14,33 +14,44 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.core.kernels import Kernels, System
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import CHEIRALITY, Rules
+from ba_node.core.objective import Rules
 from ba_node.core.problem import Problem, State
 
 FloatArray = NDArray[np.float64]
 
-BACKENDS = ("auto", "native", "numpy")
-
-# As in enum Loss of kernel.hpp.
+# As in the enums of kernel.hpp.
 _LOSSES = ("squared", "huber")
+_CHEIRALITY = ("keep", "constant", "drop")
 
 
 class KernelsError(ValueError):
     """Kernels that were asked for by name and cannot be had."""
 
 
-def make(problem: Problem, rules: Rules, backend: str = "auto") -> Kernels:
+def make(
+    problem: Problem, rules: Rules, backend: str = "auto", schur: str = "points", preconditioner: str = "none"
+) -> Kernels:
     """Return the kernels of a problem.
 
     Raises:
-        KernelsError: native is asked for and is not built, or does not have what the rules ask for.
+        KernelsError: native is asked for and is not built, or does not have what else is asked for.
     """
-    reason = native.missing(rules.parameterisation, rules.loss)
+    reason = missing(rules, schur, preconditioner)
     if backend == "native" and reason:
         raise KernelsError(f"backend native: {reason}; take numpy or auto")
     if backend == "numpy" or reason:
-        return NumpyKernels(problem, rules)
+        return NumpyKernels(problem, rules, schur)
     return NativeKernels(problem, rules)
+
+
+def missing(rules: Rules, schur: str, preconditioner: str) -> str:
+    """Return why the C++ kernels cannot be used, or an empty string if they can."""
+    reason = native.missing(rules.parameterisation, rules.loss)
+    if not reason and schur != "points":
+        return f"the C++ kernels eliminate points only, not schur = {schur}"
+    if not reason and preconditioner in ("b_block", "b_diag"):
+        return f"the C++ kernels have no preconditioner {preconditioner}"
+    return reason
 
 
 class NativeKernels:
@@ -66,13 +77,16 @@ class NativeKernels:
             fixed=problem.fixed,
             loss=_LOSSES.index(rules.loss),
             loss_scale=rules.loss_scale,
-            cheirality=CHEIRALITY.index(rules.cheirality),
+            cheirality=_CHEIRALITY.index(rules.cheirality),
             start=_arrays(problem.start),
         )
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
         # S is written to the same memory in every iteration.
         self._dense = np.empty((0, 0))
+
+    def graduate(self, graduation: float) -> None:
+        """Do nothing: these kernels have no truncated quadratic."""
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
@@ -114,12 +128,13 @@ def _arrays(state: State) -> tuple[FloatArray, ...]:
 class _NativeSystem:
     """The kernel's current reduced system; valid until the next linearisation or reduction."""
 
+    side = "points"
+    radius_factor = 1.0
+
     def __init__(self, kernel: Any, size: int, memory: Callable[[], FloatArray]) -> None:
         self._kernel, self._size, self._memory = kernel, size, memory
         self.rhs: FloatArray = kernel.rhs()
         self.product = kernel.product
-        self.diagonal_blocks = kernel.diagonal_blocks
-        self.back_substitute = kernel.back_substitute
 
     def dense(self) -> FloatArray:
         """Return S, (n, n); the next call writes over it."""
@@ -134,3 +149,20 @@ class _NativeSystem:
         starts = np.searchsorted(rows[order], np.arange(len(self.rhs) // self._size + 1))
         n = len(self.rhs)
         return scipy.sparse.bsr_matrix((blocks[order], columns[order], starts), shape=(n, n))
+
+    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
+        """Return the diagonal blocks of S, (n_free, d, d)."""
+        return (self._kernel.diagonal_blocks(),)
+
+    def own_blocks(self) -> tuple[FloatArray, ...]:
+        """Refuse: see :func:`missing`."""
+        raise KernelsError("the C++ kernels keep no blocks of B apart; take backend numpy or auto")
+
+    def gather(self, of_keyframes: FloatArray, _of_points: FloatArray) -> FloatArray:
+        """Return what belongs to the unknowns of S out of values for all unknowns."""
+        return of_keyframes.ravel()
+
+    def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return both steps and the reduction of the undamped model."""
+        step_p, reduction = self._kernel.back_substitute(x)
+        return x.reshape(-1, self._size), step_p, reduction

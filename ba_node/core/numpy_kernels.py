@@ -9,25 +9,39 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ba_node.core import polish
+from ba_node.core.blocks import condition
 from ba_node.core.kernels import DENSE_LIMIT, System
 from ba_node.core.objective import Linearisation, Objective, Rules
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
+from ba_node.core.schur_cameras import CameraReduction, FullSystem
 
 FloatArray = NDArray[np.float64]
+Reduction = ReducedSystem | CameraReduction | FullSystem
+
+_SIDES: dict[str, type[ReducedSystem] | type[CameraReduction] | type[FullSystem]] = {
+    "points": ReducedSystem,
+    "cameras": CameraReduction,
+    "none": FullSystem,
+}
 
 
 class NumpyKernels:
     """The kernels in numpy and scipy."""
 
-    def __init__(self, problem: Problem, rules: Rules) -> None:
+    def __init__(self, problem: Problem, rules: Rules, schur: str = "points") -> None:
         """Sort the observations once."""
         self._structure = Structure(problem)
         self._objective = Objective(problem, rules)
+        self._schur = schur
         self.n_free, self.size = self._structure.n_free, self._structure.size
         self.gradient_norm = np.inf
         self._linearisation: Linearisation
         self._equations: NormalEquations
+
+    def graduate(self, graduation: float) -> None:
+        """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself."""
+        self._objective.graduation = graduation
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
@@ -41,9 +55,25 @@ class NumpyKernels:
         return self._equations.diagonals()
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
-        """Add damping to the diagonals and eliminate the points."""
-        system = ReducedSystem(self._structure, self._equations, damping_c, damping_p)
-        return _NumpySystem(system, self._structure, self._equations, self._linearisation, self._objective.problem)
+        """Add damping to the diagonals and eliminate."""
+        side, factor = self._schur, 1.0
+        if side == "adaptive":
+            side, factor = self._adapt(damping_c, damping_p)
+        reduction = _SIDES[side](self._structure, self._equations, damping_c, damping_p)
+        system = _NumpySystem(reduction, self._structure, self._equations, self._linearisation)
+        system.radius_factor = factor
+        return system
+
+    def _adapt(self, damping_c: FloatArray, damping_p: FloatArray) -> tuple[str, float]:
+        """Return the side that is better conditioned and what the radius becomes there (Algorithm 10)."""
+        if self.n_free == 0:
+            return "points", 1.0
+        equations, size = self._equations, self.size
+        b = equations.b + damping_c[:, :, None] * np.eye(size)
+        c = equations.c + damping_p[:, :, None] * np.eye(3)
+        if condition(c) < condition(b):
+            return "points", 1.0
+        return "cameras", 3.0 * self._structure.n_points / (size * self.n_free)
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
@@ -55,36 +85,30 @@ class NumpyKernels:
 
 
 class _NumpySystem:
-    """A ReducedSystem that also knows the full model."""
+    """A reduction that also knows the full model."""
+
+    radius_factor = 1.0
 
     def __init__(
-        self,
-        system: ReducedSystem,
-        structure: Structure,
-        equations: NormalEquations,
-        linearisation: Linearisation,
-        problem: Problem,
+        self, reduction: Reduction, structure: Structure, equations: NormalEquations, linearisation: Linearisation
     ) -> None:
-        self._system, self._structure, self._equations = system, structure, equations
-        self._linearisation, self._problem = linearisation, problem
-        self.rhs = system.rhs
-        self.dense, self.sparse, self.diagonal_blocks = system.dense, system.sparse, system.diagonal_blocks
+        self._reduction, self._structure, self._equations = reduction, structure, equations
+        self._linearisation = linearisation
+        self.rhs: FloatArray = reduction.rhs
+        self.side = reduction.side
+        self.dense, self.sparse, self.gather = reduction.dense, reduction.sparse, reduction.gather
+        self.diagonal_blocks, self.own_blocks = reduction.diagonal_blocks, reduction.own_blocks
         self._matrix: scipy.sparse.bsr_matrix | None = None
-        if structure.form_schur and len(self.rhs) > DENSE_LIMIT:
-            self._matrix = system.sparse()
+        if self.side == "points" and structure.form_schur and len(self.rhs) > DENSE_LIMIT:
+            self._matrix = reduction.sparse()
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""
-        return np.asarray(self._matrix @ x) if self._matrix is not None else self._system.product(x)
+        return np.asarray(self._matrix @ x) if self._matrix is not None else self._reduction.product(x)
 
-    def back_substitute(self, step_c: FloatArray) -> tuple[FloatArray, float]:
-        """Return the points' step and the reduction of the undamped model, by J p itself."""
-        step_p = self._system.back_substitute(step_c)
-        blocks = step_c.reshape(-1, self._structure.size)
-        full = np.zeros((self._problem.n_keyframes, self._structure.size))
-        full[self._structure.free] = blocks
-        obs, lin = self._problem.observations, self._linearisation
-        moved = (lin.d_keyframe @ full[obs.keyframe][:, :, None])[..., 0]
-        moved += (lin.d_point @ step_p[obs.point][:, :, None])[..., 0]
-        slope = np.sum(self._equations.gradient_c * blocks) + np.sum(self._equations.gradient_p * step_p)
-        return step_p, -float(slope) - 0.5 * float(np.sum(moved * moved))
+    def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return both steps and the reduction of the undamped model, by J p itself."""
+        step_c, step_p = self._reduction.expand(x)
+        moved = self._structure.jacobian_product(self._linearisation, step_c, step_p)
+        slope = np.sum(self._equations.gradient_c * step_c) + np.sum(self._equations.gradient_p * step_p)
+        return step_c, step_p, -float(slope) - 0.5 * float(np.sum(moved * moved))

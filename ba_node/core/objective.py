@@ -21,8 +21,6 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-CHEIRALITY = ("keep", "constant", "drop")
-
 # A point nearer to the camera plane than this (m) counts as on it.
 MIN_DEPTH = 1e-6
 # What a point behind its camera costs under ``constant``: as much as a residual of this norm.
@@ -31,7 +29,14 @@ _BEHIND_NORM = 100.0
 
 @dataclass(frozen=True)
 class Rules:
-    """How residuals are judged: parameterisation, loss and its scale (in sigmas), cheirality."""
+    """How residuals are judged.
+
+    Attributes:
+        parameterisation: how a pose is stepped.
+        loss: robust loss.
+        loss_scale: where it leaves the square, in sigmas.
+        cheirality: what points behind their camera cost.
+    """
 
     parameterisation: str = "local"
     loss: str = "squared"
@@ -78,6 +83,8 @@ class Objective:
         """Prepare the indices that stay the same over all iterations."""
         self.problem = problem
         self.rules = rules
+        # mu of the surrogate that stands in for a truncated quadratic; infinite for the loss itself.
+        self.graduation = np.inf
         obs, cams = problem.observations, problem.cameras
         n_cam = max(len(cams.model), 1)
         key = obs.keyframe * n_cam + obs.camera
@@ -204,18 +211,21 @@ class Objective:
         """Return Psi of each observation and the square root of the weight of each row, (n, 1) or (n, 3)."""
         rules = self.rules
         norm = np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)
-        cost, weight = loss.evaluate(rules.loss, norm, rules.loss_scale)
+        cost, weight = self._loss(norm)
         if rules.cheirality != "keep" and masked.any():
-            behind, _ = loss.evaluate(rules.loss, np.array([_BEHIND_NORM]), rules.loss_scale)
+            behind, _ = self._loss(np.array([_BEHIND_NORM]))
             cost[masked] = behind[0]
         if self._ignored is not None:
             cost[self._ignored] = 0.0
         root = np.sqrt(weight)[:, None]
         if self._has_depth:
-            depth_cost, depth_weight = loss.evaluate(rules.loss, np.abs(residual[:, 2]), rules.loss_scale)
+            depth_cost, depth_weight = self._loss(np.abs(residual[:, 2]))
             cost = cost + depth_cost
             root = np.concatenate([root, root, np.sqrt(depth_weight)[:, None]], axis=1)
         return cost, root
+
+    def _loss(self, norm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return loss.evaluate(self.rules.loss, norm, self.rules.loss_scale, self.graduation)
 
     def _row_scale(self, root_weight: FloatArray) -> FloatArray:
         """Return sqrt(weight) / sigma of each row, (n, 1 or 3)."""

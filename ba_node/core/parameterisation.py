@@ -17,8 +17,6 @@ from ba_node.core import geometry
 
 FloatArray = NDArray[np.float64]
 
-PARAMETERISATIONS = ("local", "global")
-
 
 def pose_jacobian(
     kind: str, d_point: FloatArray, point: FloatArray, rotation: FloatArray, row_pose: NDArray[np.intp]

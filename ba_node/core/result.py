@@ -38,6 +38,7 @@ class Iteration:
         accepted: True if the step was taken.
         damping: mu during the iteration.
         radius: radius of the trust region during the iteration, inf without one.
+        side: what was eliminated: points, cameras or none; empty in row 0.
     """
 
     iteration: int
@@ -48,6 +49,7 @@ class Iteration:
     accepted: bool
     damping: float
     radius: float
+    side: str = ""
 
 
 @dataclass(frozen=True)

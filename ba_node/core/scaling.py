@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-SCALINGS = ("none", "identity", "diag", "inc")
-
 # Steps by kind of parameter: rotation (rad), translation (m), f (px), k1, k2, point (m).
 INC_STEPS = {"rotation": 1e-8, "translation": 1e-8, "f": 1e-5, "k1": 1e-8, "k2": 1e-8, "point": 1e-8}
 
@@ -28,7 +26,7 @@ def diagonals(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatA
     """Return D for keyframes (n_free, d) and points (n_points, 3); zeros for ``none``.
 
     Args:
-        kind: one of SCALINGS.
+        kind: a choice of damping or trust_region.
         hessian: diag(B) (n_free, d) and diag(C) (n_points, 3).
     """
     d_c, d_p = hessian
@@ -43,3 +41,11 @@ def diagonals(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatA
         inverse = steps["point"] / np.array(row[: d_c.shape[1]])
         return np.broadcast_to(inverse, d_c.shape), np.ones_like(d_p)
     return np.zeros_like(d_c), np.zeros_like(d_p)
+
+
+def scaled_space(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return D of ``p~ = D p`` (3.94-3.99), as :func:`diagonals`; the root of diag(H), and I for ``none``."""
+    if kind == "none":
+        kind = "identity"
+    d_c, d_p = diagonals(kind, hessian)
+    return (np.sqrt(d_c), np.sqrt(d_p)) if kind == "diag" else (d_c, d_p)

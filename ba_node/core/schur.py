@@ -45,6 +45,8 @@ class Structure:
         self.size = 9 if problem.free_intrinsics else 6
         self.free = np.flatnonzero(~problem.fixed)
         self.n_free, self.n_points = len(self.free), problem.n_points
+        self._row_keyframe, self._row_point = obs.keyframe, obs.point
+        self._n_keyframes = problem.n_keyframes
         column = np.full(problem.n_keyframes, -1, dtype=np.intp)
         column[self.free] = np.arange(self.n_free)
         # By point: rows are sorted already; only points with rows take part in the sums.
@@ -105,6 +107,14 @@ class Structure:
             gradient[k] = part.T @ r[bounds[k] : bounds[k + 1]]
         return blocks, gradient
 
+    def jacobian_product(self, lin: Linearisation, step_c: FloatArray, step_p: FloatArray) -> FloatArray:
+        """Return J p of every observation, (n_obs, 2 or 3), for steps (n_free, d) and (n_points, 3)."""
+        full = np.zeros((self._n_keyframes, self.size))
+        full[self.free] = step_c
+        moved = (lin.d_keyframe @ full[self._row_keyframe][:, :, None])[..., 0]
+        moved += (lin.d_point @ step_p[self._row_point][:, :, None])[..., 0]
+        return np.asarray(moved)
+
     def edge_matrix(self, blocks: FloatArray) -> scipy.sparse.bsr_matrix:
         """Return edge blocks (n_edges, d, 3) as a block-sparse (d n_free, 3 n_points) matrix."""
         shape = (self.size * self.n_free, 3 * self.n_points)
@@ -159,6 +169,8 @@ def normal_equations(structure: Structure, lin: Linearisation) -> NormalEquation
 class ReducedSystem:
     """The damped system after elimination of the points."""
 
+    side = "points"
+
     def __init__(
         self, structure: Structure, equations: NormalEquations, damping_c: FloatArray, damping_p: FloatArray
     ) -> None:
@@ -197,21 +209,34 @@ class ReducedSystem:
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S as a block-sparse matrix."""
-        n, d = self._structure.n_free, self._structure.size
-        own = scipy.sparse.bsr_matrix((self.b, np.arange(n), np.arange(n + 1)), shape=(n * d, n * d))
-        return own - self.z @ self.z_t
+        return block_diagonal(self.b) - self.z @ self.z_t
 
-    def diagonal_blocks(self) -> FloatArray:
+    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d), without forming S."""
         blocks = self.b.copy()
         own = self._blocks @ np.swapaxes(self._blocks, 1, 2)
         np.subtract.at(blocks, self._structure.edge_keyframe, own)
-        return blocks
+        return (blocks,)
 
-    def back_substitute(self, step_c: FloatArray) -> FloatArray:
-        """Return the step of the points (n_points, 3) that belongs to a step of the keyframes (n_free d,)."""
-        rhs = -self._scaled_gradient_p - (self.z_t @ step_c).reshape(-1, 3)
-        return np.asarray((np.swapaxes(self._inverse_l, 1, 2) @ rhs[:, :, None])[..., 0])
+    def own_blocks(self) -> tuple[FloatArray, ...]:
+        """Return the blocks of B, damped."""
+        return (self.b,)
+
+    def gather(self, of_keyframes: FloatArray, _of_points: FloatArray) -> FloatArray:
+        """Return what belongs to the unknowns of S out of values for all unknowns."""
+        return of_keyframes.ravel()
+
+    def expand(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the steps of keyframes (n_free, d) and points (n_points, 3) that belong to a solution (n_free d,)."""
+        rhs = -self._scaled_gradient_p - (self.z_t @ x).reshape(-1, 3)
+        step_p = np.asarray((np.swapaxes(self._inverse_l, 1, 2) @ rhs[:, :, None])[..., 0])
+        return x.reshape(-1, self._structure.size), step_p
+
+
+def block_diagonal(blocks: FloatArray) -> scipy.sparse.bsr_matrix:
+    """Return blocks (n, d, d) as a block-sparse matrix."""
+    n, d, _ = blocks.shape
+    return scipy.sparse.bsr_matrix((blocks, np.arange(n), np.arange(n + 1)), shape=(n * d, n * d))
 
 
 def inverse_cholesky3(c: FloatArray) -> FloatArray:

@@ -1,9 +1,9 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""One loop for every method: damped, trust-region, inexact Newton steps on the reduced system (Algorithms 5, 8, 9, 11).
+"""One loop for every method: damped, trust-region, inexact Newton steps on the reduced system (Algorithms 5, 8 to 11).
 
-Each outer iteration linearises, damps (``H + mu D``), eliminates the points, solves for the keyframes by Cholesky or
-by PCG inside ``|D pc| <= radius``, substitutes back, and judges the step by the gain ratio
+Each outer iteration linearises, damps (``H + mu D``), eliminates the points (or the keyframes, or nothing), solves
+what is left by Cholesky or by PCG inside ``|D x| <= radius``, substitutes back, and judges the step by the gain ratio
 
     rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2)          (3.90, 3.104)
 
@@ -22,15 +22,15 @@ A step that is not finite, or that could not be computed, counts as a rejected o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.core import linear, native_kernels, parameterisation, scaling
-from ba_node.core.kernels import DENSE_LIMIT, System
-from ba_node.core.objective import Rules
+from ba_node.core.annealing import Annealing
+from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem, State
+from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Iteration, Result, Status
 
 FloatArray = NDArray[np.float64]
@@ -39,49 +39,6 @@ FloatArray = NDArray[np.float64]
 _SAVED_RHO = 0.3
 # A loop that has rejected this many steps in a row has nothing left to gain.
 _MAX_REJECTED = 25
-
-
-@dataclass(frozen=True)
-class SolverOptions:
-    """The parts of a method. See docs/methods.md for the named ones.
-
-    Attributes:
-        method: name for the report.
-        rules: parameterisation, loss, cheirality.
-        damping: D of the damping: none, identity, diag, inc.
-        damping_policy: nielsen or fast.
-        initial_damping: first mu.
-        trust_region: D of the region: none, identity, diag, inc.
-        initial_radius: first radius, in units of the scaled step.
-        linear_solver: cholesky, pcg, or auto (by size).
-        polish_steps: Newton steps of every point alone after each step of the keyframes; 0 for none.
-        backend: auto, native or numpy.
-        preconditioner: none or schur_block (diagonal blocks of S), for pcg.
-        t_eps: PCG stops at |r| <= min(t_eps, |b|) |b|.
-        max_linear_iterations: cap on PCG steps in one outer iteration.
-        max_iterations: cap on outer iterations, rejected ones included.
-        function_tolerance: stop when an accepted step lowers the objective by less than this share.
-        gradient_tolerance: stop when |g| falls below this (xi1).
-        objective_tolerance: stop when the objective falls below this (xi2).
-    """
-
-    method: str = "auto"
-    rules: Rules = field(default_factory=Rules)
-    damping: str = "diag"
-    damping_policy: str = "fast"
-    initial_damping: float = 1e-4
-    trust_region: str = "none"
-    initial_radius: float = 1e4
-    linear_solver: str = "auto"
-    preconditioner: str = "schur_block"
-    polish_steps: int = 3
-    backend: str = "auto"
-    t_eps: float = 0.1
-    max_linear_iterations: int = 500
-    max_iterations: int = 50
-    function_tolerance: float = 1e-6
-    gradient_tolerance: float = 1e-9
-    objective_tolerance: float = 0.0
 
 
 def _no_clock() -> float:
@@ -108,7 +65,9 @@ def solve(
 
     Raises:
         ProblemError: the problem is not well formed.
+        ChoiceError: a choice does not exist or contradicts another.
     """
+    options.check()
     problem.check()
     if len(problem.observations) == 0 or (problem.fixed.all() and problem.n_points == 0):
         return Result(problem.start, Status.SKIPPED, "no observations: nothing to solve", options.method, ())
@@ -134,20 +93,24 @@ class _Run:
         self.clock, self.began = clock, clock()
         self.on_iteration = on_iteration
         with np.errstate(all="ignore"):
-            self.kernels = native_kernels.make(problem, options.rules, options.backend)
+            self.kernels = native_kernels.make(
+                problem, options.rules, options.backend, options.schur, options.preconditioner
+            )
+        self.reduced = ReducedSolver(options)
         self.free = np.flatnonzero(~problem.fixed)
         self.state = problem.start
         self.value = np.inf
         self.mu, self.nu = options.initial_damping, 2.0
         self.radius = options.initial_radius if options.trust_region != "none" else np.inf
         self.rejected = 0
+        self.side = ""
         self.stopped = False
         self.trace: list[Iteration] = []
-        n = self.kernels.n_free * self.kernels.size
-        self.dense = n <= DENSE_LIMIT
-        self.linear_solver = options.linear_solver
-        if self.linear_solver == "auto":
-            self.linear_solver = "cholesky" if self.dense else "pcg"
+        self.annealing: Annealing | None = None
+        if options.annealing == "gnc":
+            with np.errstate(all="ignore"):
+                self.annealing = Annealing(problem, options)
+            self.kernels.graduate(self.annealing.graduation)
 
     def run(self) -> Result:
         self.value = self.kernels.linearise(self.state)
@@ -155,7 +118,7 @@ class _Run:
             return self._result(Status.FAILED, "the objective or its derivatives are not finite at the start")
         self._record(0, 0, True)
         for iteration in range(1, self.options.max_iterations + 1):
-            reason = self._converged()
+            reason = "" if self._annealed() else self._converged()
             if reason:
                 return self._result(Status.CONVERGED, reason)
             if self.stopped:
@@ -164,6 +127,10 @@ class _Run:
             accepted, solution = self._step()
             if accepted:
                 self.kernels.linearise(self.state)
+            if self._annealed():
+                self._anneal(accepted)
+                self._record(iteration, solution.iterations, accepted)
+                continue
             self._record(iteration, solution.iterations, accepted)
             if accepted and before - self.value <= self.options.function_tolerance * before:
                 share = (before - self.value) / before if before > 0 else 0.0
@@ -171,6 +138,25 @@ class _Run:
             if self.rejected >= _MAX_REJECTED:
                 return self._result(Status.STALLED, f"{self.rejected} steps in a row did not lower the objective")
         return self._result(Status.MAX_ITERATIONS, f"stopped at the cap of {self.options.max_iterations} iterations")
+
+    def _annealed(self) -> bool:
+        """Return True while a surrogate stands in for the loss."""
+        return self.annealing is not None and self.annealing.active
+
+    def _anneal(self, accepted: bool) -> None:
+        """Go on to the next surrogate, or to the loss itself at the best state seen."""
+        assert self.annealing is not None
+        if accepted:
+            self.annealing.see(self.state)
+        if not self.annealing.advance(self.rejected):
+            return
+        self.rejected = 0
+        self.kernels.graduate(self.annealing.graduation)
+        if self.annealing.active:
+            self.value = self.kernels.linearise(self.state)
+        else:
+            self.state, self.value = self.annealing.state, self.annealing.value
+            self.kernels.linearise(self.state)
 
     def _converged(self) -> str:
         if self.kernels.gradient_norm <= self.options.gradient_tolerance:
@@ -184,11 +170,12 @@ class _Run:
         hessian = self.kernels.diagonals()
         d_c, d_p = scaling.diagonals(self.options.damping, hessian)
         system = self.kernels.reduce(self.mu * d_c, self.mu * d_p)
-        solution = self._solve_reduced(system, hessian)
+        self.side = system.side
+        solution = self.reduced.solve(system, hessian, self.radius)
         if solution.x is None:
             return self._judge(-1.0, solution), solution
-        step_p, predicted = system.back_substitute(solution.x)
-        candidate = self._retract(solution.x, step_p)
+        step_c, step_p, predicted = system.back_substitute(solution.x)
+        candidate = self._retract(step_c, step_p)
         if not candidate.is_finite():
             return self._judge(-1.0, solution), solution
         value = self.kernels.objective(candidate)
@@ -204,57 +191,17 @@ class _Run:
         return accepted, solution
 
     def _retract(self, step_c: FloatArray, step_p: FloatArray) -> State:
-        """Return the state after a step."""
+        """Return the state after a step (n_free, d) and (n_points, 3)."""
         state, free = self.state, self.free
-        blocks = step_c.reshape(-1, self.kernels.size)
         rotation, translation = state.rotation.copy(), state.translation.copy()
         rotation[free], translation[free] = parameterisation.retract(
-            self.options.rules.parameterisation, rotation[free], translation[free], blocks[:, :6]
+            self.options.rules.parameterisation, rotation[free], translation[free], step_c[:, :6]
         )
         intrinsics = state.intrinsics
         if len(intrinsics):
             intrinsics = intrinsics.copy()
-            intrinsics[free] += blocks[:, 6:]
+            intrinsics[free] += step_c[:, 6:]
         return State(rotation, translation, state.points + step_p, intrinsics)
-
-    def _solve_reduced(self, system: System, hessian: tuple[FloatArray, FloatArray]) -> linear.Solution:
-        options = self.options
-        n = len(system.rhs)
-        if n == 0:
-            return linear.Solution(np.zeros(0))
-        if self.linear_solver == "cholesky":
-            return linear.cholesky(system.dense() if self.dense else system.sparse(), system.rhs)
-        scale = np.ones(n)
-        if options.trust_region != "none":
-            d_c, _ = scaling.diagonals(options.trust_region, hessian)
-            scale = 1.0 / (np.sqrt(d_c) if options.trust_region == "diag" else d_c).ravel()
-        limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, self.radius)
-        found = linear.pcg_steihaug(
-            self._scaled_product(system, scale), scale * system.rhs, self._preconditioner(system, scale), limits
-        )
-        x = None if found.x is None else scale * found.x
-        return linear.Solution(x, found.iterations, found.on_boundary)
-
-    def _scaled_product(self, system: System, scale: FloatArray) -> linear.Product:
-        """Return x -> D^-1 S D^-1 x."""
-        if self.dense:
-            matrix = system.dense()
-            matrix *= scale[:, None]
-            matrix *= scale
-            return lambda x: np.asarray(matrix @ x)
-        return lambda x: scale * system.product(scale * x)
-
-    def _preconditioner(self, system: System, scale: FloatArray) -> linear.Product:
-        if self.options.preconditioner == "none":
-            return lambda r: r
-        size = self.kernels.size
-        s = scale.reshape(-1, size)
-        blocks = system.diagonal_blocks() * s[:, :, None] * s[:, None, :]
-        try:
-            inverse = np.linalg.inv(blocks)
-        except np.linalg.LinAlgError:
-            inverse = np.linalg.pinv(blocks, hermitian=True)
-        return lambda r: (inverse @ r.reshape(-1, size, 1)).ravel()
 
     def _judge(self, rho: float, solution: linear.Solution) -> bool:
         """Update damping and radius from the gain ratio; return whether the step is taken."""
@@ -276,16 +223,19 @@ class _Run:
         row = Iteration(
             iteration=iteration,
             time_s=self.clock() - self.began,
-            objective=self.value,
+            objective=self.annealing.value if self.annealing is not None and self.annealing.active else self.value,
             gradient_norm=self.kernels.gradient_norm,
             linear_iterations=linear_iterations,
             accepted=accepted,
             damping=self.mu if self.options.damping != "none" else 0.0,
             radius=self.radius,
+            side=self.side,
         )
         self.trace.append(row)
         if self.on_iteration is not None and not self.on_iteration(row):
             self.stopped = True
 
     def _result(self, status: Status, reason: str) -> Result:
+        if self.annealing is not None and self.annealing.active:
+            self.state = self.annealing.state
         return Result(self.state, status, reason, self.options.method, tuple(self.trace))

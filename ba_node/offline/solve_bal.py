@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
-from ba_node.core.solver import SolverOptions, solve
+from ba_node.core.solver import solve
 from ba_node.io.bal import BalProblem, from_state, read_bal, to_problem
 from ba_node.offline.solver_settings import describe
 from ba_node.window.quality import problem_rms_px

@@ -10,27 +10,13 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-from ba_node import native
 from ba_node.config import ConfigError, Value, parse_assignment
 from ba_node.core import methods
-from ba_node.core.loss import LOSSES
-from ba_node.core.native_kernels import BACKENDS
-from ba_node.core.objective import CHEIRALITY, Rules
-from ba_node.core.parameterisation import PARAMETERISATIONS
-from ba_node.core.scaling import SCALINGS
-from ba_node.core.solver import SolverOptions
+from ba_node.core.choices import PARTS, ChoiceError
+from ba_node.core.native_kernels import missing
+from ba_node.core.objective import Rules
+from ba_node.core.options import SolverOptions
 
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "parameterisation": PARAMETERISATIONS,
-    "loss": LOSSES,
-    "cheirality": CHEIRALITY,
-    "damping": SCALINGS,
-    "damping_policy": ("nielsen", "fast"),
-    "trust_region": SCALINGS,
-    "linear_solver": ("auto", "cholesky", "pcg"),
-    "preconditioner": ("none", "schur_block"),
-    "backend": BACKENDS,
-}
 # Numbers that may be zero; the others must be above it.
 _MAY_BE_ZERO = (
     "t_eps",
@@ -43,6 +29,11 @@ _MAY_BE_ZERO = (
 _GROUP = "solver."
 # Where the parameter of the node has another name than the option.
 _RENAMED = {"loss_scale_px": "loss_scale"}
+# Other names: those of choices.py, and those of the thesis for numbers.
+_ALIASES = {alias: part.option for part in PARTS.values() for alias in part.aliases} | {
+    "gamma": "loss_scale",
+    "cap": "max_linear_iterations",
+}
 _RULES = tuple(item.name for item in dataclasses.fields(Rules))
 _OPTIONS = tuple(item.name for item in dataclasses.fields(SolverOptions) if item.name not in ("method", "rules"))
 
@@ -61,7 +52,8 @@ def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
             the latter must also be in the range of the parameter.
 
     Raises:
-        ConfigError: a method, name or value that does not exist or is out of range, or kernels that are not there.
+        ConfigError: a method, name or value that does not exist or is out of range, choices that contradict each other,
+            or kernels that are not there.
     """
     changes: dict[str, Value] = {}
     for text in assignments:
@@ -73,7 +65,11 @@ def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
     options = methods.options(method)
     rules = dataclasses.replace(options.rules, **_taken(changes, _RULES))
     options = dataclasses.replace(options, rules=rules, **_taken(changes, _OPTIONS))
-    reason = native.missing(rules.parameterisation, rules.loss)
+    try:
+        options.check()
+    except ChoiceError as error:
+        raise ConfigError(str(error)) from None
+    reason = missing(rules, options.schur, options.preconditioner)
     if options.backend == "native" and reason:
         raise ConfigError(f"option backend = 'native': {reason}; take numpy or auto")
     return options
@@ -99,10 +95,12 @@ def _read(text: str) -> tuple[str, Value]:
         name, value = parse_assignment(text)
         bare = name.removeprefix(_GROUP)
         return _RENAMED.get(bare, bare), value
-    if name in _CHOICES:
-        if raw not in _CHOICES[name]:
-            raise ConfigError(f"option {name} = {raw!r}: choose one of {', '.join(_CHOICES[name])}")
-        return name, raw
+    name = _ALIASES.get(name, name)
+    if name in PARTS:
+        try:
+            return name, PARTS[name].resolve(raw)
+        except ChoiceError as error:
+            raise ConfigError(str(error)) from None
     if name not in option_names():
         raise ConfigError(f"option {name!r} does not exist{_nearest(name, option_names())}")
     return name, _number(name, raw)

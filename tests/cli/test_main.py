@@ -93,7 +93,7 @@ def test_recording_without_keyframes_names_what_is_missing(
         ("window.max_keyframe=3", "did you mean 'window.max_keyframes'?"),
         ("window.max_keyframes=many", "expected int"),
         ("window.max_keyframes=1", "expected a number in [2, 100000]"),
-        ("solver.loss=cauchy", "choose one of squared, huber"),
+        ("solver.loss=l1", "choose one of squared, huber"),
         ("window.max_keyframes", "expected name=value"),
     ],
 )

@@ -15,7 +15,17 @@ from ba_node.core import methods
 from ba_node.io.bal import read_bal
 from ba_node.offline.solver_settings import describe, option_names, solver_options
 
-ROW = {"iteration", "time_s", "objective", "gradient_norm", "linear_iterations", "accepted", "damping", "radius"}
+ROW = {
+    "iteration",
+    "time_s",
+    "objective",
+    "gradient_norm",
+    "linear_iterations",
+    "accepted",
+    "damping",
+    "radius",
+    "side",
+}
 
 
 def test_solve_writes_trace_and_problem(bal_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,7 +105,7 @@ def test_without_settings_the_method_is_as_declared() -> None:
     ("setting", "words"),
     [
         ("los=huber", "did you mean 'loss'?"),
-        ("loss=cauchy", "choose one of squared, huber"),
+        ("loss=l1", "choose one of squared, huber"),
         ("max_iterations=0", "expected a finite number > 0"),
         ("max_iterations=2.5", "expected int"),
         ("t_eps=nan", "expected a finite number >= 0"),

@@ -14,9 +14,10 @@ import pytest
 
 from ba_node.core import methods
 from ba_node.core.objective import Objective, Rules
+from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.result import Iteration, Result, Status
-from ba_node.core.solver import SolverOptions, solve
+from ba_node.core.solver import solve
 from ba_node.io import bal
 
 Make = Callable[..., tuple[Problem, State]]
@@ -155,7 +156,9 @@ class TestDegenerate:
         check(solve(dataclasses.replace(problem, start=start), methods.options(method)))
         observations = dataclasses.replace(problem.observations, uv=problem.observations.uv * 1e200)
         result = solve(dataclasses.replace(problem, observations=observations), methods.options(method))
-        assert result.status == Status.FAILED and result.state.is_finite()
+        assert result.state.is_finite() and result.reason
+        # A truncated quadratic is finite there too, and flat.
+        assert result.status == (Status.CONVERGED if method == "irls_tq" else Status.FAILED)
 
     def test_no_observations_no_points_nothing_free(self, make_problem: Make) -> None:
         problem, _ = make_problem()

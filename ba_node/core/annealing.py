@@ -1,0 +1,66 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Lead up to a truncated quadratic by graduated non-convexity (GNC-TLS; see loss.py for the surrogates).
+
+From a cold start most residuals lie on the plateau of a truncated quadratic, where they pull at nothing: the solve
+ends where it began. Here each step is taken on a surrogate of its own, from the nearly convex one whose graduation is
+``mu = c^2 / (2 max|r|^2 - c^2)`` up to one that is the loss for all purposes; then the loss itself takes over from the
+best state seen. What is reported meanwhile is the objective of that state under the loss itself: it never rises.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ba_node.core.objective import Objective
+from ba_node.core.options import SolverOptions
+from ba_node.core.problem import Problem, State
+
+# The surrogate of this graduation differs from the loss within 0.5 % of the scale only.
+_LAST = 100.0
+# Growth of mu a step, as 3 ends a little lower than 10, unless the levels would use up half of the iterations.
+_GROWTH = 3.0
+# A level whose steps are rejected this often is left.
+_MAX_REJECTED = 3
+
+
+class Annealing:
+    """The levels of one solve, and the best state seen on them.
+
+    Attributes:
+        graduation: mu of the present surrogate, infinite when the loss itself has taken over.
+        state: the best state so far.
+        value: its objective under the loss itself.
+    """
+
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
+        """Set the first level."""
+        self._objective = Objective(problem, options.rules)
+        self.state, self.value = problem.start, self._objective.value(problem.start)
+        norms = np.linalg.norm(self._objective.errors(problem.start), axis=1) / problem.observations.sigma_px
+        share = 2.0 * float(np.max(norms[np.isfinite(norms)], initial=0.0)) ** 2 / options.rules.loss_scale**2
+        self.graduation = 1.0 / (share - 1.0) if 1.0 < share < np.inf else np.inf
+        levels = max(1, options.max_iterations // 2)
+        self._growth = max(_GROWTH, (_LAST / self.graduation) ** (1.0 / levels)) if self.active else 1.0
+
+    @property
+    def active(self) -> bool:
+        """Return True while a surrogate stands in."""
+        return math.isfinite(self.graduation)
+
+    def see(self, state: State) -> None:
+        """Remember a state if it is the best so far."""
+        value = self._objective.value(state)
+        if value < self.value:
+            self.state, self.value = state, value
+
+    def advance(self, rejected: int) -> bool:
+        """Go on to the next level, unless the step was rejected and may be tried again; return True if it did."""
+        if 0 < rejected < _MAX_REJECTED:
+            return False
+        self.graduation *= self._growth
+        if self.graduation > _LAST:
+            self.graduation = np.inf
+        return True
