@@ -41,9 +41,9 @@ def positive_inverses(blocks: FloatArray) -> FloatArray:
 
 
 def condition(blocks: FloatArray) -> float:
-    """Return the condition number of a block-diagonal matrix; infinite if it is singular, 1 if it is empty."""
+    """Return the largest condition number of a block: how much of it its inverse may lose; 1 if there is none."""
     if not blocks.size:
         return 1.0
     values = np.linalg.eigvalsh(np.nan_to_num(blocks))
-    smallest, largest = float(values.min()), float(values.max())
-    return largest / smallest if smallest > 0.0 else np.inf
+    smallest, largest = values[:, 0], values[:, -1]
+    return float(np.max(np.where(smallest > 0.0, largest / np.where(smallest > 0.0, smallest, 1.0), np.inf)))

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import scipy.sparse
@@ -16,6 +17,21 @@ FloatArray = NDArray[float64]
 
 # Up to this many unknowns S is stored densely.
 DENSE_LIMIT = 3000
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What a method asks of the kernels beside the rules.
+
+    Attributes:
+        schur: which unknowns are eliminated.
+        preconditioner: M of PCG.
+        space: D of the scaled space, as of scaling.scaled_space.
+    """
+
+    schur: str = "points"
+    preconditioner: str = "none"
+    space: str = "none"
 
 
 class System(Protocol):

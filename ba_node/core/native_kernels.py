@@ -12,7 +12,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ba_node import native
-from ba_node.core.kernels import Kernels, System
+from ba_node.core.kernels import Demands, Kernels, System
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Rules
 from ba_node.core.problem import Problem, State
@@ -28,29 +28,30 @@ class KernelsError(ValueError):
     """Kernels that were asked for by name and cannot be had."""
 
 
-def make(
-    problem: Problem, rules: Rules, backend: str = "auto", schur: str = "points", preconditioner: str = "none"
-) -> Kernels:
+_POINTS = Demands()
+
+
+def make(problem: Problem, rules: Rules, backend: str = "auto", demands: Demands = _POINTS) -> Kernels:
     """Return the kernels of a problem.
 
     Raises:
         KernelsError: native is asked for and is not built, or does not have what else is asked for.
     """
-    reason = missing(rules, schur, preconditioner)
+    reason = missing(rules, demands)
     if backend == "native" and reason:
         raise KernelsError(f"backend native: {reason}; take numpy or auto")
     if backend == "numpy" or reason:
-        return NumpyKernels(problem, rules, schur)
+        return NumpyKernels(problem, rules, demands)
     return NativeKernels(problem, rules)
 
 
-def missing(rules: Rules, schur: str, preconditioner: str) -> str:
+def missing(rules: Rules, demands: Demands) -> str:
     """Return why the C++ kernels cannot be used, or an empty string if they can."""
     reason = native.missing(rules.parameterisation, rules.loss)
-    if not reason and schur != "points":
-        return f"the C++ kernels eliminate points only, not schur = {schur}"
-    if not reason and preconditioner in ("b_block", "b_diag"):
-        return f"the C++ kernels have no preconditioner {preconditioner}"
+    if not reason and demands.schur != "points":
+        return f"the C++ kernels eliminate points only, not schur = {demands.schur}"
+    if not reason and demands.preconditioner in ("b_block", "b_diag"):
+        return f"the C++ kernels have no preconditioner {demands.preconditioner}"
     return reason
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from ba_node.core import polish
+from ba_node.core import polish, scaling
 from ba_node.core.blocks import condition
-from ba_node.core.kernels import DENSE_LIMIT, System
+from ba_node.core.kernels import DENSE_LIMIT, Demands, System
 from ba_node.core.objective import Linearisation, Objective, Rules
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
@@ -19,6 +19,7 @@ from ba_node.core.schur_cameras import CameraReduction, FullSystem
 FloatArray = NDArray[np.float64]
 Reduction = ReducedSystem | CameraReduction | FullSystem
 
+_POINTS = Demands()
 _SIDES: dict[str, type[ReducedSystem] | type[CameraReduction] | type[FullSystem]] = {
     "points": ReducedSystem,
     "cameras": CameraReduction,
@@ -29,11 +30,11 @@ _SIDES: dict[str, type[ReducedSystem] | type[CameraReduction] | type[FullSystem]
 class NumpyKernels:
     """The kernels in numpy and scipy."""
 
-    def __init__(self, problem: Problem, rules: Rules, schur: str = "points") -> None:
+    def __init__(self, problem: Problem, rules: Rules, demands: Demands = _POINTS) -> None:
         """Sort the observations once."""
         self._structure = Structure(problem)
         self._objective = Objective(problem, rules)
-        self._schur = schur
+        self._demands = demands
         self.n_free, self.size = self._structure.n_free, self._structure.size
         self.gradient_norm = np.inf
         self._linearisation: Linearisation
@@ -56,7 +57,7 @@ class NumpyKernels:
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
         """Add damping to the diagonals and eliminate."""
-        side, factor = self._schur, 1.0
+        side, factor = self._demands.schur, 1.0
         if side == "adaptive":
             side, factor = self._adapt(damping_c, damping_p)
         reduction = _SIDES[side](self._structure, self._equations, damping_c, damping_p)
@@ -65,12 +66,19 @@ class NumpyKernels:
         return system
 
     def _adapt(self, damping_c: FloatArray, damping_p: FloatArray) -> tuple[str, float]:
-        """Return the side that is better conditioned and what the radius becomes there (Algorithm 10)."""
+        """Return the side to eliminate and what the radius becomes there (Algorithm 10).
+
+        The conditions are those of the diagonal blocks in the scaled space, as a block is what has to be inverted
+        well; they are of the size that section 4.1 reports, 1e4 for B and up to 1e7 for C. Those of B and C as whole
+        matrices compare the units of unlike parameters.
+        """
         if self.n_free == 0:
             return "points", 1.0
         equations, size = self._equations, self.size
         b = equations.b + damping_c[:, :, None] * np.eye(size)
         c = equations.c + damping_p[:, :, None] * np.eye(3)
+        s_c, s_p = (1.0 / d for d in scaling.scaled_space(self._demands.space, self.diagonals()))
+        b, c = b * s_c[:, :, None] * s_c[:, None, :], c * s_p[:, :, None] * s_p[:, None, :]
         if condition(c) < condition(b):
             return "points", 1.0
         return "cameras", 3.0 * self._structure.n_points / (size * self.n_free)

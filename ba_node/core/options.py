@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, field
 
 from ba_node.core.choices import PARTS, ChoiceError
+from ba_node.core.kernels import Demands
 from ba_node.core.objective import Rules
 
 
@@ -57,6 +58,12 @@ class SolverOptions:
     function_tolerance: float = 1e-6
     gradient_tolerance: float = 1e-9
     objective_tolerance: float = 0.0
+
+    @property
+    def demands(self) -> Demands:
+        """Return what the method asks of the kernels; without a region the scaled space is that of the damping."""
+        space = self.damping if self.trust_region == "none" else self.trust_region
+        return Demands(self.schur, self.preconditioner, space)
 
     def check(self) -> None:
         """Raise ChoiceError if a choice does not exist or contradicts another; say which, and what to do."""

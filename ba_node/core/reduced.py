@@ -46,8 +46,7 @@ class ReducedSolver:
         if self._by_cholesky(n):
             return linear.cholesky(_matrix(system), system.rhs)
         options = self._options
-        kind = options.damping if options.trust_region == "none" else options.trust_region
-        scale = 1.0 / system.gather(*scaling.scaled_space(kind, hessian))
+        scale = 1.0 / system.gather(*scaling.scaled_space(options.demands.space, hessian))
         limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius * system.radius_factor)
         precondition = preconditioner(options.preconditioner, system, scale)
         found = linear.pcg_steihaug(_scaled_product(system, scale), scale * system.rhs, precondition, limits)

@@ -93,9 +93,7 @@ class _Run:
         self.clock, self.began = clock, clock()
         self.on_iteration = on_iteration
         with np.errstate(all="ignore"):
-            self.kernels = native_kernels.make(
-                problem, options.rules, options.backend, options.schur, options.preconditioner
-            )
+            self.kernels = native_kernels.make(problem, options.rules, options.backend, options.demands)
         self.reduced = ReducedSolver(options)
         self.free = np.flatnonzero(~problem.fixed)
         self.state = problem.start

@@ -69,7 +69,7 @@ def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
         options.check()
     except ChoiceError as error:
         raise ConfigError(str(error)) from None
-    reason = missing(rules, options.schur, options.preconditioner)
+    reason = missing(rules, options.demands)
     if options.backend == "native" and reason:
         raise ConfigError(f"option backend = 'native': {reason}; take numpy or auto")
     return options

@@ -1,0 +1,208 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The named methods: what they choose, what is refused, and that each runs to its stop on every data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ba_node.core import methods
+from ba_node.core.choices import PARTS, ChoiceError
+from ba_node.core.objective import Rules
+from ba_node.core.options import SolverOptions
+from ba_node.core.problem import Problem, State
+from ba_node.core.result import Result, Status
+from ba_node.core.solver import solve
+from ba_node.io import bal
+from ba_node.solver_settings import describe, solver_options
+
+Make = Callable[..., tuple[Problem, State]]
+# What the thesis tests of each: the table of its section 3 and 4.
+VARIANTS = [
+    *((name, ()) for name in methods.METHODS),
+    ("lma_cd", ("schur=B",)),
+    ("lma_cd", ("schur=H",)),
+    ("inm", ("schur=B", "scaling=diag")),
+    ("inm", ("schur=H", "scaling=I")),
+    ("tnm", ("schur=B", "damping=inc")),
+    ("tnm", ("schur=H", "damping=I")),
+    ("tnm", ("damping=diag",)),
+    ("dinm", ("scaling=inc", "damping=diag")),
+    ("dinm", ("scaling=diag", "damping=I")),
+    ("dinm", ("scaling=diag", "damping=inc")),
+    *(("dinm", (f"preconditioner={name}",)) for name in PARTS["preconditioner"].names),
+    ("adinm", ("preconditioner=b_diag",)),
+    ("irls_huber", ("loss=cauchy",)),
+    ("irls_huber", ("loss=geman_mcclure", "gamma=2")),
+    ("irls_tq", ("annealing=none",)),
+]
+IDS = ["-".join((name, *settings)) for name, settings in VARIANTS]
+
+
+def check(result: Result) -> None:
+    """Assert what holds for every result."""
+    assert result.state.is_finite() and result.reason
+    assert result.status in (Status.CONVERGED, Status.MAX_ITERATIONS, Status.STALLED), result.reason
+    objectives = [row.objective for row in result.trace]
+    assert np.isfinite(objectives).all()
+    assert all(b <= a for a, b in itertools.pairwise(objectives)), objectives
+
+
+@pytest.mark.parametrize("shape", [{}, {"free_intrinsics": True, "points": 60}], ids=["6", "9"])
+@pytest.mark.parametrize(("name", "settings"), VARIANTS, ids=IDS)
+def test_every_variant_on_a_small_problem(
+    name: str, settings: tuple[str, ...], shape: dict[str, object], make_problem: Make
+) -> None:
+    problem, _ = make_problem(**shape)
+    result = solve(problem, solver_options(name, [*settings, "max_iterations=15"]))
+    check(result)
+    # From its plateau a truncated quadratic does not come down by itself.
+    share = 1.0 if "annealing=none" in settings else 0.5
+    assert result.objective_after < share * result.objective_before, result.reason
+
+
+@pytest.mark.parametrize(("name", "settings"), VARIANTS, ids=IDS)
+def test_every_variant_on_dubrovnik(name: str, settings: tuple[str, ...], shared_data: Path) -> None:
+    problem = bal.to_problem(bal.read_bal(shared_data / "gtsam-dubrovnik-small" / "dubrovnik-3-7-pre.txt"))
+    check(solve(problem, solver_options(name, settings)))
+
+
+@pytest.mark.slow
+class TestLadybug:
+    """The problem that the thesis measures on, 50 iterations each."""
+
+    @pytest.fixture(scope="class")
+    def results(self, shared_data: Path) -> dict[str, Result]:
+        problem = bal.to_problem(bal.read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt"))
+        return {name: solve(problem, options) for name, options in methods.METHODS.items()}
+
+    def test_every_method_stops_with_a_reason(self, results: dict[str, Result]) -> None:
+        for result in results.values():
+            check(result)
+
+    def test_gradients(self, results: dict[str, Result]) -> None:
+        dinm, local = results["dinm"].gradient_norm, results["local_dinm"].gradient_norm
+        assert dinm < 10.0, f"dinm: {dinm:.2f}"
+        assert local <= dinm, f"local_dinm: {local:.2f}, dinm: {dinm:.2f}"
+
+    def test_objectives_agree(self, results: dict[str, Result]) -> None:
+        values = {name: results[name].objective_after for name in ("dinm", "adinm", "local_dinm", "lma_cd")}
+        assert max(values.values()) <= 1.01 * min(values.values()), values
+
+
+class TestAnnealing:
+    """A truncated quadratic from a cold start."""
+
+    @pytest.fixture
+    def problem(self, make_problem: Make) -> Problem:
+        problem, _ = make_problem(stereo=True, points=80, start_error=0.05)
+        uv = problem.observations.uv.copy()
+        uv[::4] += 80.0
+        return dataclasses.replace(problem, observations=dataclasses.replace(problem.observations, uv=uv))
+
+    def test_it_leaves_the_plateau(self, problem: Problem) -> None:
+        ends = {
+            name: solve(problem, solver_options("irls_tq", [f"annealing={name}", "gamma=3"]))
+            for name in ("none", "gnc")
+        }
+        for result in ends.values():
+            check(result)
+        assert ends["gnc"].objective_after < 0.7 * ends["none"].objective_after, ends
+
+    @pytest.mark.parametrize("cap", [1, 2, 5])
+    def test_stopped_halfway_it_returns_the_best_state(self, cap: int, problem: Problem) -> None:
+        options = solver_options("irls_tq", [f"max_iterations={cap}", "gamma=3"])
+        result = solve(problem, options)
+        check(result)
+        again = solve(dataclasses.replace(problem, start=result.state), dataclasses.replace(options, annealing="none"))
+        assert again.objective_before == pytest.approx(result.objective_after, rel=1e-12)
+
+
+class TestBadInput:
+    """Nothing to solve, or nothing that can be: a status and a reason."""
+
+    @pytest.mark.parametrize("name", list(methods.METHODS))
+    def test_no_weight_anywhere(self, name: str, make_problem: Make) -> None:
+        """All residuals lie on the plateau, or where a redescending loss no longer pulls."""
+        problem, _ = make_problem()
+        uv = problem.observations.uv + 1e6
+        problem = dataclasses.replace(problem, observations=dataclasses.replace(problem.observations, uv=uv))
+        options = dataclasses.replace(
+            methods.options(name),
+            rules=Rules(methods.options(name).rules.parameterisation, "truncated_quadratic"),
+            annealing="none",
+        )
+        result = solve(problem, options)
+        check(result)
+        assert result.status == Status.CONVERGED and "gradient" in result.reason
+
+    @pytest.mark.parametrize("name", list(methods.METHODS))
+    def test_one_camera_one_point(self, name: str, make_problem: Make) -> None:
+        problem, _ = make_problem(keyframes=2, points=1, fixed=1)
+        obs = problem.observations
+        one = {f.name: getattr(obs, f.name)[:1] for f in dataclasses.fields(obs)}
+        check(solve(dataclasses.replace(problem, observations=dataclasses.replace(obs, **one)), methods.options(name)))
+
+    @pytest.mark.parametrize("name", list(methods.METHODS))
+    def test_no_points(self, name: str, make_problem: Make) -> None:
+        problem, _ = make_problem()
+        obs = problem.observations
+        none = {f.name: getattr(obs, f.name)[:0] for f in dataclasses.fields(obs)}
+        start = dataclasses.replace(problem.start, points=problem.start.points[:0])
+        empty = dataclasses.replace(problem, start=start, observations=dataclasses.replace(obs, **none))
+        assert solve(empty, methods.options(name)).status == Status.SKIPPED
+
+    @pytest.mark.parametrize("side", PARTS["schur"].names)
+    def test_nothing_but_points_is_free(self, side: str, make_problem: Make) -> None:
+        problem, _ = make_problem()
+        fixed = dataclasses.replace(problem, fixed=np.ones(problem.n_keyframes, bool))
+        result = solve(fixed, dataclasses.replace(SolverOptions(), schur=side, polish_steps=0))
+        check(result)
+        assert result.objective_after < 0.5 * result.objective_before
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (SolverOptions(damping="big"), "damping = 'big': choose one of none, identity, diag, inc"),
+        (SolverOptions(schur="B"), "write cameras"),
+        (SolverOptions(trust_region="inc", linear_solver="cholesky"), "only pcg stops at the boundary"),
+        (SolverOptions(rules=Rules(loss="huber", loss_scale=0.0)), "a robust loss needs the residual"),
+        (SolverOptions(rules=Rules(loss="cauchy", loss_scale=float("nan"))), "set loss_scale to a number > 0"),
+        (SolverOptions(rules=Rules(loss="huber"), annealing="gnc"), "loss = truncated_quadratic"),
+    ],
+)
+def test_contradictions_are_refused_with_the_reason(options: SolverOptions, words: str, make_problem: Make) -> None:
+    with pytest.raises(ChoiceError, match=words):
+        solve(make_problem()[0], options)
+
+
+def test_every_choice_of_every_method_is_declared() -> None:
+    for name, method in methods.CATALOGUE.items():
+        method.options.check()
+        assert set(PARTS) <= set(describe(method.options)), name
+
+
+def test_methods_are_the_table_of_the_thesis() -> None:
+    expected = {
+        "lma_cd": ("identity", "none", "cholesky", "points", "global", "squared"),
+        "bal": ("diag", "none", "pcg", "points", "global", "squared"),
+        "inm": ("none", "inc", "pcg", "points", "global", "squared"),
+        "tnm": ("inc", "none", "pcg", "points", "global", "squared"),
+        "dinm": ("identity", "inc", "pcg", "points", "global", "squared"),
+        "adinm": ("identity", "inc", "pcg", "adaptive", "global", "squared"),
+        "local_dinm": ("identity", "inc", "pcg", "points", "local", "squared"),
+        "irls_huber": ("identity", "inc", "pcg", "points", "local", "huber"),
+        "irls_tq": ("identity", "inc", "pcg", "points", "local", "truncated_quadratic"),
+    }
+    parts = ("damping", "trust_region", "linear_solver", "schur", "parameterisation", "loss")
+    for name, row in expected.items():
+        values = describe(methods.options(name))
+        assert tuple(values[part] for part in parts) == row, name
+    assert describe(methods.options("bal"))["preconditioner"] == "b_block"
