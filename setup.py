@@ -82,6 +82,8 @@ setup(
     # Exact versions for development are in requirements/.
     extras_require={
         "test": ["hypothesis", "mcap-ros2-support", "pytest", "pytest-timeout"],
+        # Solvers that `make bench` compares with; each is left out where it is missing.
+        "bench": ["g2opy", "gtsam", "pycolmap"],
         "lint": ["mypy", "ruff", "types-PyYAML", "types-tqdm"],
     },
     entry_points={
