@@ -7,9 +7,9 @@ PYTHON ?=
 ARGS ?=
 
 RUN := .venv/bin/python
-CHECKED := ba_node tests tools setup.py $(wildcard launch/*.py)
+CHECKED := ba_node benchmarks tests tools setup.py $(wildcard launch/*.py)
 
-.PHONY: help setup demo test lint format clean
+.PHONY: help setup demo test bench lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
@@ -23,6 +23,9 @@ demo: setup ## play a recording into the node over DDS, compare with ground trut
 test: setup ## run the tests
 	@$(RUN) -m pytest $(ARGS)
 
+bench: setup ## compare with the solvers that are installed, see docs/performance.md (ARGS="--quick": two windows)
+	@$(RUN) -m benchmarks $(ARGS)
+
 lint: setup ## check style and types
 	@$(RUN) -m ruff check $(CHECKED)
 	@$(RUN) -m ruff format --check $(CHECKED)
@@ -34,4 +37,4 @@ format: setup ## put all Python files into the agreed style
 
 clean: ## remove .venv and everything else that commands have made
 	@rm -rf .venv build install log out *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	@find ba_node tests tools launch -name __pycache__ -prune -exec rm -rf {} +
+	@find ba_node benchmarks tests tools launch -name __pycache__ -prune -exec rm -rf {} +
