@@ -89,15 +89,15 @@ _IMPORTS = {
 }
 _WHEELS = (
     Solver("pycolmap", ("pycolmap_run",), needs_in_front=True, quick=False, printed=True, max_observations=200_000),
-    Solver("gtsam", ("gtsam_run",), needs_in_front=True, quick=False, max_observations=50_000),
-    Solver("g2o", ("g2o_run",), sizes=(6,), quick=False, max_observations=50_000),
+    Solver("gtsam", ("gtsam_run",), needs_in_front=True, quick=False, max_observations=20_000),
+    Solver("g2o", ("g2o_run",), sizes=(6,), quick=False, max_observations=20_000),
     Solver("scipy", ("scipy_run",), quick=False, max_observations=20_000),
 )
 
 
 def _ba_node() -> tuple[list[Solver], list[str]]:
     command = (sys.executable, "-m", "benchmarks.peers.ba_node_run")
-    numpy = Solver("ba_node numpy", command, "numpy", max_observations=40_000, quick=False)
+    numpy = Solver("ba_node numpy", command, "numpy", max_observations=20_000, quick=False)
     reason = native.missing("local", "huber")
     if reason:
         return [Solver("ba_node numpy", command, "numpy")], [f"ba_node native: {reason}"]

@@ -26,8 +26,10 @@ START_AGREES_PRINTED = 1e-6
 END_AGREES = 1e-4
 # Relative figures count from this share of the start's objective where the best is next to nothing.
 _NOTHING = 1e-9
-# A solver that took longer than this on a problem, all runs together, is not run on it again, s.
-_LONG_S = 8.0
+# A solver that took so long on a problem, all runs together, is not run on it again; after three runs the time is
+# shorter, as long runs scatter less, s.
+_LONG_S = 4.0
+_LONG_AFTER_THREE_S = 0.5
 
 
 @dataclass
@@ -150,7 +152,9 @@ def faults(one: Run, f_start: float, start_agrees: float) -> list[str]:
 def _is_settled(result: Result) -> bool:
     """Return True if a further run would take long or fail again."""
     failed = bool(result.faults) or any(not one.trace for one in result.runs)
-    return failed or sum(one.total_s for one in result.runs) > _LONG_S
+    return failed or sum(one.total_s for one in result.runs) > (
+        _LONG_S if len(result.runs) < 3 else _LONG_AFTER_THREE_S
+    )
 
 
 def _any_behind(case: Case) -> bool:
