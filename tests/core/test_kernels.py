@@ -111,6 +111,30 @@ def test_native_has_every_camera_model(name: str, make_problem: Make) -> None:
     near(systems[0], systems[1])
 
 
+@built
+def test_native_numbers_images_of_many_keyframes_and_cameras(make_problem: Make) -> None:
+    """More than 2^20 pairs of keyframe and camera, few of them seen, in no order."""
+    small, _ = make_problem(stereo=True)
+    cams, start, obs = small.cameras, small.start, small.observations
+    more = dataclasses.replace(
+        cams,
+        rotation=np.tile(cams.rotation, (600, 1, 1)),
+        translation=np.tile(cams.translation, (600, 1)),
+        model=np.tile(cams.model, 600),
+        params=np.tile(cams.params, (600, 1)),
+    )
+    state = dataclasses.replace(
+        start, rotation=np.tile(start.rotation, (200, 1, 1)), translation=np.tile(start.translation, (200, 1))
+    )
+    spread = dataclasses.replace(
+        obs, keyframe=995 - 5 * (obs.point % 7) + obs.keyframe, camera=2 * (599 - 3 * obs.point) + obs.camera
+    )
+    problem = Problem(state, np.tile(small.fixed, 200), more, spread)
+    assert problem.n_keyframes * len(more.model) > 2**20
+    oracle, kernels = pair(problem, Rules())
+    near(oracle.diagonals()[0], kernels.diagonals()[0])
+
+
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
 def test_polishing_moves_points_only_and_never_makes_one_worse(backend: str, make_problem: Make) -> None:
     problem, _ = make_problem(start_error=0.05)

@@ -57,6 +57,9 @@ class Layout {
   std::vector<std::uint8_t> model;
 
  private:
+  // Up to this many (keyframe, camera) pairs images are numbered by a table, beyond it by searching.
+  static constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
+
   std::vector<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
 
   void sort_observations(const ProblemView& p) {
@@ -72,9 +75,11 @@ class Layout {
     // Order by (point, keyframe): rows of one edge stand together.
     std::vector<std::int64_t> order(n_obs);
     for (std::int64_t i = 0; i < n_obs; ++i) order[i] = i;
-    std::stable_sort(order.begin(), order.end(), [&](std::int64_t a, std::int64_t b) {
+    const auto before = [&p](std::int64_t a, std::int64_t b) {
       return p.point[a] != p.point[b] ? p.point[a] < p.point[b] : p.keyframe[a] < p.keyframe[b];
-    });
+    };
+    // The back-end's windows come in this order already.
+    if (!std::is_sorted(order.begin(), order.end(), before)) std::stable_sort(order.begin(), order.end(), before);
     const std::int64_t padded = (n_obs + kLanes - 1) / kLanes * kLanes;
     obs_keyframe.resize(padded);
     obs_camera.resize(padded);
@@ -158,10 +163,21 @@ class Layout {
     const auto key = [this](std::size_t o) {
       return static_cast<std::int64_t>(obs_keyframe[o]) * n_cameras + obs_camera[o];
     };
+    obs_image.resize(obs_keyframe.size());
+    if (n_keyframes * n_cameras <= kTableLimit) {
+      std::vector<std::int32_t> number(n_keyframes * n_cameras, -1);
+      for (std::size_t o = 0; o < obs_keyframe.size(); ++o) number[key(o)] = 0;
+      for (std::int64_t i = 0; i < n_keyframes * n_cameras; ++i) {
+        if (number[i] < 0) continue;
+        number[i] = static_cast<std::int32_t>(images.size());
+        images.push_back(i);
+      }
+      for (std::size_t o = 0; o < obs_keyframe.size(); ++o) obs_image[o] = number[key(o)];
+      return;
+    }
     for (std::size_t o = 0; o < obs_keyframe.size(); ++o) images.push_back(key(o));
     std::sort(images.begin(), images.end());
     images.erase(std::unique(images.begin(), images.end()), images.end());
-    obs_image.resize(obs_keyframe.size());
     for (std::size_t o = 0; o < obs_keyframe.size(); ++o)
       obs_image[o] =
           static_cast<std::int32_t>(std::lower_bound(images.begin(), images.end(), key(o)) - images.begin());
