@@ -39,7 +39,7 @@ inline double sum(V8 v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]
 
 template <class T>
 inline void clear(T* first, std::int64_t count) {
-  std::memset(static_cast<void*>(first), 0, static_cast<std::size_t>(count) * sizeof(T));
+  if (count > 0) std::memset(static_cast<void*>(first), 0, static_cast<std::size_t>(count) * sizeof(T));
 }
 
 template <int D>
