@@ -106,10 +106,6 @@ class Backend:
         self.config = config
         self.scene.config = config.scene
 
-    def reset(self) -> None:
-        """Forget the map but not the rig; the session goes on with what comes next."""
-        self._renew(self.scene.session_id, self.scene.cameras)
-
     def completes(self, measurement: Measurement) -> bool:
         """Return True if adding this would begin a new keyframe (or session) while the last one is unsolved."""
         if isinstance(measurement, CameraRig) or self.scene.keyframes.solved.all():

@@ -71,10 +71,6 @@ class Scene:
         """Return the landmark rows by track id."""
         return self._landmark_rows.rows
 
-    def find_landmarks(self, track_ids: IdArray) -> IntArray:
-        """Return the row of each track, -1 where it is not known."""
-        return self._landmark_rows.find(track_ids)
-
     def find_keyframe(self, keyframe_id: int) -> int | None:
         """Return the row of a keyframe, None if it is not known."""
         return self._keyframe_rows.get(keyframe_id)

@@ -288,17 +288,6 @@ def test_another_rig_is_used_from_the_next_session_on() -> None:
     assert backend.scene.cameras.params[0, 0] == pytest.approx(1.1 * rig.intrinsics[0, 0])
 
 
-def test_reset_forgets_the_map_and_goes_on() -> None:
-    stream = messages()
-    backend = Backend(Config())
-    replay(backend, stream[:20])
-    backend.reset()
-    assert len(backend.scene.keyframes) == 0
-    replay(backend, stream[19:])
-    assert not backend.rejected
-    assert backend.scene.keyframes.refined.any()
-
-
 def test_parameters_take_effect_at_the_next_solve() -> None:
     backend = Backend(Config())
     replay(backend, messages())
