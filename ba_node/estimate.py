@@ -92,6 +92,17 @@ class SolveReport:
     queue_wait_s: float = 0.0
     dropped: int = 0
     coalesced: int = 0
+    received: int = 0
+    solved: int = 0
+    dropped_keyframes: int = 0
+    rejected_keyframes: int = 0
+    waiting: int = 0
+    latency_p50_s: float = 0.0
+    latency_p95_s: float = 0.0
+    latency_max_s: float = 0.0
+    stamp_latency_p50_s: float = 0.0
+    stamp_latency_p95_s: float = 0.0
+    stamp_latency_max_s: float = 0.0
 
     def without_times(self) -> SolveReport:
         """Return a copy that does not depend on the machine, for reproducible files."""

@@ -123,6 +123,17 @@ def report() -> SolveReport:
         queue_wait_s=0.75,
         dropped=6,
         coalesced=8,
+        received=61,
+        solved=44,
+        dropped_keyframes=11,
+        rejected_keyframes=10,
+        waiting=1,
+        latency_p50_s=0.015,
+        latency_p95_s=0.031,
+        latency_max_s=0.047,
+        stamp_latency_p50_s=0.115,
+        stamp_latency_p95_s=0.131,
+        stamp_latency_max_s=0.147,
     )
 
 
