@@ -103,6 +103,9 @@ class SolveReport:
     stamp_latency_p50_s: float = 0.0
     stamp_latency_p95_s: float = 0.0
     stamp_latency_max_s: float = 0.0
+    correction_m: float = 0.0
+    correction_rad: float = 0.0
+    correction_held: bool = False
 
     def without_times(self) -> SolveReport:
         """Return a copy that does not depend on the machine, for reproducible files."""

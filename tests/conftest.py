@@ -134,6 +134,9 @@ def report() -> SolveReport:
         stamp_latency_p50_s=0.115,
         stamp_latency_p95_s=0.131,
         stamp_latency_max_s=0.147,
+        correction_m=0.25,
+        correction_rad=0.0125,
+        correction_held=True,
     )
 
 
