@@ -66,6 +66,7 @@ def small_project(root: Path) -> Path:
         ("tools/venv_hook.py", {"packages", "interfaces", "project"}),
         ("msg_defs/msg/A.msg", {"interfaces"}),
         ("msg_defs/msg/B.msg", {"interfaces"}),
+        ("tests/ros/interfaces/tf2_msgs/msg/C.msg", {"interfaces"}),
         ("package.xml", {"project"}),
         ("ba_node/a.py", set()),
     ],
@@ -73,6 +74,7 @@ def small_project(root: Path) -> Path:
 def test_a_change_reaches_the_stamps_that_depend_on_it(tmp_path: Path, changed: str, stamps: set[str]) -> None:
     root = small_project(tmp_path)
     before = setup_env.wanted_stamps(root)
+    (root / changed).parent.mkdir(parents=True, exist_ok=True)
     (root / changed).write_text("after\n")
     after = setup_env.wanted_stamps(root)
     assert {step for step in before if before[step] != after[step]} == stamps
@@ -161,7 +163,7 @@ def test_pip_failure_is_one_line(output: str, expected: str) -> None:
 def test_build_failure_quotes_the_first_error() -> None:
     output = "-- ok\nCMake Error at CMakeLists.txt:7 (find_package):\n  No package std_msgs\n\nmore\n"
     expected = "cannot build ba_msgs: CMake Error at CMakeLists.txt:7 (find_package): No package std_msgs"
-    assert env_checks.build_failure(output) == expected
+    assert env_checks.build_failure(output, "ba_msgs") == expected
 
 
 def test_setup_sees_no_other_ros() -> None:
@@ -241,3 +243,25 @@ def test_make_alone_prints_the_commands() -> None:
     listed = subprocess.run(["make", "-s"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     named = [line.split()[0] for line in listed.splitlines()]
     assert named[:6] == ["help", "setup", "demo", "test", "bench", "lint"]
+
+
+def test_only_interfaces_that_no_wheel_brought_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[str] = []
+    monkeypatch.setattr(setup_env.Environment, "build", lambda _, package: built.append(package))
+    environment = setup_env.Environment(tmp_path, ROOT)
+    environment.interfaces()
+    (tmp_path / "share" / "tf2_msgs").mkdir(parents=True)
+    environment.interfaces()
+    assert sorted(built[:2]) == ["ba_msgs", "tf2_msgs"]
+    assert built[2:] == ["ba_msgs"]
+
+
+def test_what_was_built_before_is_removed_first(tmp_path: Path) -> None:
+    share, build = tmp_path / "share" / "tf2_msgs", tmp_path / "build" / "tf2_msgs"
+    share.mkdir(parents=True)
+    build.mkdir(parents=True)
+    library = tmp_path / "libtf2_msgs.so"
+    library.touch()
+    (build / "install_manifest.txt").write_text(f"{library}\n{share / 'package.xml'}\n")
+    setup_env.Environment(tmp_path, ROOT).remove("tf2_msgs")
+    assert not library.exists() and not share.exists() and not build.exists()

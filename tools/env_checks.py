@@ -100,7 +100,7 @@ def pip_failure(output: str) -> str:
     return f"{what}; check the network, then run make again"
 
 
-def build_failure(output: str) -> str:
-    """Say in a few words why the build of ba_msgs failed, from what CMake and the compiler printed."""
+def build_failure(output: str, package: str) -> str:
+    """Say in a few words why the build of an interface package failed, from what CMake and the compiler printed."""
     cause = re.search(r"^.*(?:CMake Error|error:|Error:|FAILED:).*(?:\n  .*)?", output, re.MULTILINE)
-    return f"cannot build ba_msgs: {' '.join(cause[0].split())[:200]}" if cause else "cannot build ba_msgs"
+    return f"cannot build {package}: {' '.join(cause[0].split())[:200]}" if cause else f"cannot build {package}"

@@ -3,7 +3,8 @@
 """Make .venv: ROS 2 Jazzy from wheels, ba_msgs built into it, ba_node installed from this folder.
 
 Needs Python's standard library only, and does nothing when .venv is up to date. Three steps, each with a
-digest of its inputs in .venv/setup.json: `packages` (a new environment), `interfaces` (ba_msgs), `project`.
+digest of its inputs in .venv/setup.json: `packages` (a new environment), `interfaces` (ba_msgs, and for the tests
+tf2_msgs, which is not among the wheels), `project`.
 """
 
 from __future__ import annotations  # so that an older Python comes as far as check_python
@@ -22,7 +23,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 from tools.env_checks import (
@@ -41,6 +44,8 @@ VENV = ROOT / ".venv"
 STATE = "setup.json"
 LOG = "setup.log"
 STEPS = ("packages", "interfaces", "project")
+# Interface packages to build, and where they are defined. One that a wheel has brought is left as it is.
+INTERFACES = {"ba_msgs": "msg_defs", "tf2_msgs": "tests/ros/interfaces/tf2_msgs"}
 
 # Variables of a sourced ROS, of another environment or of pip that would lead the steps below outside .venv.
 FOREIGN_VARIABLES = (
@@ -78,7 +83,7 @@ def digest(files: Iterable[Path], root: Path, seed: str = "") -> str:
 def wanted_stamps(root: Path) -> dict[str, str]:
     """Return the stamp that each step has to carry for the files as they are now."""
     packages = digest([*root.glob("requirements/*.txt"), *root.glob("tools/*.py")], root)
-    interfaces = [path for path in root.glob("msg_defs/**/*") if path.is_file()]
+    interfaces = [path for folder in INTERFACES.values() for path in root.glob(f"{folder}/**/*") if path.is_file()]
     project = [root / name for name in ("setup.py", "setup.cfg", "package.xml")]
     project += [path for path in root.glob("ba_node/native/src/*") if path.is_file()]
     return {
@@ -211,13 +216,27 @@ class Environment:
         (site / "ba_node_venv.pth").write_text("import ba_node_venv\n")
 
     def interfaces(self) -> None:
-        """Build ba_msgs and install it into the environment, in place of an older one."""
-        say("building ba_msgs")
-        build = self.venv / "build" / "ba_msgs"
+        """Build the interface packages that are missing and install them into the environment."""
+        for package in INTERFACES:
+            self.remove(package)
+        missing = [package for package in INTERFACES if not (self.venv / "share" / package).is_dir()]
+        say(f"building {' and '.join(missing)}")
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(self.build, missing))
+
+    def remove(self, package: str) -> None:
+        """Remove an interface package that was built here."""
+        build = self.venv / "build" / package
         with contextlib.suppress(FileNotFoundError):
-            for installed in (build / "install_manifest.txt").read_text().splitlines():
-                Path(installed).unlink(missing_ok=True)
+            installed = [Path(line) for line in (build / "install_manifest.txt").read_text().splitlines()]
+            for path in installed:
+                path.unlink(missing_ok=True)
+            shutil.rmtree(self.venv / "share" / package, ignore_errors=True)
         shutil.rmtree(build, ignore_errors=True)
+
+    def build(self, package: str) -> None:
+        """Build an interface package and install it into the environment."""
+        build = self.venv / "build" / package
         settings = {
             "BUILD_TESTING": "OFF",
             "CMAKE_BUILD_TYPE": "Release",
@@ -227,8 +246,10 @@ class Environment:
         }
         cmake = str(self.venv / "bin" / "cmake")
         defines = [f"-D{name}={value}" for name, value in settings.items()]
-        self.run([cmake, "-S", str(self.root / "msg_defs"), "-B", str(build), "-G", "Ninja", *defines], build_failure)
-        self.run([cmake, "--build", str(build), "--target", "install"], build_failure)
+        source = str(self.root / INTERFACES[package])
+        explain = partial(build_failure, package=package)
+        self.run([cmake, "-S", source, "-B", str(build), "-G", "Ninja", *defines], explain)
+        self.run([cmake, "--build", str(build), "--target", "install"], explain)
 
     def project(self) -> None:
         """Install ba_node so that changes of its files take effect at once."""
