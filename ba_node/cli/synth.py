@@ -1,51 +1,87 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make a recording with ground truth: a stereo or mono camera on a path around and through structure.
+"""Make data with ground truth: a recording, or a BAL problem of points on a sphere.
 
-The front-end's poses drift, its pixels are noisy and some are wrong, as the options say. The true poses are in the
-recording on ground_truth/pose. The same options give the same bytes.
+A recording (--kind recording, OUT.mcap) is a stereo or mono camera on a path around and through structure. The
+front-end's poses drift, its pixels are noisy and some are wrong, as the options say. The true poses are in it on
+ground_truth/pose.
+
+A sphere (--kind sphere, OUT.txt, .bz2 or .gz) is the synthetic problem of section 5.1 of the thesis: --preset has the
+sizes measured there. The truth is written beside it in the same format, as OUT.truth.txt.
+
+The same options give the same bytes.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ba_node.cli.console import require_mcap
+from ba_node.cli.console import TargetError, require_folder, require_mcap
 
-SUMMARY = "make a recording with ground truth"
-EXAMPLE = "ba synth loop.mcap --seed 3 --keyframes 100 --outlier-share 0.1"
+if TYPE_CHECKING:
+    from ba_node.config import Parameter
+
+SUMMARY = "make a recording or a BAL problem with ground truth"
+EXAMPLE = (
+    "ba synth loop.mcap --seed 3 --keyframes 100 --outlier-share 0.1\n  ba synth ball.txt --kind sphere --preset 10-253"
+)
+_RECORDING, _SPHERE = "recording", "sphere"
+_BAL = (".txt", ".bz2", ".gz")
+
+
+class OptionError(ValueError):
+    """An option that the kind of data does not have."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options: one for each field of SyntheticOptions."""
-    from ba_node.synthetic import declarations  # noqa: PLC0415
+    """Declare the options: one for each field of SyntheticOptions and SphereOptions."""
+    from ba_node.synthetic import PRESETS  # noqa: PLC0415
 
-    parser.add_argument("target", type=Path, metavar="OUT.mcap")
-    for option in declarations():
-        flag = f"--{option.name.replace('_', '-')}"
-        unit = f", {option.unit}" if option.unit else ""
-        text = f"{option.doc} (default: {option.default}{unit})".replace("%", "%%")
+    parser.add_argument("target", type=Path, metavar="OUT")
+    parser.add_argument(
+        "--kind", choices=(_RECORDING, _SPHERE), default=_RECORDING, help="what to make (default: recording)"
+    )
+    parser.add_argument(
+        "--preset", choices=tuple(PRESETS), help="sphere: images-points of the thesis; options change it"
+    )
+    for name, declared in _declared().items():
+        option = next(iter(declared.values()))
+        flag = f"--{name.replace('_', '-')}"
         if option.kind is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=option.default, help=text)
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=_help(declared))
         else:
             parser.add_argument(
                 flag,
                 type=option.kind,
-                default=option.default,
                 choices=option.choices or None,
                 metavar=None if option.choices else option.kind.__name__.upper(),
-                help=text,
+                help=_help(declared),
             )
 
 
 def run(args: argparse.Namespace) -> int:
     """Generate."""
+    given: dict[str, Any] = {}
+    for name, declared in _declared().items():
+        value = getattr(args, name)
+        if value is None:
+            continue
+        if args.kind not in declared:
+            raise OptionError(f"--{name.replace('_', '-')} is an option of --kind {next(iter(declared))} alone")
+        given[name] = value
+    if args.kind == _RECORDING and args.preset:
+        raise OptionError("--preset is an option of --kind sphere alone")
+    return _sphere(args, given) if args.kind == _SPHERE else _recording(args, given)
+
+
+def _recording(args: argparse.Namespace, given: dict[str, Any]) -> int:
     from ba_node.offline.recording import record  # noqa: PLC0415
-    from ba_node.synthetic import SyntheticOptions, declarations, generate  # noqa: PLC0415
+    from ba_node.synthetic import SyntheticOptions, generate  # noqa: PLC0415
 
     require_mcap(args.target)
-    data = generate(SyntheticOptions(**{option.name: getattr(args, option.name) for option in declarations()}))
+    data = generate(SyntheticOptions(**given))
     count = record(args.target, data.timeline(), data.truth)
     observations = sum(len(image.track_id) for images in data.tracks for image in images)
     print(
@@ -53,3 +89,43 @@ def run(args: argparse.Namespace) -> int:
         f" {observations} observations"
     )
     return 0
+
+
+def _sphere(args: argparse.Namespace, given: dict[str, Any]) -> int:
+    import dataclasses  # noqa: PLC0415
+
+    from ba_node.offline.sphere_file import write_sphere  # noqa: PLC0415
+    from ba_node.synthetic import SphereOptions, generate_sphere, preset  # noqa: PLC0415
+
+    require_folder(args.target)
+    if args.target.suffix not in _BAL:
+        raise TargetError(f"{args.target}: BAL problems are written as {', '.join(_BAL)}: give a name that ends so")
+    base = preset(args.preset) if args.preset else SphereOptions()
+    data = generate_sphere(dataclasses.replace(base, **given))
+    truth = write_sphere(args.target, data)
+    print(
+        f"{args.target}: {len(data.cameras)} images, {len(data.points)} points, {len(data.uv)} observations,"
+        f" {int(data.outlier.sum())} of them outliers\n{truth}: the truth"
+    )
+    return 0
+
+
+def _declared() -> dict[str, dict[str, Parameter]]:
+    """Return, by name of the option, its declaration for each kind that has it."""
+    from ba_node.synthetic import declarations, sphere_declarations  # noqa: PLC0415
+
+    found: dict[str, dict[str, Parameter]] = {}
+    for kind, options in ((_RECORDING, declarations()), (_SPHERE, sphere_declarations())):
+        for option in options:
+            found.setdefault(option.name, {})[kind] = option
+    return found
+
+
+def _help(declared: dict[str, Parameter]) -> str:
+    option = next(iter(declared.values()))
+    unit = f", {option.unit}" if option.unit else ""
+    if len(declared) > 1:
+        defaults = ", ".join(f"{kind} {item.default}" for kind, item in declared.items())
+        return f"{option.doc} (default: {defaults}{unit})".replace("%", "%%")
+    only = "sphere: " if _SPHERE in declared else ""
+    return f"{only}{option.doc} (default: {option.default}{unit})".replace("%", "%%")
