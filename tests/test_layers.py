@@ -32,7 +32,18 @@ SAME = {
     "offline": {"ros"},
     "cli": {"offline", "ros"},
 }
-ROS_ONLY = ("rclpy", "ba_msgs", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rcl_interfaces", "tf2_msgs")
+ROS_ONLY = (
+    "rclpy",
+    "action_msgs",
+    "ba_msgs",
+    "geometry_msgs",
+    "nav_msgs",
+    "rcl_interfaces",
+    "sensor_msgs",
+    "std_msgs",
+    "std_srvs",
+    "tf2_msgs",
+)
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 

@@ -16,6 +16,7 @@ from ba_node.config import Config, Value
 from ba_node.core.choices import PARTS
 from ba_node.core.methods import CATALOGUE
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
+from ba_node.messages.commands import ACTION_TYPES, SERVICE_TYPES
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
@@ -41,6 +42,13 @@ OUTPUTS = {
     "points": ("latched", "The map: fields x, y, z (m), rms_px (float32), views (uint32)."),
     "report": ("reliable", "How each solve went, failed and skipped ones too."),
 }
+SERVICES = {
+    "reset": "Forget the map and begin anew; the cameras stay.",
+    "pause": "`data: true`: take in no more messages, count them as dropped; `data: false`: go on.",
+    "save_map": "Write all that is known to a file, see docs/map_format.md.",
+    "load_map": "Put what a file holds in the place of all that is known.",
+}
+ACTIONS = {"optimize": "Refine all keyframes and points that are kept; feedback after each iteration."}
 
 TOPICS_INTRO = """\
 # Topics
@@ -87,8 +95,11 @@ def topics_markdown() -> str:
             f"| `{prefix}{topic}` | `{kind}` | {about[topic][0]} | {about[topic][1]} |" for topic, kind in types.items()
         ]
         parts.append("\n".join(lines) + "\n")
-    parts.append("## Messages\n")
-    parts += [_message(path) for path in sorted((ROOT / "msg_defs" / "msg").glob("*.msg"))]
+    parts.append(_commands("Services", SERVICE_TYPES, SERVICES))
+    parts.append(_commands("Action", ACTION_TYPES, ACTIONS))
+    for title, folder in (("Messages", "msg"), ("Service types", "srv"), ("Action types", "action")):
+        parts.append(f"## {title}\n")
+        parts += [_interface(path) for path in sorted((ROOT / "msg_defs" / folder).glob(f"*.{folder}"))]
     parts.append(_table("Reasons for rejection", "In `report`, and in report.json of a replay.", REASONS))
     parts.append(_table("Notices", "Counted in report.json of a replay; nothing is lost by them.", NOTICES))
     return "\n".join(parts)
@@ -161,19 +172,35 @@ def pages() -> dict[str, str]:
     }
 
 
-def _message(path: Path) -> str:
-    """Return a table of the fields of a message."""
-    about: list[str] = []
-    rows: list[str] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        code, _, comment = (part.strip() for part in line.partition("#"))
-        if not code and not rows and comment:
-            about.append(comment)
-        elif code:
-            kind, _, name = code.partition(" ")
-            rows.append(f"| `{name.strip()}` | `{kind}` | {comment} |")
-    head = f"### ba_msgs/{path.stem}\n\n{' '.join(about)}\n\n| field | type | meaning |\n|---|---|---|\n"
-    return head + "\n".join(rows) + "\n"
+# What stands between the lines `---` of a definition.
+_SECTIONS = {".msg": ("",), ".srv": ("Request", "Response"), ".action": ("Goal", "Result", "Feedback")}
+
+
+def _interface(path: Path) -> str:
+    """Return a table of the fields of a message, or one for each part of a service or an action."""
+    text = path.read_text(encoding="utf-8")
+    first, *_ = text.splitlines()
+    about = first.removeprefix("# ")
+    head = f"### ba_msgs/{path.stem}\n\n{about}\n"
+    sections = text.removeprefix(first).split("\n---\n")
+    return "\n".join([head, *(_fields(*part) for part in zip(_SECTIONS[path.suffix], sections, strict=True))])
+
+
+def _fields(title: str, section: str) -> str:
+    """Return a table of the fields in one part of a definition."""
+    head = f"{title}:\n\n" if title else ""
+    lines = (line.partition("#") for line in section.splitlines() if line.strip())
+    fields = [(*code.strip().split(" ", 1), comment.strip()) for code, _, comment in lines]
+    rows = "".join(f"| `{name.strip()}` | `{kind}` | {comment} |\n" for kind, name, comment in fields)
+    return f"{head}| field | type | meaning |\n|---|---|---|\n{rows}"
+
+
+def _commands(title: str, types: dict[str, str], about: dict[str, str]) -> str:
+    """Return a table of services or actions."""
+    if types.keys() != about.keys():
+        raise SystemExit(f"tools/generate_docs.py describes {sorted(about)}, the node has {sorted(types)}")
+    rows = "\n".join(f"| `~/{name}` | `{kind}` | {about[name]} |" for name, kind in types.items())
+    return f"## {title}\n\n| name | type | what |\n|---|---|---|\n{rows}\n"
 
 
 def _table(title: str, about: str, entries: dict[str, str]) -> str:
