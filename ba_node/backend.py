@@ -187,8 +187,7 @@ class Backend:
             problem, methods.from_config(self.config.solver), clock=self._clock, on_iteration=on_iteration
         )
         elapsed = self._clock() - began
-        window.merge(self.scene, selection, result, self.config.tracks.outlier_px)
-        rms_before, rms_after = quality.problem_rms_px(problem, problem.start, result.state)
+        after = window.merge(self.scene, selection, result, self.config.tracks.outlier_px, self.config.solver.backend)
         return dataclasses.replace(
             self._base_report(newest, result.status, result.reason),
             method=result.method,
@@ -198,8 +197,8 @@ class Backend:
             objective_before=result.objective_before,
             objective_after=result.objective_after,
             gradient_norm=result.gradient_norm,
-            rms_px_before=rms_before,
-            rms_px_after=rms_after,
+            rms_px_before=quality.rms_of_norms_px(selection, selection.norms),
+            rms_px_after=quality.rms_of_norms_px(selection, after),
             keyframes=int(np.count_nonzero(~problem.fixed)),
             fixed_keyframes=int(np.count_nonzero(problem.fixed)),
             landmarks=problem.n_points,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.core.kernels import Demands, Kernels, System
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Rules
+from ba_node.core.objective import Rules, reprojection_errors
 from ba_node.core.problem import Problem, State
 
 FloatArray = NDArray[np.float64]
@@ -53,6 +53,27 @@ def missing(rules: Rules, demands: Demands) -> str:
     if not reason and demands.preconditioner in ("b_block", "b_diag"):
         return f"the C++ kernels have no preconditioner {demands.preconditioner}"
     return reason
+
+
+def residual_norms(problem: Problem, state: State, backend: str = "auto") -> FloatArray:
+    """Return the size of each residual, (n_obs,) in sigmas, inf for points on or behind the camera plane."""
+    if backend != "numpy" and native.kernels is not None and not problem.free_intrinsics:
+        obs, cams = problem.observations, problem.cameras
+        norms: FloatArray = native.kernels.residual_norms(
+            keyframe=obs.keyframe,
+            camera=obs.camera,
+            point=obs.point,
+            uv=obs.uv,
+            sigma_px=obs.sigma_px,
+            camera_rotation=cams.rotation,
+            camera_translation=cams.translation,
+            camera_model=cams.model,
+            camera_params=cams.params,
+            state=_arrays(state),
+        )
+        return norms
+    error = reprojection_errors(problem, state)
+    return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
 
 
 class NativeKernels:

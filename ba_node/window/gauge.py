@@ -107,9 +107,9 @@ def _shows_scale(problem: Problem) -> BoolArray:
     scale = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
     centres = _camera_centres(problem)
     # Rows are sorted by point, keyframe, camera: the views of one point from one keyframe are neighbours.
-    same = (np.diff(obs.point) == 0) & (np.diff(obs.keyframe) == 0)
-    apart = np.linalg.norm(centres[obs.camera[1:]] - centres[obs.camera[:-1]], axis=1) > _MIN_BASELINE_M
-    scale[1:] |= same & apart
+    second = 1 + np.flatnonzero((obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1]))
+    between = centres[obs.camera[second]] - centres[obs.camera[second - 1]]
+    scale[second] |= np.linalg.norm(between, axis=1) > _MIN_BASELINE_M
     return scale
 
 

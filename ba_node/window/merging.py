@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node.core import geometry
+from ba_node.core import geometry, native_kernels
 from ba_node.window import gauge
 from ba_node.window.initial_points import widened
-from ba_node.window.selection import residual_norms
 
 if TYPE_CHECKING:
     from ba_node.core.problem import State
@@ -22,11 +21,15 @@ if TYPE_CHECKING:
     from ba_node.window.selection import Selection
 
 
-def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float) -> None:
-    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
+def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float, backend: str = "auto") -> FloatArray:
+    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew.
+
+    Returns:
+        (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these.
+    """
     state = result.state
     if not result.status.usable or not state.is_finite():
-        return
+        return selection.norms
     state = _scaled(scene, selection, state)
     free = ~selection.problem.fixed
     rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
@@ -36,8 +39,11 @@ def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float)
     scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
-    _judge(scene, selection, state, outlier_px)
+    whole = dataclasses.replace(selection.problem, observations=selection.sightings)
+    norms = native_kernels.residual_norms(whole, state, backend)
+    _judge(scene, selection, norms, outlier_px)
     _displace(scene, selection.lost)
+    return norms
 
 
 def _scaled(scene: Scene, selection: Selection, state: State) -> State:
@@ -59,24 +65,22 @@ def _scaled(scene: Scene, selection: Selection, state: State) -> State:
     return dataclasses.replace(state, translation=translation, points=points)
 
 
-def _judge(scene: Scene, selection: Selection, state: State, outlier_px: float) -> None:
+def _judge(scene: Scene, selection: Selection, norm: FloatArray, outlier_px: float) -> None:
     """Mark the observations to leave out next time, and note the error of each point.
 
     The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point with
     fewer than two good views (or one with a measured depth) is in the wrong place, or its track is: it loses its
     position, and all its views are heard again when it is next placed.
     """
-    problem = dataclasses.replace(selection.problem, observations=selection.sightings)
-    obs = selection.sightings
-    norm = residual_norms(problem, state)
+    obs, n_points = selection.sightings, selection.problem.n_points
     outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
     scene.sightings.outlier[selection.rows] = outlier
     if outlier_px > 0:
         measured = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(norm), bool)
-        good = np.bincount(obs.point, ~outlier * np.where(measured, 2, 1), problem.n_points)
+        good = np.bincount(obs.point, ~outlier * np.where(measured, 2, 1), n_points)
         _displace(scene, selection.landmarks[good < 2])
     error = norm * obs.sigma_px
-    scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, problem.n_points)
+    scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
 
 
 def _displace(scene: Scene, landmarks: IntArray) -> None:

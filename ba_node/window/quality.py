@@ -11,12 +11,13 @@ import numpy as np
 
 from ba_node.core import geometry, objective, triangulation
 from ba_node.core.problem import Problem, State
-from ba_node.window.selection import problem_of
+from ba_node.window.problems import problem_of
 
 if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.scene.scene import Scene
     from ba_node.scene.tables import FloatArray
+    from ba_node.window.selection import Selection
 
 STATES = ("input", "refined")
 
@@ -25,6 +26,18 @@ def problem_rms_px(problem: Problem, *states: State) -> list[float]:
     """Return for each state the rms over the observations whose point is in front of the camera; 0 without any."""
     measure = objective.Objective(problem, objective.Rules())
     return [_rms(_in_front(measure.errors(state))) for state in states]
+
+
+def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
+    """Return the rms over the observations of a solve whose point is in front of the camera; 0 without any.
+
+    Args:
+        selection: what was solved.
+        norms: (n_all,) sizes of its residuals, as ``Selection.norms``.
+    """
+    error = (norms * selection.sightings.sigma_px)[selection.believed]
+    error = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(error * error) / 2.0)) if len(error) else 0.0
 
 
 def rms_px(scene: Scene, config: Config, state: str) -> float:

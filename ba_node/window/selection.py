@@ -19,14 +19,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ba_node.core import geometry, objective
-from ba_node.core.problem import Observations, Problem, State
+from ba_node.core import native_kernels
 from ba_node.window import gauge
 from ba_node.window.initial_points import initial_points, widened
+from ba_node.window.problems import part_of, problem_of, some_observations
 
 if TYPE_CHECKING:
     from ba_node.config import Config
+    from ba_node.core.problem import Observations, Problem
     from ba_node.scene.scene import Scene
     from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
@@ -44,6 +46,7 @@ class Selection:
     Attributes:
         problem: with the observations that are believed.
         sightings: all observations of its points by its keyframes, believed or not, sorted by point.
+        norms: (n_all,) their residuals at the start, sigmas, inf behind the camera.
         rows: (n_all,) row in the scene of each of these.
         believed: (n_all,) True where it is in the problem.
         keyframes: (n_kf,) row of each keyframe in the scene, oldest first.
@@ -56,6 +59,7 @@ class Selection:
 
     problem: Problem
     sightings: Observations
+    norms: FloatArray
     rows: IntArray
     believed: BoolArray
     keyframes: IntArray
@@ -68,11 +72,18 @@ class Selection:
 
 @dataclass(frozen=True)
 class _Part:
-    """Rows of observations, and the keyframes and landmarks that they refer to (rows in the scene)."""
+    """What may take part: a problem with all poses fixed, and where its parts stand in the scene, as in Selection."""
 
+    problem: Problem
     rows: IntArray
     keyframes: IntArray
     landmarks: IntArray
+    origin: FloatArray
+
+    def only(self, rows: BoolArray, keyframes: BoolArray, points: BoolArray) -> _Part:
+        """Return some of it, see ``part_of``."""
+        problem = part_of(self.problem, rows, keyframes, points)
+        return _Part(problem, self.rows[rows], self.keyframes[keyframes], self.landmarks[points], self.origin)
 
 
 def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
@@ -87,75 +98,34 @@ def select(scene: Scene, config: Config, end: int | None = None) -> Selection | 
     if reason:
         return reason
     scene.settle_poses()
-    cameras = scene.cameras
-    assert cameras is not None
-    part = _reach(scene, window, config.window.max_fixed_keyframes)
-    origin = scene.keyframes.position[part.keyframes[0]] if len(part.keyframes) else np.zeros(3)
-    positions = _positions(scene, part, origin, config)
-    usable = _usable(scene, part, origin, positions, config)
+    part = _reach(scene, window, config)
+    part = dataclasses.replace(part, problem=_placed(scene, part, config))
+    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
+    norms = native_kernels.residual_norms(part.problem, start, config.solver.backend)
+    usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
-    part, positions = _restrict(scene, part, positions, usable, config.window.max_landmarks)
-    if not np.isin(part.keyframes, window).any():
+    kept, keyframes, points = _determined(part.problem, usable, config.window.max_landmarks)
+    part, norms, usable = part.only(kept, keyframes, points), norms[kept], usable[kept]
+    is_new = np.zeros(len(scene.keyframes), bool)
+    is_new[window] = True
+    is_old = ~is_new[part.keyframes]
+    if is_old.all():
         return "no keyframe of the window sees enough points that a second image sees"
-    problem = problem_of(scene, part.rows, part.keyframes, part.landmarks, origin, positions, config)
-    believed = usable[part.rows]
-    active = dataclasses.replace(problem, observations=_take(problem.observations, believed))
-    is_old = ~np.isin(part.keyframes, window)
+    active = some_observations(part.problem, usable)
     held = gauge.choose(active, is_old)
     return Selection(
         dataclasses.replace(active, fixed=held.fixed),
-        problem.observations,
+        part.problem.observations,
+        norms,
         part.rows,
-        believed,
+        usable,
         part.keyframes,
         part.landmarks,
         window,
         lost,
-        origin,
+        part.origin,
         held.unscaled,
     )
-
-
-def problem_of(
-    scene: Scene,
-    rows: IntArray,
-    keyframes: IntArray,
-    landmarks: IntArray,
-    origin: FloatArray,
-    positions: FloatArray,
-    config: Config,
-) -> Problem:
-    """Return the problem of some observations, sorted by point, keyframe, camera; all poses fixed.
-
-    Args:
-        scene: where they stand.
-        rows: rows of the observations; reordered in place.
-        keyframes: rows of the keyframes of the problem, in its order.
-        landmarks: rows of the points of the problem, in its order.
-        origin: (3,) of the problem in the map, m.
-        positions: (n_pt, 3) of the points in the problem.
-        config: for the precision of depths.
-    """
-    table, cameras = scene.sightings, scene.cameras
-    assert cameras is not None
-    keyframe = _number(keyframes, len(scene.keyframes))[table.keyframe[rows]]
-    point = _number(landmarks, len(scene.landmarks))[table.landmark[rows]]
-    camera = table.camera[rows].astype(np.intp)
-    order = np.argsort((point * len(keyframes) + keyframe) * len(cameras.model) + camera, kind="stable")
-    rows[:] = rows[order]
-    depth = table.depth_m[rows].astype(float)
-    depth = np.empty(0) if np.isnan(depth).all() else depth
-    observations = Observations(
-        keyframe[order],
-        camera[order],
-        point[order],
-        table.uv[rows].astype(float),
-        table.sigma_px[rows].astype(float),
-        depth,
-        config.tracks.depth_sigma_ratio * depth,
-    )
-    poses = geometry.inverse(scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes] - origin)
-    return Problem(State(*poses, positions, np.empty((0, 3))), np.ones(len(keyframes), bool), cameras, observations)
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:
@@ -168,51 +138,55 @@ def _nothing(scene: Scene, window: IntArray) -> str:
     return ""
 
 
-def _reach(scene: Scene, window: IntArray, max_fixed: int) -> _Part:
+def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     """Return all observations of the window's landmarks by the window and the older keyframes that share most."""
+    table = scene.sightings
     ranges = [np.arange(b.begin, b.end) for row in window for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
-    seen = np.zeros(len(scene.landmarks), bool)
-    seen[scene.sightings.landmark[own]] = True
-    rows = scene.views_of(np.flatnonzero(seen))
+    rows = scene.views_of(_distinct(table.landmark[own], len(scene.landmarks)))
     n = len(scene.keyframes)
     in_window = np.zeros(n, bool)
     in_window[window] = True
-    believed = rows[~scene.sightings.outlier[rows]]
-    shared = np.bincount(scene.sightings.keyframe[believed], minlength=n)
+    keyframe = table.keyframe.take(rows)
+    shared = np.bincount(keyframe[~table.outlier.take(rows)], minlength=n)
     # Newest first, so that of those that share equally many the newest are taken. A keyframe that was never refined
     # would only hold the others to the front-end's drift.
     older = scene.order[: int(np.argmax(in_window[scene.order]))][::-1]
     older = older[(shared[older] > 0) & scene.keyframes.refined[older]]
-    chosen = older[np.argsort(-shared[older], kind="stable")[:max_fixed]]
-    in_part = in_window.copy()
-    in_part[chosen] = True
-    return _part(scene, rows[in_part[scene.sightings.keyframe[rows]]], in_part)
+    in_part = in_window
+    in_part[older[np.argsort(-shared[older], kind="stable")[: config.window.max_fixed_keyframes]]] = True
+    rows = rows[in_part.take(keyframe)]
+    keyframes = scene.order[in_part[scene.order]]
+    landmarks = _distinct(table.landmark[rows], len(scene.landmarks))
+    landmarks = landmarks[np.argsort(scene.landmarks.track_id[landmarks])]
+    origin = scene.keyframes.position[keyframes[0]] if len(keyframes) else np.zeros(3)
+    positions = scene.landmarks.position[landmarks] - origin
+    problem = problem_of(scene, rows, keyframes, landmarks, origin, positions, config)
+    return _Part(problem, rows, keyframes, landmarks, origin)
 
 
-def _part(scene: Scene, rows: IntArray, keyframes: BoolArray) -> _Part:
-    landmarks = np.zeros(len(scene.landmarks), bool)
-    landmarks[scene.sightings.landmark[rows]] = True
-    by_id = scene.landmark_order
-    return _Part(rows, scene.order[keyframes[scene.order]], by_id[landmarks[by_id]])
+def _distinct(rows: NDArray[np.int32], n: int) -> IntArray:
+    """Return the different ones among rows of a table of n, ascending."""
+    marked = np.zeros(n, bool)
+    marked[rows] = True
+    return np.flatnonzero(marked)
 
 
-def _positions(scene: Scene, part: _Part, origin: FloatArray, config: Config) -> FloatArray:
-    """Return the position of each landmark in the problem's frame, NaN where none can be had yet."""
-    table = scene.landmarks
-    positions = table.position[part.landmarks] - origin
-    new = ~table.has_position[part.landmarks]
-    positions[new] = np.nan
-    is_new = np.zeros(len(table), bool)
-    is_new[part.landmarks[new]] = True
-    rows = part.rows[is_new[scene.sightings.landmark[part.rows]] & ~scene.sightings.outlier[part.rows]]
-    if not len(rows):
-        return positions
-    landmarks = part.landmarks[new]
-    guess = moved_guesses(scene, landmarks) - origin
-    problem = problem_of(scene, rows, part.keyframes, landmarks, origin, guess, config)
-    positions[new] = initial_points(problem, guess, config.tracks)
-    return positions
+def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
+    """Return the problem of a part with first positions of points that have none, NaN where none can be had yet."""
+    new = ~scene.landmarks.has_position[part.landmarks]
+    points = part.problem.start.points.copy()
+    points[new] = np.nan
+    rows = new.take(part.problem.observations.point) & ~scene.sightings.outlier.take(part.rows)
+    if rows.any():
+        of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
+        guess = moved_guesses(scene, part.landmarks[new]) - part.origin
+        points[new] = initial_points(of_new, guess, config.tracks)
+    return _with_points(part.problem, points)
+
+
+def _with_points(problem: Problem, points: FloatArray) -> Problem:
+    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
 def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
@@ -231,66 +205,49 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     return np.asarray((rotation @ guess[:, :, None])[..., 0] + translation)
 
 
-def _usable(scene: Scene, part: _Part, origin: FloatArray, positions: FloatArray, config: Config) -> BoolArray:
+def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> BoolArray:
     """Return which observations may take part: no outliers, and none that begins with an absurd residual."""
-    usable: BoolArray = ~scene.sightings.outlier[: len(scene.sightings)]
-    if config.tracks.outlier_px <= 0 or not len(part.rows):
+    usable: BoolArray = ~scene.sightings.outlier.take(part.rows)
+    if outlier_px <= 0:
         return usable
-    rows = part.rows.copy()
-    known = np.nan_to_num(positions, nan=0.0)
-    problem = problem_of(scene, rows, part.keyframes, part.landmarks, origin, known, config)
-    norm = residual_norms(problem, problem.start)
-    placed = ~np.isnan(positions[problem.observations.point, 0])
-    gate = _ABSURD * config.tracks.outlier_px
-    far = norm > gate
+    obs = part.problem.observations
+    gate = _ABSURD * outlier_px
+    far = norms > gate
+    placed = ~np.isnan(part.problem.start.points[:, 0])
     # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
-    for k in np.unique(problem.observations.keyframe[far]):
-        own = problem.observations.keyframe == k
-        far[own] = norm[own] > widened(gate, norm[own & placed & usable[rows]], 1)
-    usable[rows[far]] = False
-    return usable
+    for k in np.unique(obs.keyframe[far]):
+        own = np.flatnonzero(obs.keyframe == k)
+        far[own] = norms[own] > widened(gate, norms[own[placed[obs.point[own]] & usable[own]]], 1)
+    return usable & ~far
 
 
 def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     """Return the rows of placed landmarks that absurd residuals leave with too few views, by track id."""
-    rows = part.rows[~scene.sightings.outlier[part.rows]]
-    weight = np.where(np.isfinite(scene.sightings.depth_m[rows]), 2, 1)
-    n = len(scene.landmarks)
-    before = np.bincount(scene.sightings.landmark[rows], weight, n)
-    after = np.bincount(scene.sightings.landmark[rows], weight * usable[rows], n)
-    lost = scene.landmarks.has_position & (before >= 2) & (after < 2)
-    return part.landmarks[lost[part.landmarks]]
+    obs, n = part.problem.observations, len(part.landmarks)
+    weight = np.where(np.isfinite(obs.depth_m), 2, 1) if len(obs.depth_m) else np.ones(len(obs))
+    before = np.bincount(obs.point, weight * ~scene.sightings.outlier.take(part.rows), n)
+    after = np.bincount(obs.point, weight * usable, n)
+    return part.landmarks[scene.landmarks.has_position[part.landmarks] & (before >= 2) & (after < 2)]
 
 
-def residual_norms(problem: Problem, state: State) -> FloatArray:
-    """Return the size of each residual in sigmas, inf for points on or behind the camera plane."""
-    error = objective.reprojection_errors(problem, state)
-    return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
-
-
-def _restrict(
-    scene: Scene, part: _Part, positions: FloatArray, usable: BoolArray, max_landmarks: int
-) -> tuple[_Part, FloatArray]:
-    """Leave out what does not determine anything, until nothing more has to go."""
-    rows, n_kf, n_pt = part.rows, len(part.keyframes), len(part.landmarks)
-    keyframe = _number(part.keyframes, len(scene.keyframes))[scene.sightings.keyframe[rows]]
-    point = _number(part.landmarks, len(scene.landmarks))[scene.sightings.landmark[rows]]
-    active = usable[rows]
-    measured = active & np.isfinite(scene.sightings.depth_m[rows])
-    keep_pt = _most_seen(~np.isnan(positions[:, 0]), np.bincount(point[active], minlength=n_pt), max_landmarks)
+def _determined(problem: Problem, usable: BoolArray, max_landmarks: int) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return which observations, keyframes and points are left without all that does not determine anything."""
+    obs, n_kf, n_pt = problem.observations, problem.n_keyframes, problem.n_points
+    measured = usable & np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
+    known = ~np.isnan(problem.start.points[:, 0])
+    keep_pt = _most_seen(known, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
     count = -1
     while True:
-        used = active & keep_pt[point]
-        keep_kf = np.bincount(keyframe[used], minlength=n_kf) >= MIN_OBSERVATIONS
-        used &= keep_kf[keyframe]
-        views = np.bincount(point[used], minlength=n_pt)
-        depths = np.bincount(point[used & measured], minlength=n_pt)
+        used = usable & keep_pt.take(obs.point)
+        keep_kf = np.bincount(obs.keyframe[used], minlength=n_kf) >= MIN_OBSERVATIONS
+        used &= keep_kf.take(obs.keyframe)
+        views = np.bincount(obs.point[used], minlength=n_pt)
+        depths = np.bincount(obs.point[used & measured], minlength=n_pt)
         keep_pt = keep_pt & ((views >= 2) | (depths > 0))
         previous, count = count, int(np.count_nonzero(keep_pt)) + int(np.count_nonzero(keep_kf))
         if count == previous:
             break
-    kept = keep_pt[point] & keep_kf[keyframe]
-    return _Part(rows[kept], part.keyframes[keep_kf], part.landmarks[keep_pt]), positions[keep_pt]
+    return keep_pt.take(obs.point) & keep_kf.take(obs.keyframe), keep_kf, keep_pt
 
 
 def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
@@ -300,23 +257,3 @@ def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
     keep = np.zeros(len(known), bool)
     keep[np.argsort(np.where(known, -views, 1), kind="stable")[:limit]] = True
     return keep
-
-
-def _number(rows: IntArray, n: int) -> IntArray:
-    """Return the place of each of n rows in a list of rows, -1 where it is not in it."""
-    place = np.full(n, -1)
-    place[rows] = np.arange(len(rows))
-    return place
-
-
-def _take(obs: Observations, rows: BoolArray) -> Observations:
-    has_depth = len(obs.depth_m) > 0
-    return Observations(
-        obs.keyframe[rows],
-        obs.camera[rows],
-        obs.point[rows],
-        obs.uv[rows],
-        obs.sigma_px[rows],
-        obs.depth_m[rows] if has_depth else obs.depth_m,
-        obs.depth_sigma_m[rows] if has_depth else obs.depth_sigma_m,
-    )

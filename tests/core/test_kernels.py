@@ -96,6 +96,33 @@ def test_native_polishes_as_numpy_does(shape: dict[str, object], rules: Rules, m
 
 
 @built
+@pytest.mark.parametrize("model", ["shape", "fisheye"])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_native_measures_residuals_as_numpy_does(shape: dict[str, object], model: str, make_problem: Make) -> None:
+    """With points behind the cameras."""
+    problem = some_behind(make_problem(start_error=0.02, **shape)[0])
+    if model == "fisheye":
+        kinds = problem.cameras.model.copy()
+        kinds[-1] = cameras.Model.EQUIDISTANT
+        problem = dataclasses.replace(problem, cameras=dataclasses.replace(problem.cameras, model=kinds))
+    oracle, found = (native_kernels.residual_norms(problem, problem.start, name) for name in ("numpy", "native"))
+    assert len(found) == len(problem.observations) > 100
+    behind = np.isinf(oracle)
+    assert 0 < np.count_nonzero(behind) < len(oracle)
+    np.testing.assert_array_equal(np.isinf(found), behind)
+    near(oracle[~behind], found[~behind])
+
+
+@built
+@pytest.mark.parametrize("backend", ["numpy", "native"])
+def test_residuals_of_nothing_are_nothing(backend: str, make_problem: Make) -> None:
+    problem = make_problem()[0]
+    none = {name: getattr(problem.observations, name)[:0] for name in vars(problem.observations)}
+    empty = dataclasses.replace(problem, observations=dataclasses.replace(problem.observations, **none))
+    assert native_kernels.residual_norms(empty, problem.start, backend).shape == (0,)
+
+
+@built
 @pytest.mark.parametrize("name", ["rational_polynomial", "equidistant"])
 def test_native_has_every_camera_model(name: str, make_problem: Make) -> None:
     """One camera of the given model and one plumb_bob, in one rig."""

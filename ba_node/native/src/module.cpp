@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "kernel.hpp"
+#include "norms.hpp"
 
 namespace py = pybind11;
 
@@ -35,27 +36,51 @@ py::array_t<T> copy(const std::vector<T>& values, std::vector<py::ssize_t> shape
   return out;
 }
 
+// Shapes are those of core/problem.py; the view points into the arrays.
+ba::ProblemView view(const Ints& keyframe, const Ints& camera, const Ints& point, const Doubles& uv,
+                     const Doubles& sigma, const Doubles& camera_rotation, const Doubles& camera_translation,
+                     const Array<std::uint8_t>& model, const Doubles& params, const StateArrays& start) {
+  return {std::get<1>(start).shape(0),
+          std::get<2>(start).shape(0),
+          keyframe.size(),
+          model.size(),
+          keyframe.data(),
+          camera.data(),
+          point.data(),
+          uv.data(),
+          sigma.data(),
+          nullptr,
+          nullptr,
+          camera_rotation.data(),
+          camera_translation.data(),
+          params.data(),
+          model.data(),
+          nullptr};
+}
+
+Doubles residual_norms(const Ints& keyframe, const Ints& camera, const Ints& point, const Doubles& uv,
+                       const Doubles& sigma, const Doubles& camera_rotation, const Doubles& camera_translation,
+                       const Array<std::uint8_t>& model, const Doubles& params, const StateArrays& state) {
+  const ba::ProblemView problem =
+      view(keyframe, camera, point, uv, sigma, camera_rotation, camera_translation, model, params, state);
+  const ba::StateView at = view(state);
+  Doubles norms = empty({keyframe.size()});
+  double* out = norms.mutable_data();
+  py::gil_scoped_release release;
+  ba::residual_norms(problem, at, out);
+  return norms;
+}
+
 template <int D>
 ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point, const Doubles& uv, const Doubles& sigma,
                     const Doubles& depth, const Doubles& depth_sigma, const Doubles& camera_rotation,
                     const Doubles& camera_translation, const Array<std::uint8_t>& model, const Doubles& params,
                     const Array<bool>& fixed, int loss, double loss_scale, int cheirality, const StateArrays& start) {
-  const ba::ProblemView problem{fixed.size(),
-                                std::get<2>(start).shape(0),
-                                keyframe.size(),
-                                model.size(),
-                                keyframe.data(),
-                                camera.data(),
-                                point.data(),
-                                uv.data(),
-                                sigma.data(),
-                                depth.size() ? depth.data() : nullptr,
-                                depth_sigma.data(),
-                                camera_rotation.data(),
-                                camera_translation.data(),
-                                params.data(),
-                                model.data(),
-                                fixed.data()};
+  ba::ProblemView problem =
+      view(keyframe, camera, point, uv, sigma, camera_rotation, camera_translation, model, params, start);
+  problem.depth = depth.size() ? depth.data() : nullptr;
+  problem.depth_sigma = depth_sigma.data();
+  problem.fixed = fixed.data();
   const ba::Rules rules{static_cast<ba::Loss>(loss), loss_scale, static_cast<ba::Cheirality>(cheirality)};
   const ba::StateView state = view(start);
   py::gil_scoped_release release;
@@ -172,4 +197,7 @@ PYBIND11_MODULE(_kernels, m) {
   m.doc() = "Kernels of bundle adjustment in C++; see ba_node/core/kernels.py.";
   bind<6>(m, "Kernel6");
   bind<9>(m, "Kernel9");
+  m.def("residual_norms", &residual_norms, py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"),
+        py::arg("uv"), py::arg("sigma_px"), py::arg("camera_rotation"), py::arg("camera_translation"),
+        py::arg("camera_model"), py::arg("camera_params"), py::arg("state"));
 }

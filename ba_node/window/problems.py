@@ -1,0 +1,111 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Turn observations of a scene into a problem, and take parts of a problem.
+
+All observations of a problem are sorted by point, keyframe, camera. A part keeps the order, so it need not be sorted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.core.problem import Observations, Problem, State
+
+if TYPE_CHECKING:
+    from ba_node.config import Config
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+
+
+def problem_of(
+    scene: Scene,
+    rows: IntArray,
+    keyframes: IntArray,
+    landmarks: IntArray,
+    origin: FloatArray,
+    positions: FloatArray,
+    config: Config,
+) -> Problem:
+    """Return the problem of some observations, sorted by point, keyframe, camera; all poses fixed.
+
+    Args:
+        scene: where they stand.
+        rows: rows of the observations; reordered in place.
+        keyframes: rows of the keyframes of the problem, in its order.
+        landmarks: rows of the points of the problem, in its order.
+        origin: (3,) of the problem in the map, m.
+        positions: (n_pt, 3) of the points in the problem.
+        config: for the precision of depths.
+    """
+    table, cameras = scene.sightings, scene.cameras
+    assert cameras is not None
+    keyframe = _number(keyframes, len(scene.keyframes)).take(table.keyframe.take(rows))
+    point = _number(landmarks, len(scene.landmarks)).take(table.landmark.take(rows))
+    camera = table.camera.take(rows).astype(np.intp)
+    # No camera sees a point twice in a keyframe, so no two keys are equal and any sort gives the same.
+    order = np.argsort((point * len(keyframes) + keyframe) * len(cameras.model) + camera)
+    rows[:] = rows.take(order)
+    depth = table.depth_m.take(rows).astype(float)
+    depth = np.empty(0) if np.isnan(depth).all() else depth
+    observations = Observations(
+        keyframe.take(order),
+        camera.take(order),
+        point.take(order),
+        table.uv.take(rows, axis=0).astype(float),
+        table.sigma_px.take(rows).astype(float),
+        depth,
+        config.tracks.depth_sigma_ratio * depth,
+    )
+    poses = geometry.inverse(scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes] - origin)
+    return Problem(State(*poses, positions, np.empty((0, 3))), np.ones(len(keyframes), bool), cameras, observations)
+
+
+def some_observations(problem: Problem, rows: BoolArray) -> Problem:
+    """Return a problem with some of the observations of another, and all its keyframes and points."""
+    return dataclasses.replace(problem, observations=_taken(problem.observations, np.flatnonzero(rows)))
+
+
+def part_of(problem: Problem, rows: BoolArray, keyframes: BoolArray, points: BoolArray) -> Problem:
+    """Return a problem with some observations, keyframes and points of another.
+
+    Args:
+        problem: the whole.
+        rows: (n_obs,) observations to keep, all of kept keyframes and points.
+        keyframes: (n_kf,) keyframes to keep.
+        points: (n_pt,) points to keep.
+    """
+    obs, start = _taken(problem.observations, np.flatnonzero(rows)), problem.start
+    return Problem(
+        State(start.rotation[keyframes], start.translation[keyframes], start.points[points], start.intrinsics),
+        problem.fixed[keyframes],
+        problem.cameras,
+        dataclasses.replace(
+            obs,
+            keyframe=(np.cumsum(keyframes) - 1).take(obs.keyframe),
+            point=(np.cumsum(points) - 1).take(obs.point),
+        ),
+    )
+
+
+def _taken(obs: Observations, rows: IntArray) -> Observations:
+    has_depth = len(obs.depth_m) > 0
+    return Observations(
+        obs.keyframe.take(rows),
+        obs.camera.take(rows),
+        obs.point.take(rows),
+        obs.uv.take(rows, axis=0),
+        obs.sigma_px.take(rows),
+        obs.depth_m.take(rows) if has_depth else obs.depth_m,
+        obs.depth_sigma_m.take(rows) if has_depth else obs.depth_sigma_m,
+    )
+
+
+def _number(rows: IntArray, n: int) -> IntArray:
+    """Return the place of each of n rows in a list of rows, -1 where it is not in it."""
+    place = np.full(n, -1)
+    place[rows] = np.arange(len(rows))
+    return place
