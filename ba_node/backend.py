@@ -30,22 +30,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter, deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ba_node import window
 from ba_node.core import geometry, methods, solver
-from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport, Status
 from ba_node.measurements import CameraRig, Keyframe, Measurement
+from ba_node.scene import ingest
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
+from ba_node.window.correction import MapCorrection, Transform
+from ba_node.window.covariance import covariances
+from ba_node.window.view import view
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ba_node.config import Config
-    from ba_node.core.problem import Cameras
+    from ba_node.core.problem import Cameras, State
     from ba_node.core.result import Iteration
     from ba_node.scene.tables import IntArray
 
@@ -53,6 +57,8 @@ FINISHED_KEPT = 8
 # Keyframes from which it is learned how many cameras deliver.
 _LEARN_FROM = 5
 _UNSOLVED = "not solved yet"
+# The front-end's frame where neither it nor the parameters name one.
+_ODOM_FRAME = "odom"
 
 
 def _no_clock() -> float:
@@ -67,6 +73,7 @@ class Backend:
         scene: the current map.
         finished: session id and last estimate of the sessions before, oldest first, the last few.
         solve_count: solves since the beginning.
+        extras: what the next solve is to work out beside the estimate.
     """
 
     def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
@@ -75,11 +82,13 @@ class Backend:
         self.scene = Scene(config.scene)
         self.finished: list[tuple[int, Estimate]] = []
         self.solve_count = 0
+        self.extras = Extras()
         self._clock = clock
         self._current: int | None = None
         self._settled = False
         self._delivered: deque[int] = deque(maxlen=_LEARN_FROM)
         self._report = SolveReport(reason=_UNSOLVED)
+        self._correction = MapCorrection()
 
     @property
     def rejected(self) -> Counter[str]:
@@ -118,6 +127,8 @@ class Backend:
 
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement; what cannot be used is counted in ``rejected``."""
+        if isinstance(measurement, CameraRig) and self.config.frames.poses_of == "camera":
+            measurement = ingest.seen_from_first(measurement)
         if not isinstance(measurement, CameraRig) and self._opens(measurement):
             self._begin(measurement.session_id)
         last = self._current
@@ -158,15 +169,19 @@ class Backend:
         taking_part = window.rows_of(self.scene, self.config, end)
         self.solve_count += 1
         newest = int(self.scene.keyframes.keyframe_id[taking_part[-1]])
+        extra: dict[str, Any] = {}
         if isinstance(selection, str):
             self._report = self._base_report(newest, Status.SKIPPED, selection)
         else:
             taking_part = _taking_part(self.scene, selection)
-            self._report = self._solve(newest, selection, on_iteration)
+            self._report, state = self._solve(newest, selection, on_iteration)
+            if state is not None:
+                self._correct(int(taking_part[-1]))
+                extra = self._extras(selection, state, taking_part)
         reached = np.zeros(len(self.scene.keyframes), bool)
         reached[self.scene.order[:end]] = True
         self.scene.keyframes.solved[due[reached[due]]] = True
-        return self._estimate(taking_part)
+        return dataclasses.replace(self._estimate(taking_part), **extra)
 
     def rms_px(self, state: str = "refined") -> float:
         """Return the root mean square reprojection error per coordinate over all observations of the map, px.
@@ -180,15 +195,15 @@ class Backend:
 
     def _solve(
         self, newest: int, selection: window.Selection, on_iteration: Callable[[Iteration], bool] | None
-    ) -> SolveReport:
+    ) -> tuple[SolveReport, State | None]:
         began = self._clock()
         problem = selection.problem
         result = solver.solve(
             problem, methods.from_config(self.config.solver), clock=self._clock, on_iteration=on_iteration
         )
         elapsed = self._clock() - began
-        after = window.merge(self.scene, selection, result, self.config.tracks.outlier_px, self.config.solver.backend)
-        return dataclasses.replace(
+        merged = window.merge(self.scene, selection, result, self.config.tracks.outlier_px, self.config.solver.backend)
+        report = dataclasses.replace(
             self._base_report(newest, result.status, result.reason),
             method=result.method,
             iterations=max(len(result.trace) - 1, 0),
@@ -198,7 +213,7 @@ class Backend:
             objective_after=result.objective_after,
             gradient_norm=result.gradient_norm,
             rms_px_before=quality.rms_of_norms_px(selection, selection.norms),
-            rms_px_after=quality.rms_of_norms_px(selection, after),
+            rms_px_after=quality.rms_of_norms_px(selection, merged.norms),
             keyframes=int(np.count_nonzero(~problem.fixed)),
             fixed_keyframes=int(np.count_nonzero(problem.fixed)),
             landmarks=problem.n_points,
@@ -206,6 +221,32 @@ class Backend:
             outliers=len(selection.rows) - len(problem.observations),
             solve_time_s=elapsed,
         )
+        return report, merged.state
+
+    def _correct(self, row: int) -> None:
+        """Let the correction map -> odom follow what was found at a keyframe, and tell its size in the report."""
+        self.scene.settle_poses()
+        table = self.scene.keyframes
+        found = Transform(*self.scene.corrections(np.array(row)))
+        body = Transform(table.input_rotation[row], table.input_position[row])
+        move = self._correction.update(self.config.frames, found, body, int(table.stamp_ns[row]))
+        self._report = dataclasses.replace(
+            self._report, correction_m=move.distance_m, correction_rad=move.angle_rad, correction_held=move.held
+        )
+
+    def _extras(self, selection: window.Selection, state: State, refined: IntArray) -> dict[str, Any]:
+        """Return what was asked for beside the estimate, with rows as in ``refined``."""
+        place = np.searchsorted(_places(self.scene)[refined], _places(self.scene)[selection.keyframes])
+        found: dict[str, Any] = {}
+        if self.extras.covariance:
+            measured = self.scene.keyframes.input_position[selection.keyframes]
+            found["covariance"] = np.full((len(refined), 6, 6), np.nan)
+            found["covariance"][place] = covariances(
+                selection, state, measured, methods.from_config(self.config.solver)
+            )
+        if self.extras.view:
+            found["view"] = view(selection.problem, state, place, len(refined))
+        return found
 
     def _base_report(self, newest: int, status: Status, reason: str) -> SolveReport:
         return SolveReport(
@@ -226,12 +267,20 @@ class Backend:
         rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
         return Estimate(
             stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]),
-            frame_id=scene.frame_id,
+            frame_id=self.config.frames.map_frame,
             refined=_poses(scene, refined),
             trajectory=_poses(scene, scene.order),
             cloud=Cloud(points.track_id[rows], points.position[rows], points.rms_px[rows], points.views[rows]),
             report=self._report,
+            correction=self._published(),
         )
+
+    def _published(self) -> Correction | None:
+        transform = self._correction.published
+        if transform is None:
+            return None
+        name = self.config.frames.odom_frame or self.scene.frame_id or _ODOM_FRAME
+        return Correction(name, transform.translation, geometry.quaternion_from_matrix(transform.rotation))
 
     def _due(self) -> IntArray:
         """Return the rows of complete keyframes that were not solved."""
@@ -285,6 +334,7 @@ class Backend:
         self._current, self._settled = None, False
         self._delivered.clear()
         self._report = SolveReport(reason=_UNSOLVED)
+        self._correction = MapCorrection()
 
 
 def _taking_part(scene: Scene, selection: window.Selection) -> IntArray:
@@ -293,6 +343,13 @@ def _taking_part(scene: Scene, selection: window.Selection) -> IntArray:
     marked[selection.window] = True
     marked[selection.keyframes] = True
     return scene.order[marked[scene.order]]
+
+
+def _places(scene: Scene) -> IntArray:
+    """Return the place of each row of keyframes in the order of time."""
+    place = np.empty(len(scene.order), np.intp)
+    place[scene.order] = np.arange(len(place))
+    return place
 
 
 def _poses(scene: Scene, rows: IntArray) -> Poses:

@@ -22,6 +22,8 @@ METHODS = ("auto", "lma_cd", "bal", "inm", "tnm", "dinm", "adinm", "local_dinm",
 LOSSES = ("squared", "huber", "truncated_quadratic", "cauchy", "geman_mcclure")
 BACKENDS = ("auto", "native", "numpy")
 CHEIRALITY = ("keep", "constant", "drop")
+POSES_OF = ("body", "camera")
+EXTRINSICS = ("camera_rig", "tf_static")
 
 
 class ConfigError(ValueError):
@@ -204,12 +206,81 @@ class SolverConfig:
 
 
 @dataclass(frozen=True)
+class FramesConfig:
+    """Names of frames, and how the correction map -> odom moves. See docs/frames.md."""
+
+    map_frame: str = _param("map", "Frame of everything that is published.", live=False)
+    odom_frame: str = _param(
+        "", "Frame of the front-end's poses; empty: the header.frame_id of its keyframes.", live=False
+    )
+    base_frame: str = _param("base_link", "Frame of the body, from which tf_static leads to the cameras.", live=False)
+    poses_of: str = _param(
+        "body",
+        "What poses are of, in and out: the body, or camera 0 of the rig (optical frame).",
+        choices=POSES_OF,
+        live=False,
+    )
+    extrinsics: str = _param(
+        "camera_rig",
+        "Where the cameras sit on the body: as camera_rig says, or as tf_static does, by their frame_id.",
+        choices=EXTRINSICS,
+        live=False,
+    )
+    publish_tf: bool = _param(True, "Publish map -> odom on /tf.")
+    transform_tolerance: float = _param(
+        0.2, "How far ahead of the data map -> odom is stamped.", unit="s", minimum=0.0, maximum=60.0
+    )
+    publish_period_s: float = _param(
+        0.05,
+        "How often map -> odom is repeated, between solves too; 0: after solves only.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+        live=False,
+    )
+    gate_m: float = _param(
+        1.0,
+        "A solve that moves the newest keyframe further is held back from /tf until others confirm it; 0: never.",
+        unit="m",
+        minimum=0.0,
+        maximum=1e9,
+    )
+    gate_rad: float = _param(
+        0.2, "The same for a solve that turns it further; 0: never.", unit="rad", minimum=0.0, maximum=4.0
+    )
+    gate_confirmations: int = _param(
+        2, "Solves in a row that have to agree with a correction beyond a gate.", minimum=1, maximum=1000
+    )
+    smoothing_s: float = _param(
+        0.0,
+        "Time constant, by the stamps of keyframes, with which map -> odom follows corrections; 0: at once.",
+        unit="s",
+        minimum=0.0,
+        maximum=3600.0,
+    )
+
+
+@dataclass(frozen=True)
 class OutputConfig:
     """What is published."""
 
     path_max_poses: int = _param(1000, "Poses in ~/path; the newest are kept.", minimum=1, maximum=1_000_000)
     points_max: int = _param(
         200_000, "Points in ~/points; beyond it they are thinned evenly.", minimum=1, maximum=50_000_000
+    )
+    markers_max_keyframes: int = _param(
+        200, "Keyframes drawn in ~/markers; the newest are kept.", minimum=1, maximum=10_000
+    )
+    markers_max_links: int = _param(
+        500, "Lines in ~/markers between keyframes; those with most common points are kept.", minimum=0, maximum=100_000
+    )
+    markers_frustum_m: float = _param(0.2, "Depth of the frusta in ~/markers.", unit="m", minimum=1e-3, maximum=1e3)
+    markers_rms_px: float = _param(
+        2.0,
+        "Reprojection error of a keyframe that ~/markers draws in red; 0 is green.",
+        unit="px",
+        minimum=1e-3,
+        maximum=1e6,
     )
 
 
@@ -243,6 +314,7 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
+    frames: FramesConfig = field(default_factory=FramesConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     node: NodeConfig = field(default_factory=NodeConfig)
 

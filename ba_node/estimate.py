@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ba_node.core.result import Status
 
-__all__ = ["Cloud", "Estimate", "Poses", "SolveReport", "Status"]
+__all__ = ["Cloud", "Correction", "Estimate", "Extras", "Poses", "SolveReport", "Status", "WindowView"]
 
 FloatArray = NDArray[np.float64]
 
@@ -113,16 +113,60 @@ class SolveReport:
 
 
 @dataclass(frozen=True)
+class Correction:
+    """Where the front-end's fixed frame stands in the map, as published: map from odom.
+
+    Attributes:
+        odom_frame: name of the front-end's fixed frame.
+        position: (3,) of its origin, m.
+        orientation: (4,) unit quaternion x y z w.
+    """
+
+    odom_frame: str
+    position: FloatArray
+    orientation: FloatArray
+
+
+@dataclass(frozen=True)
+class WindowView:
+    """What there is to see of a solve; rows as in ``Estimate.refined``.
+
+    Attributes:
+        free: (n,) True where the pose was free, False where it was held.
+        rms_px: (n,) root mean square residual per coordinate of each keyframe, px; NaN without observations.
+        links: (m, 2) pairs of keyframes that see common points.
+        shared: (m,) number of their common points.
+    """
+
+    free: NDArray[np.bool_]
+    rms_px: FloatArray
+    links: NDArray[np.intp]
+    shared: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What a solve is to work out beside the estimate, for those who look at it."""
+
+    covariance: bool = False
+    view: bool = False
+
+
+@dataclass(frozen=True)
 class Estimate:
     """What is published after a solve.
 
     Attributes:
         stamp_ns: stamp of the newest keyframe, ns.
-        frame_id: name of the fixed frame.
+        frame_id: name of the map's frame.
         refined: poses of the keyframes in the solve, free and fixed, oldest first.
         trajectory: poses of all keyframes that are kept, oldest first, the newest estimate of each.
         cloud: all points that are kept.
         report: how the solve went.
+        correction: of the front-end's fixed frame; None before the first usable solve of a session.
+        covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
+            0 for poses that were held. None if it was not asked for, or the solve is not usable.
+        view: what there is to see; None likewise.
     """
 
     stamp_ns: int
@@ -131,3 +175,6 @@ class Estimate:
     trajectory: Poses
     cloud: Cloud
     report: SolveReport
+    correction: Correction | None = None
+    covariance: FloatArray | None = None
+    view: WindowView | None = None

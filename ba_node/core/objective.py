@@ -127,6 +127,18 @@ class Objective:
         residual = self._residual(uv, x_cam, masked)
         return self._total(self._costs(residual, masked)[0])
 
+    def weighted_squares(self, state: State) -> tuple[float, int]:
+        """Return ``r' W r`` with the IRLS weights W, and the number of rows that count (not those behind a camera)."""
+        x_cam = self.in_camera(state)
+        masked = self._mask(x_cam)
+        uv = cameras.project(x_cam, self._model, self._row_params(state))
+        residual = self._residual(uv, x_cam, masked)
+        weighted = residual * self._costs(residual, masked)[1]
+        rows = 2 * np.count_nonzero(~masked)
+        if self._has_depth:
+            rows += np.count_nonzero(np.isfinite(self.problem.observations.depth_m[~masked]))
+        return float(np.sum(weighted * weighted)), int(rows)
+
     def linearise(self, state: State) -> Linearisation:
         """Return residuals and Jacobians at a state."""
         rows, d_intrinsics = self._rows(state)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Cameras
+from ba_node.scene.rejections import RejectionLog
 
 if TYPE_CHECKING:
     from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-    from ba_node.scene.rejections import RejectionLog
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -130,6 +130,19 @@ def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
             return None
     rotation, translation = geometry.inverse(geometry.matrix_from_quaternion(rig.orientation), rig.position)
     return Cameras(rotation, translation, model, params)
+
+
+def seen_from_first(rig: CameraRig) -> CameraRig:
+    """Return a rig as it is seen from its first camera, which then is the body; unchanged where it cannot be used."""
+    n = len(rig)
+    if n == 0 or rig_cameras(rig, RejectionLog()) is None:
+        return rig
+    rotation = geometry.matrix_from_quaternion(rig.orientation)
+    back = geometry.inverse(rotation[0], rig.position[0])
+    seen = geometry.compose(*back, rotation, rig.position)
+    return dataclasses.replace(
+        rig, frame_id=rig.names[0], position=seen[1], orientation=geometry.quaternion_from_matrix(seen[0])
+    )
 
 
 def _first_of_each(tracks: FeatureTracks, good: BoolArray, log: RejectionLog) -> BoolArray:

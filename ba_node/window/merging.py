@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,15 +21,23 @@ if TYPE_CHECKING:
     from ba_node.window.selection import Selection
 
 
-def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float, backend: str = "auto") -> FloatArray:
-    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew.
+class Merged(NamedTuple):
+    """What came of a result.
 
-    Returns:
-        (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these.
+    Attributes:
+        norms: (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these.
+        state: the solution in the scale that it has in the map; None without a usable result.
     """
+
+    norms: FloatArray
+    state: State | None
+
+
+def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float, backend: str = "auto") -> Merged:
+    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
     state = result.state
     if not result.status.usable or not state.is_finite():
-        return selection.norms
+        return Merged(selection.norms, None)
     state = _scaled(scene, selection, state)
     free = ~selection.problem.fixed
     rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
@@ -43,7 +51,7 @@ def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float,
     norms = native_kernels.residual_norms(whole, state, backend)
     _judge(scene, selection, norms, outlier_px)
     _displace(scene, selection.lost)
-    return norms
+    return Merged(norms, state)
 
 
 def _scaled(scene: Scene, selection: Selection, state: State) -> State:

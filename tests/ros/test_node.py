@@ -100,7 +100,7 @@ def test_keyframes_come_back_refined(
     peer.until(lambda: _in_solve(peer) == KEYFRAMES, "a solve with all keyframes")
     last = peer.received["refined_keyframes"][-1]
     assert list(last.keyframe_id) == list(range(KEYFRAMES))
-    assert last.header.frame_id == "odom"
+    assert last.header.frame_id == "map"
     position = np.asarray(last.position).reshape(-1, 3)
     orientation = np.asarray(last.orientation).reshape(-1, 4)
     assert np.isfinite(position).all()

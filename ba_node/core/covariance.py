@@ -1,0 +1,105 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""How well a solution is determined: the covariance of every free pose.
+
+At the minimum the errors of the unknowns are, to first order, ``-H^-1 J' W e`` for noise e of the residuals, so their
+covariance is ``sigma^2 H^-1`` with the undamped ``H = J' W J``. Its keyframe part is the inverse of the Schur
+complement of the points (3.64-3.67), which is small::
+
+    Sigma_c = sigma^2 S^-1,    S = B - E C^-1 E',    sigma^2 = r' W r / (m - n)
+
+W are the IRLS weights of the loss at the solution, m the rows of residuals and n the unknowns: sigma^2 is the
+a-posteriori variance of unit weight, near 1 where sigma_px is right. So uncertain points count (they are integrated
+out), and everything is relative to what the problem holds fixed.
+
+Where scale is held by a condition ``g'x = 0`` on the step of all keyframes instead of by a fixed pose, S is inverted on
+the directions that the condition leaves: with an orthonormal basis Q of them, ``S^-1 -> Q (Q' S Q)^-1 Q'``.
+
+A direction that nothing determines has no variance. Keyframes that take part in such a direction are unknown (NaN); the
+others keep theirs. S is scaled to a unit diagonal first, so that units do not decide what is rounding.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from ba_node.core import native_kernels
+from ba_node.core.kernels import DENSE_LIMIT
+from ba_node.core.objective import Objective
+
+if TYPE_CHECKING:
+    from ba_node.core.options import SolverOptions
+    from ba_node.core.problem import Problem, State
+
+FloatArray = NDArray[np.float64]
+
+# Eigenvalues of S, scaled to a unit diagonal, that are rounding.
+_ROUNDING = 1e-11
+# A keyframe with a larger share (unit vector) in an undetermined direction is unknown itself.
+_SHARE = 1e-4
+
+
+def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
+    """Return the covariance of the step of every free pose at a solution.
+
+    Args:
+        problem: as it was solved.
+        state: its solution.
+        options: the rules (loss, cheirality) and the kernels that it was solved with; poses are stepped locally.
+        conditions: (n_free, 6, n_conditions) g: conditions that hold what no fixed pose holds; or none, (n_free, 6, 0).
+
+    Returns:
+        (n_free, 6, 6) in the local tangent, ``R <- R Exp(dphi), t <- t + R dt``: rotation (rad), then translation (m),
+        row-major. NaN where unknown: nothing determines the pose, there are no more residuals than unknowns, or S is
+        too large to be inverted (DENSE_LIMIT).
+    """
+    n_free = int(np.count_nonzero(~problem.fixed))
+    unknown = np.full((n_free, 6, 6), np.nan)
+    n = 6 * n_free
+    if n == 0 or n > DENSE_LIMIT or problem.free_intrinsics:
+        return unknown
+    rules = dataclasses.replace(options.rules, parameterisation="local")
+    with np.errstate(all="ignore"):
+        variance = unit_variance(Objective(problem, rules), state, conditions.shape[2])
+        kernels = native_kernels.make(problem, rules, options.backend)
+        kernels.linearise(state)
+        s = kernels.reduce(np.zeros((n_free, 6)), np.zeros((problem.n_points, 3))).dense()
+    if not np.isfinite(variance) or not np.isfinite(s).all():
+        return unknown
+    return variance * _diagonal_of_inverse(s, conditions.reshape(n, -1))
+
+
+def unit_variance(objective: Objective, state: State, n_conditions: int = 0) -> float:
+    """Return ``r' W r / (m - n)``, NaN where there are no more rows than unknowns."""
+    problem = objective.problem
+    squares, rows = objective.weighted_squares(state)
+    unknowns = 6 * int(np.count_nonzero(~problem.fixed)) + 3 * len(np.unique(problem.observations.point))
+    freedom = rows - (unknowns - n_conditions)
+    return squares / freedom if freedom > 0 else np.nan
+
+
+def _diagonal_of_inverse(s: FloatArray, conditions: FloatArray) -> FloatArray:
+    """Return the 6 x 6 blocks on the diagonal of ``Q (Q' S Q)^-1 Q'``, NaN for keyframes that are undetermined."""
+    n = len(s)
+    diagonal = np.diagonal(s)
+    unit = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+    scaled = s * unit[:, None] * unit
+    if conditions.shape[1]:
+        # x = D x~ turns g'x into (D g)'x~.
+        basis = scipy.linalg.qr(conditions * unit[:, None])[0][:, conditions.shape[1] :]
+        values, vectors = np.linalg.eigh(basis.T @ scaled @ basis)
+        vectors = basis @ vectors
+    else:
+        values, vectors = np.linalg.eigh(scaled)
+    kept = values > _ROUNDING * n
+    roots = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
+    blocks = roots.reshape(n // 6, 6, -1)
+    out = np.asarray(blocks @ np.swapaxes(blocks, 1, 2))
+    loose = np.sum(vectors[:, ~kept].reshape(n // 6, -1) ** 2, axis=1) > _SHARE**2
+    out[loose] = np.nan
+    return out

@@ -1,0 +1,52 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Say what there is to see of a solved window: what was free, how well each keyframe fits, and who sees the same."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse
+
+from ba_node.core import objective
+from ba_node.estimate import WindowView
+
+if TYPE_CHECKING:
+    from ba_node.core.problem import Observations, Problem, State
+    from ba_node.scene.tables import FloatArray, IntArray
+
+
+def view(problem: Problem, state: State, place: IntArray, n: int) -> WindowView:
+    """Return what there is to see.
+
+    Args:
+        problem: as it was solved.
+        state: its solution.
+        place: (n_kf,) row of each keyframe of the problem among the n keyframes of the estimate.
+        n: keyframes of the estimate; those that are not in the problem are neither free nor linked.
+    """
+    free, rms_px = np.zeros(n, bool), np.full(n, np.nan)
+    free[place] = ~problem.fixed
+    rms_px[place] = _rms_by_keyframe(problem, state)
+    links, shared = _links(problem.observations, problem.n_keyframes, problem.n_points)
+    return WindowView(free, rms_px, place[links], shared)
+
+
+def _rms_by_keyframe(problem: Problem, state: State) -> FloatArray:
+    error = objective.reprojection_errors(problem, state)
+    seen = ~np.isnan(error[:, 0])
+    keyframe = problem.observations.keyframe[seen]
+    total = np.bincount(keyframe, np.sum(error[seen] ** 2, axis=1), problem.n_keyframes)
+    count = np.bincount(keyframe, minlength=problem.n_keyframes)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(total / (2 * count)))
+
+
+def _links(obs: Observations, n_kf: int, n_points: int) -> tuple[IntArray, IntArray]:
+    """Return pairs of keyframes (m, 2), the earlier first, and the number of points that both see (m,)."""
+    sees = scipy.sparse.csr_matrix((np.ones(len(obs)), (obs.keyframe, obs.point)), shape=(n_kf, n_points))
+    # A point that several cameras of a keyframe see counts once.
+    sees.data[:] = 1.0
+    common = scipy.sparse.triu(sees @ sees.T, k=1).tocoo()
+    return np.stack([common.row, common.col], axis=1).astype(np.intp), common.data.astype(np.intp)

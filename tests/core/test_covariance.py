@@ -1,0 +1,174 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from ba_node.core import covariance, geometry, matrix_forms, methods, objective, solver
+from ba_node.core.objective import Objective, Rules
+from ba_node.core.options import SolverOptions
+from ba_node.core.problem import Observations, Problem, State
+
+MakeProblem = Callable[..., tuple[Problem, State]]
+
+SQUARED = dataclasses.replace(methods.options("auto"), gradient_tolerance=1e-9, function_tolerance=1e-14)
+
+
+def options(loss: str = "squared", backend: str = "auto") -> SolverOptions:
+    return dataclasses.replace(SQUARED, rules=Rules("local", loss, 1.0, "constant"), backend=backend)
+
+
+def solved(problem: Problem, chosen: SolverOptions) -> State:
+    result = solver.solve(problem, chosen)
+    assert result.status.usable, result.reason
+    return result.state
+
+
+def none(problem: Problem) -> np.ndarray:
+    return np.empty((int(np.count_nonzero(~problem.fixed)), 6, 0))
+
+
+def by_full_inverse(problem: Problem, state: State, chosen: SolverOptions) -> np.ndarray:
+    """Return the blocks of the keyframes in the inverse of all of H, put together from one dense Jacobian."""
+    measure = Objective(problem, chosen.rules)
+    lin = measure.linearise(state)
+    h, _ = matrix_forms.explicit_dense(problem, lin)
+    rows = int(np.count_nonzero(np.any(lin.d_point != 0.0, axis=2)))
+    variance = np.sum(lin.residual**2) / (rows - len(h))
+    n = int(np.count_nonzero(~problem.fixed))
+    inverse = variance * np.linalg.inv(h)
+    return np.array([inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)])
+
+
+@pytest.mark.parametrize("backend", ["native", "numpy"])
+@pytest.mark.parametrize("loss", ["squared", "huber"])
+@pytest.mark.parametrize(
+    "fields", [{"stereo": True}, {"stereo": True, "depth": True}, {"fixed": 2}], ids=["stereo", "depth", "mono"]
+)
+def test_it_is_the_inverse_of_the_whole_of_h(
+    make_problem: MakeProblem, backend: str, loss: str, fields: dict[str, object]
+) -> None:
+    problem, _ = make_problem(noise_px=1.0, **fields)
+    chosen = options(loss, backend)
+    state = solved(problem, chosen)
+    got = covariance.pose_covariances(problem, state, chosen, none(problem))
+    expected = by_full_inverse(problem, state, chosen)
+    scale = np.sqrt(np.einsum("kii,kjj->kij", expected, expected))
+    worst = float(np.max(np.abs(got - expected) / scale))
+    assert worst < 1e-6, f"largest difference {worst:.1e} of the standard deviations"
+
+
+def with_noise(problem: Problem, exact: Observations, rng: np.random.Generator) -> Problem:
+    uv = exact.uv + rng.normal(size=exact.uv.shape) * exact.sigma_px[:, None]
+    return dataclasses.replace(problem, observations=dataclasses.replace(exact, uv=uv))
+
+
+def local_errors(truth: State, found: State, free: np.ndarray) -> np.ndarray:
+    """Return the steps (n_free, 6) that lead from the true to the found poses."""
+    back = np.swapaxes(truth.rotation, 1, 2)
+    turn = geometry.so3_log(back @ found.rotation)
+    moved = (back @ (found.translation - truth.translation)[:, :, None])[..., 0]
+    return np.asarray(np.concatenate([turn, moved], axis=1)[free])
+
+
+def test_it_is_what_repeated_measurements_scatter_by(make_problem: MakeProblem) -> None:
+    problem, truth = make_problem(noise_px=0.0, start_error=0.0, stereo=True, keyframes=4, points=30)
+    rng = np.random.default_rng(1)
+    chosen, free, n = options(), ~problem.fixed, 400
+    errors, told, variances = [], [], []
+    for _ in range(n):
+        noisy = with_noise(problem, problem.observations, rng)
+        state = solved(noisy, chosen)
+        errors.append(local_errors(truth, state, free))
+        variances.append(covariance.unit_variance(Objective(noisy, chosen.rules), state))
+        told.append(covariance.pose_covariances(noisy, state, chosen, none(problem)))
+    # The standard error of a standard deviation from n samples is 1 / sqrt(2 n): 3.5 %.
+    measured = np.std(np.array(errors), axis=0)
+    ratio = measured / np.sqrt(np.diagonal(np.mean(told, axis=0), axis1=1, axis2=2))
+    assert np.all(np.abs(ratio - 1.0) < 0.15), f"scatter over told deviation: {ratio.min():.3f} to {ratio.max():.3f}"
+    assert abs(np.mean(variances) - 1.0) < 0.02, "the a-posteriori variance of noise of the size that sigma_px says"
+    correlation = np.corrcoef(np.array(errors)[:, 0].T)
+    mean = np.mean(told, axis=0)[0]
+    deviation = np.sqrt(np.diagonal(mean))
+    assert np.max(np.abs(correlation - mean / np.outer(deviation, deviation))) < 0.2
+
+
+def test_sigma_follows_the_residuals_not_what_was_claimed(make_problem: MakeProblem) -> None:
+    problem, _ = make_problem(stereo=True, noise_px=1.0)
+    obs = problem.observations
+    claimed = dataclasses.replace(problem, observations=dataclasses.replace(obs, sigma_px=10.0 * obs.sigma_px))
+    chosen = options()
+    state = solved(problem, chosen)
+    a = covariance.pose_covariances(problem, state, chosen, none(problem))
+    b = covariance.pose_covariances(claimed, state, chosen, none(problem))
+    np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
+
+
+def test_a_condition_holds_a_scale_that_floats(make_problem: MakeProblem) -> None:
+    """With one fixed pose and one camera S is singular; a condition makes it the inverse of the bordered matrix."""
+    problem, _ = make_problem(fixed=1, noise_px=1.0)
+    chosen = options()
+    state = solved(problem, chosen)
+    n = int(np.count_nonzero(~problem.fixed))
+    assert np.isnan(covariance.pose_covariances(problem, state, chosen, none(problem))).any(), "nothing holds the scale"
+    g = np.random.default_rng(0).normal(size=(n, 6, 1))
+    got = covariance.pose_covariances(problem, state, chosen, g)
+    lin = Objective(problem, chosen.rules).linearise(state)
+    h, _ = matrix_forms.explicit_dense(problem, lin)
+    border = np.zeros((len(h), 1))
+    border[: 6 * n, 0] = g.ravel()
+    bordered = np.block([[np.asarray(h), border], [border.T, np.zeros((1, 1))]])
+    variance = np.sum(lin.residual**2) / (2 * len(problem.observations) - len(h) + 1)
+    inverse = variance * scipy.linalg.inv(bordered)
+    expected = np.array([inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)])
+    scale = np.sqrt(np.einsum("kii,kjj->kij", expected, expected))
+    assert np.max(np.abs(got - expected) / scale) < 1e-5
+
+
+def _without(problem: Problem, kept: np.ndarray) -> Problem:
+    obs = problem.observations
+    columns = {f.name: getattr(obs, f.name) for f in dataclasses.fields(obs)}
+    return dataclasses.replace(
+        problem, observations=Observations(**{k: v[kept] if len(v) else v for k, v in columns.items()})
+    )
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda p: _without(p, np.arange(len(p.observations)) < 8),
+        lambda p: _without(p, np.zeros(len(p.observations), bool)),
+    ],
+    ids=["fewer rows than unknowns", "no observations"],
+)
+def test_unknown_is_nan(make_problem: MakeProblem, spoil: Callable[[Problem], Problem]) -> None:
+    problem = spoil(make_problem(stereo=True)[0])
+    got = covariance.pose_covariances(problem, problem.start, options(), none(problem))
+    assert got.shape == (4, 6, 6) and np.isnan(got).all()
+
+
+def test_only_the_keyframe_that_hangs_loose_is_unknown(make_problem: MakeProblem) -> None:
+    problem, _ = make_problem(stereo=True, noise_px=1.0)
+    obs = problem.observations
+    last = obs.keyframe == problem.n_keyframes - 1
+    few = last & (np.cumsum(last) > 2)
+    loose = _without(problem, ~few)
+    state = solved(loose, options())
+    got = covariance.pose_covariances(loose, state, options(), none(loose))
+    assert np.isnan(got[-1]).all()
+    assert np.isfinite(got[:-1]).all()
+
+
+def test_the_weighted_squares_are_those_of_the_linearisation(make_problem: MakeProblem) -> None:
+    problem, _ = make_problem(stereo=True, depth=True, noise_px=2.0)
+    for loss in ("squared", "huber", "cauchy"):
+        measure = objective.Objective(problem, Rules("local", loss, 1.0, "constant"))
+        lin = measure.linearise(problem.start)
+        squares, rows = measure.weighted_squares(problem.start)
+        assert squares == pytest.approx(np.sum(lin.residual**2), rel=1e-12)
+        assert rows == int(np.count_nonzero(np.any(lin.d_point != 0.0, axis=2)))
