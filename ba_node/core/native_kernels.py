@@ -100,6 +100,7 @@ class NativeKernels:
             loss=_LOSSES.index(rules.loss),
             loss_scale=rules.loss_scale,
             cheirality=_CHEIRALITY.index(rules.cheirality),
+            threads=1,
             start=_arrays(problem.start),
         )
         self.n_free: int = self._kernel.n_free
@@ -139,7 +140,7 @@ class NativeKernels:
 
     def polish_points(self, state: State, steps: int) -> tuple[float, State]:
         """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
-        value, points = self._kernel.polish_points(_arrays(state), steps)
+        _before, value, points = self._kernel.polish_points(_arrays(state), steps)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
 
 

@@ -54,7 +54,13 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         gradient = structure.sum_points((transposed @ rows.residual[:, :, None])[..., 0])[active]
         diagonal = np.maximum(np.diagonal(c, axis1=1, axis2=2), _MIN_DIAGONAL)
         inverse = inverse_cholesky3(c + damping * diagonal[:, :, None] * np.eye(3))
-        points[active] -= (np.swapaxes(inverse, 1, 2) @ (inverse @ gradient[:, :, None]))[..., 0]
+        scaled = inverse @ gradient[:, :, None]
+        promising = np.sum(scaled * scaled, axis=(1, 2)) > _MIN_GAIN * cost[active]
+        move = (np.swapaxes(inverse, 1, 2) @ scaled)[..., 0]
+        active[active] = promising
+        if not active.any():
+            break
+        points[active] -= move[promising]
         damping *= 0.1
     total = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)]))
     return total, dataclasses.replace(state, points=best)

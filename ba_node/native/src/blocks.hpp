@@ -22,6 +22,17 @@ struct Column<6> {
   V8 a;
 };
 
+// A d x 3 block of an edge, by columns; for 9 the ninth rows together.
+template <int D>
+struct Edge {
+  V8 a[3];
+  V8 b;
+};
+template <>
+struct Edge<6> {
+  V8 a[3];
+};
+
 // A d x d block, by columns of eight rows; for 9 also the ninth row.
 template <int D>
 struct Block {
@@ -34,8 +45,6 @@ template <>
 struct Block<6> {
   V8 col[6];
 };
-
-inline double sum(V8 v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])); }
 
 template <class T>
 inline void clear(T* first, std::int64_t count) {
@@ -57,24 +66,22 @@ inline double dot(const Column<D>& x, const Column<D>& y) {
   return out;
 }
 
-// out += sign (three columns) v.
+// out += e v.
 template <int D>
-inline void add_scaled(Column<D>& out, const Column<D>* columns, const double* v, double sign) {
-  for (int c = 0; c < 3; ++c) {
-    out.a += columns[c].a * (sign * v[c]);
-    if constexpr (D == 9) out.b += columns[c].b * (sign * v[c]);
-  }
+inline void add_product(Column<D>& out, const Edge<D>& e, const double* v) {
+  out.a += e.a[0] * v[0] + e.a[1] * v[1] + e.a[2] * v[2];
+  if constexpr (D == 9) out.b += e.b[0] * v[0] + e.b[1] * v[1] + e.b[2] * v[2];
 }
 
-// s -= (three columns x) (three columns y)'.
+// s -= x y'.
 template <int D>
-inline void subtract_product(Block<D>& s, const Column<D>* x, const Column<D>* y) {
-  for (int c = 0; c < (D == 9 ? 8 : 6); ++c)
-    s.col[c] -= x[0].a * y[0].a[c] + x[1].a * y[1].a[c] + x[2].a * y[2].a[c];
+inline void subtract_product(Block<D>& s, const Edge<D>& x, const Edge<D>& y) {
+#pragma GCC unroll 8
+  for (int c = 0; c < (D == 9 ? 8 : 6); ++c) s.col[c] -= x.a[0] * y.a[0][c] + x.a[1] * y.a[1][c] + x.a[2] * y.a[2][c];
   if constexpr (D == 9) {
-    s.col[8] -= x[0].a * y[0].b + x[1].a * y[1].b + x[2].a * y[2].b;
-    s.row -= y[0].a * x[0].b + y[1].a * x[1].b + y[2].a * x[2].b;
-    s.corner -= x[0].b * y[0].b + x[1].b * y[1].b + x[2].b * y[2].b;
+    s.col[8] -= x.a[0] * y.b[0] + x.a[1] * y.b[1] + x.a[2] * y.b[2];
+    s.row -= y.a[0] * x.b[0] + y.a[1] * x.b[1] + y.a[2] * x.b[2];
+    s.corner -= x.b[0] * y.b[0] + x.b[1] * y.b[1] + x.b[2] * y.b[2];
   }
 }
 
@@ -82,16 +89,6 @@ template <int D>
 inline double entry(const Block<D>& s, int r, int c) {
   if constexpr (D == 9) {
     if (r == 8) return c == 8 ? s.corner : s.row[c];
-  }
-  return s.col[c][r];
-}
-
-// Of a symmetric block, whose ninth row is not kept.
-template <int D>
-inline double symmetric_entry(const Block<D>& s, int r, int c) {
-  if constexpr (D == 9) {
-    if (r == 8 && c == 8) return s.corner;
-    if (r == 8) return s.col[8][c];
   }
   return s.col[c][r];
 }

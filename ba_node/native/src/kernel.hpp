@@ -1,17 +1,21 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Normal equations of one problem, the Schur complement of the points, and back-substitution.
-// The equations stand in core/schur.py, which is this file's oracle.
+// The Schur complement of the points, S = B - E C^-1 E' with damped B and C, and back-substitution.
+// The equations stand in core/schur.py, which is this file's oracle. With C = L L' they need Z = E L^-T alone.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 #include "blocks.hpp"
+#include "equations.hpp"
 #include "layout.hpp"
+#include "polish.hpp"
+#include "pool.hpp"
 #include "rows.hpp"
 
 namespace ba {
@@ -19,19 +23,20 @@ namespace ba {
 template <int D>
 class Kernel {
  public:
-  Kernel(const ProblemView& problem, const Rules& rules, const StateView& start)
-      : l_(problem, D == 9), rows_(l_, rules, start) {
-    e_.resize(3 * l_.edge_column.size());
-    z_.resize(3 * l_.edge_column.size());
-    b_.resize(l_.n_free);
-    gradient_c_.resize(l_.n_free);
+  Kernel(const ProblemView& problem, const Rules& rules, const StateView& start, int threads)
+      : l_(problem, D == 9), rows_(l_, rules, start), pool_(threads), equations_(l_) {
+    z_.resize(l_.n_edges());
+    row_.resize(pool_.threads() * l_.n_free);
     rhs_.resize(l_.n_free);
     step_.resize(l_.n_free);
-    product_.resize(l_.n_free);
-    c_.resize(6 * l_.n_points);
-    gradient_p_.resize(3 * l_.n_points);
-    inverse_l_.resize(6 * l_.n_points);
-    scaled_gradient_.resize(3 * l_.n_points);
+    sums_.resize(l_.n_chunks() * l_.n_free);
+    inverse_l_.resize(6 * l_.n_batches);
+    scaled_gradient_.resize(3 * l_.n_batches);
+    damping_p_.resize(3 * l_.n_batches);
+    damping_c_.resize(l_.n_free * D);
+    part_.resize(l_.n_chunks());
+    const std::int64_t most = l_.n_batches ? l_.slot_begin[1] : 0;
+    for (int i = 0; i < pool_.threads(); ++i) images_.emplace_back(most);
   }
   // The parts refer to one another.
   Kernel(const Kernel&) = delete;
@@ -39,32 +44,75 @@ class Kernel {
 
   std::int64_t n_free() const { return l_.n_free; }
   std::int64_t n_points() const { return l_.n_points; }
-  double gradient_norm() const { return gradient_norm_; }
+  double gradient_norm() const { return equations_.gradient_norm; }
 
-  double objective(const StateView& s) { return rows_.objective(s); }
-  double polish_points(const StateView& s, double* points, int steps) { return rows_.polish_points(s, points, steps); }
-
-  double linearise(const StateView& s) {
+  double objective(const StateView& s) {
     rows_.load_images(s);
-    return rows_.with_lens([&](auto lens) { return linearise_as<decltype(lens)::value>(s); });
+    rows_.with_kind([&](auto lens, auto depth) {
+      pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+        part_[chunk].after = rows_.template objective<decltype(lens)::value, decltype(depth)::value>(chunk, s);
+      });
+    });
+    return total().after;
   }
+
+  // Improve each point alone, keyframes held. points: out.
+  Polished polish_points(const StateView& s, double* points, int steps) {
+    rows_.load_images(s);
+    rows_.with_kind([&](auto lens, auto depth) {
+      pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int thread) {
+        Images* images = images_[thread].data();
+        V8 before{}, after{};
+        for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+          V8 x[3], first, best;
+          rows_.load_points(i, s.points, x);
+          polish_batch<decltype(lens)::value, decltype(depth)::value>(rows_, l_.slot_begin[i], l_.slot_begin[i + 1], steps,
+                                                                      images, x, first, best);
+          rows_.store_points(i, x, points);
+          before += first;
+          after += select(best < std::numeric_limits<double>::infinity(), best, V8{});
+        }
+        part_[chunk] = {0.5 * sum(before), 0.5 * sum(after)};
+      });
+    });
+    return total();
+  }
+
+  double linearise(const StateView& s) { return equations_.linearise(rows_, s, pool_); }
 
   // diag(B) (n_free x D) and diag(C) (n_points x 3).
   void diagonals(double* d_c, double* d_p) const {
     for (std::int64_t k = 0; k < l_.n_free; ++k)
-      for (int i = 0; i < D; ++i) d_c[k * D + i] = symmetric_entry(b_[k], i, i);
-    for (std::int64_t p = 0; p < l_.n_points; ++p) {
-      d_p[3 * p] = c_[6 * p];
-      d_p[3 * p + 1] = c_[6 * p + 2];
-      d_p[3 * p + 2] = c_[6 * p + 5];
+      for (int i = 0; i < D; ++i) d_c[k * D + i] = entry(equations_.b[k], i, i);
+    for (std::int64_t i = 0; i < l_.n_batches; ++i) {
+      const V8* c = &equations_.c[6 * i];
+      const V8 d[3] = {c[0], c[2], c[5]};
+      rows_.store_points(i, d, d_p);
     }
   }
 
   // Add damping to the diagonals and factor C; everything below is of this damped system.
   void factor(const double* damping_c, const double* damping_p) {
-    damping_c_.assign(damping_c, damping_c + l_.n_free * D);
-    for (std::int64_t p = 0; p < l_.n_points; ++p) factor_point(p, damping_p + 3 * p);
-    reduce_gradient();
+    std::copy_n(damping_c, l_.n_free * D, damping_c_.data());
+    const bool depth = l_.has_depth;
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+      clear(&sums_[chunk * l_.n_free], l_.n_free);
+      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+        V8 damping[3];
+        rows_.load_points(i, damping_p, damping);
+        if (depth || l_.has_rigs) {
+          factor_batch<true>(i, damping, &sums_[chunk * l_.n_free]);
+        } else {
+          factor_batch<false>(i, damping, &sums_[chunk * l_.n_free]);
+        }
+      }
+    });
+    // -gc + Z L^-1 gp.
+    for (std::int64_t k = 0; k < l_.n_free; ++k) {
+      rhs_[k].a = -equations_.gradient_c[k].a;
+      if constexpr (D == 9) rhs_[k].b = -equations_.gradient_c[k].b;
+    }
+    add_sums(rhs_.data());
   }
 
   void rhs(double* out) const {
@@ -75,40 +123,41 @@ class Kernel {
   // S, symmetric, (n x n), n = n_free D.
   void dense(double* out) {
     const std::int64_t n = l_.n_free * D;
-    row_.resize(l_.n_free);
-    for (std::int64_t i = 0; i < l_.n_free; ++i) {
-      clear(&row_[i], l_.n_free - i);
-      add_row(i, [this](std::int32_t j) -> Block<D>& { return row_[j]; });
+    pool_.each(l_.n_free, [&](std::int64_t i, int thread) {
+      Block<D>* row = &row_[thread * l_.n_free];
+      clear(row + i, l_.n_free - i);
+      add_row(i, [row](std::int32_t j) -> Block<D>& { return row[j]; });
       for (std::int64_t j = i; j < l_.n_free; ++j) {
         double* block = out + i * D * n + j * D;
-        write_block(row_[j], block, n);
+        write_block(row[j], block, n);
         if (j == i) add_diagonal(i, block, n);
         for (int r = 0; r < D; ++r)
           for (int c = 0; c < D; ++c) out[(j * D + c) * n + i * D + r] = block[r * n + c];
       }
-    }
+    });
   }
 
   // The blocks of S that are not zero, both triangles: D x D each, with their rows and columns.
   void sparse(std::vector<double>& blocks, std::vector<std::int64_t>& rows, std::vector<std::int64_t>& columns) {
     std::vector<std::int32_t> place(l_.n_free, -1), touched;
+    Buffer<Block<D>> row;
     for (std::int64_t i = 0; i < l_.n_free; ++i) {
       touched.clear();
-      row_.clear();
+      row.clear();
       const auto find = [&](std::int32_t j) -> Block<D>& {
         if (place[j] < 0) {
           place[j] = static_cast<std::int32_t>(touched.size());
           touched.push_back(j);
-          row_.emplace_back();
-          clear(&row_.back(), 1);
+          row.emplace_back();
+          clear(&row.back(), 1);
         }
-        return row_[place[j]];
+        return row[place[j]];
       };
       find(static_cast<std::int32_t>(i));
       add_row(i, find);
       for (std::int32_t j : touched) {
         double block[D * D];
-        write_block(row_[place[j]], block, D);
+        write_block(row[place[j]], block, D);
         if (j == i) add_diagonal(i, block, D);
         for (int turned = 0; turned < (j == i ? 1 : 2); ++turned) {
           rows.push_back(turned ? j : i);
@@ -124,201 +173,225 @@ class Kernel {
   // S x without forming S.
   void product(const double* x, double* out) {
     load_step(x);
-    Buffer<Column<D>>& y = product_;
-    for (std::int64_t k = 0; k < l_.n_free; ++k) y[k] = multiply(b_[k], step_[k]);
-    for (std::int64_t p = 0; p < l_.n_points; ++p) {
-      double v[3];
-      project_step(p, z_.data(), v);
-      for (std::int64_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) add_scaled(y[l_.edge_column[e]], &z_[3 * e], v, -1.0);
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+      Column<D>* y = &sums_[chunk * l_.n_free];
+      clear(y, l_.n_free);
+      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+        V8 v[3];
+        project_step(i, v);
+        for (int l = 0; l < l_.lanes(i); ++l) {
+          const double w[3] = {v[0][l], v[1][l], v[2][l]};
+          for (std::int32_t e = l_.point_edge[kLanes * i + l]; e < l_.point_edge[kLanes * i + l + 1]; ++e)
+            add_product(y[l_.edge_column[e]], z_[e], w);
+        }
+      }
+    });
+    for (std::int64_t k = 0; k < l_.n_free; ++k) {
+      Column<D> y = multiply(equations_.b[k], step_[k]);
+      for (std::int64_t chunk = 0; chunk < l_.n_chunks(); ++chunk) {
+        y.a -= sums_[chunk * l_.n_free + k].a;
+        if constexpr (D == 9) y.b -= sums_[chunk * l_.n_free + k].b;
+      }
+      for (int i = 0; i < D; ++i) out[k * D + i] = at(y, i) + damping_c_[k * D + i] * x[k * D + i];
     }
-    for (std::int64_t k = 0; k < l_.n_free; ++k)
-      for (int i = 0; i < D; ++i) out[k * D + i] = at(y[k], i) + damping_c_[k * D + i] * x[k * D + i];
   }
 
   void diagonal_blocks(double* out) {
-    for (std::int64_t k = 0; k < l_.n_free; ++k) {
+    pool_.each(l_.n_free, [&](std::int64_t k, int) {
       Block<D> s;
       clear(&s, 1);
       for (std::int64_t i = l_.keyframe_edge[k]; i < l_.keyframe_edge[k + 1]; ++i) {
-        const Column<D>* z = &z_[3 * l_.edges_of_keyframe[i]];
+        const Edge<D>& z = z_[l_.edges_of_keyframe[i]];
         subtract_product(s, z, z);
       }
       write_block(s, out + k * D * D, D);
       add_diagonal(k, out + k * D * D, D);
-    }
+    });
   }
 
   // Step of the points for a step of the free keyframes (n_free x D); returns the reduction of the undamped model.
+  //
+  // With y = L^-1 gp, v = Z' step_c and w = -(y + v) the points' step is p = L^-T w, and as C + D = L L' the model's
+  // curvature is step_c' B step_c + 2 w'v + |w|^2 - p' D p: E is not needed.
   double back_substitute(const double* step_c, double* step_p) {
     load_step(step_c);
-    double slope = 0, curvature = 0;
-    for (std::int64_t k = 0; k < l_.n_free; ++k) {
-      slope += dot(gradient_c_[k], step_[k]);
-      curvature += dot(multiply(b_[k], step_[k]), step_[k]);
-    }
-    for (std::int64_t p = 0; p < l_.n_points; ++p) {
-      double v[3], coupling[3];
-      project_step(p, z_.data(), v);
-      project_step(p, e_.data(), coupling);
-      const double *li = &inverse_l_[6 * p], *y = &scaled_gradient_[3 * p];
-      for (int c = 0; c < 3; ++c) v[c] = -y[c] - v[c];
-      double* x = step_p + 3 * p;
-      x[0] = li[0] * v[0] + li[1] * v[1] + li[3] * v[2];
-      x[1] = li[2] * v[1] + li[4] * v[2];
-      x[2] = li[5] * v[2];
-      const double *c = &c_[6 * p], *g = &gradient_p_[3 * p];
-      slope += g[0] * x[0] + g[1] * x[1] + g[2] * x[2];
-      curvature += x[0] * (c[0] * x[0] + 2 * (c[1] * x[1] + c[3] * x[2] + coupling[0])) +
-                   x[1] * (c[2] * x[1] + 2 * (c[4] * x[2] + coupling[1])) + x[2] * (c[5] * x[2] + 2 * coupling[2]);
-    }
-    return -slope - 0.5 * curvature;
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+      V8 slope{}, curvature{};
+      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+        V8 v[3], w[3], x[3];
+        project_step(i, v);
+        const V8 *y = &scaled_gradient_[3 * i], *g = &equations_.gradient_p[3 * i], *d = &damping_p_[3 * i];
+        for (int c = 0; c < 3; ++c) w[c] = -(y[c] + v[c]);
+        upper_times(*reinterpret_cast<const Packed*>(&inverse_l_[6 * i]), w, x);
+        rows_.store_points(i, x, step_p);
+        for (int c = 0; c < 3; ++c) {
+          slope += g[c] * x[c];
+          curvature += w[c] * (2 * v[c] + w[c]) - d[c] * x[c] * x[c];
+        }
+      }
+      part_[chunk].after = -sum(slope) - 0.5 * sum(curvature);
+    });
+    double reduction = total().after;
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      reduction -= dot(equations_.gradient_c[k], step_[k]) + 0.5 * dot(multiply(equations_.b[k], step_[k]), step_[k]);
+    return reduction;
   }
 
  private:
-  template <Lens kLens>
-  double linearise_as(const StateView& s) {
-    clear(b_.data(), l_.n_free);
-    clear(gradient_c_.data(), l_.n_free);
-    clear(e_.data(), static_cast<std::int64_t>(e_.size()));
-    std::fill(c_.begin(), c_.end(), 0.0);
-    std::fill(gradient_p_.begin(), gradient_p_.end(), 0.0);
-    double total = 0;
-    for (std::int64_t first = 0; first < l_.n_obs; first += kLanes) {
-      const int count = static_cast<int>(std::min<std::int64_t>(kLanes, l_.n_obs - first));
-      Gathered g;
-      Projected q;
-      Residuals res;
-      alignas(64) PointRows jp;
-      rows_.template gather<kLens>(s, s.points, first, g);
-      project<kLens, true>(g.in, q);
-      rows_.residuals(g, q, first, res);
-      rows_.point_rows(g, q, res, first, jp);
-      for (int l = 0; l < count; ++l) total += res.cost[l];
-      const int rows = l_.has_depth ? 3 : 2;
-      for (int row = 0; row < rows; ++row)
-        for (int l = 0; l < kLanes; ++l) res.r[row][l] *= res.root[row == 2][l];
-      rows_.add_points(jp, res.r, first, count, c_.data(), gradient_p_.data());
-      add_keyframes(g, q, res, jp, first, count);
+  // L^-1, L^-1 gp and Z of a batch; adds Z L^-1 gp to `sums`. kGeneral: edges of several observations, or with depth.
+  template <bool kGeneral>
+  void factor_batch(std::int64_t batch, const V8 (&damping)[3], Column<D>* sums) {
+    Packed& li = *reinterpret_cast<Packed*>(&inverse_l_[6 * batch]);
+    V8 g[3], y[3], x[3];
+    for (int i = 0; i < 3; ++i) {
+      g[i] = equations_.gradient_p[3 * batch + i];
+      x[i] = equations_.point[3 * batch + i];
+      damping_p_[3 * batch + i] = damping[i];
     }
-    double norm2 = 0;
-    for (const auto& x : gradient_c_) norm2 += dot(x, x);
-    for (double x : gradient_p_) norm2 += x * x;
-    gradient_norm_ = std::sqrt(norm2);
-    return 0.5 * total;
+    inverse_cholesky(*reinterpret_cast<const Packed*>(&equations_.c[6 * batch]), damping, li);
+    lower_times(li, g, y);
+    for (int i = 0; i < 3; ++i) scaled_gradient_[3 * batch + i] = y[i];
+    V8 c[6] = {}, f[D == 9 ? 9 : 1] = {};
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
+      couple<kGeneral>(slot, c, f);
+      store_edges(slot, li, x, y, c, f, sums);
+    }
   }
 
-  void add_keyframes(const Gathered& g, const Projected& q, const Residuals& res, const PointRows& jp,
-                     std::int64_t first, int count) {
-    const int rows = l_.has_depth ? 3 : 2;
-    alignas(64) double jc[3][8][kLanes];
-    alignas(64) double k2[3][kLanes] = {};
-    for (int row = 0; row < rows; ++row) {
-      for (int l = 0; l < kLanes; ++l) {
-        const double a = jp[row][0][l], b = jp[row][1][l], c = jp[row][2][l];
-        const double x = g.point[0][l], y = g.point[1][l], z = g.point[2][l];
-        jc[row][0][l] = y * c - z * b;
-        jc[row][1][l] = z * a - x * c;
-        jc[row][2][l] = x * b - y * a;
-        jc[row][3][l] = a;
-        jc[row][4][l] = b;
-        jc[row][5][l] = c;
-        jc[row][6][l] = jc[row][7][l] = 0.0;
-        if constexpr (D == 9) {
-          if (row < 2) {
-            const double w = l_.inverse_sigma[first + l] * g.used[l] * res.root[0][l];
-            jc[row][6][l] = q.d_intrinsics[row][0][l] * w;
-            jc[row][7][l] = q.d_intrinsics[row][1][l] * w;
-            k2[row][l] = q.d_intrinsics[row][2][l] * w;
-          }
-        }
-      }
+  // sum a a' (packed) and, where intrinsics are free, sum i a' over the rows of the observations of an edge so far.
+  template <bool kGeneral>
+  [[gnu::always_inline]] void couple(std::int64_t slot, V8 (&c)[6], V8* f) const {
+    V8 t[8];
+    const auto read = [&](int line) {
+      const V8* record = &equations_.record[kLanes * slot * equations_.lines + line];
+      for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.lines];
+      transpose(t);
+    };
+    const auto add = [&c](const V8* a) {
+      c[0] += a[0] * a[0];
+      c[1] += a[1] * a[0];
+      c[2] += a[1] * a[1];
+      c[3] += a[2] * a[0];
+      c[4] += a[2] * a[1];
+      c[5] += a[2] * a[2];
+    };
+    if constexpr (kGeneral) {
+      const Mask same = load(&l_.same_edge[kLanes * slot]) != 0.0;
+      for (int i = 0; i < 6; ++i) c[i] = select(same, c[i], V8{});
+      for (int i = 0; i < (D == 9 ? 9 : 0); ++i) f[i] = select(same, f[i], V8{});
+    } else {
+      for (int i = 0; i < 6; ++i) c[i] = V8{};
+      for (int i = 0; i < (D == 9 ? 9 : 0); ++i) f[i] = V8{};
     }
-    for (int l = 0; l < count; ++l) {
-      const std::int32_t edge = l_.obs_edge[first + l];
-      if (edge < 0) continue;
-      const std::int32_t k = l_.edge_column[edge];
-      Block<D>& b = b_[k];
-      Column<D>* e = &e_[3 * static_cast<std::int64_t>(edge)];
-      Column<D>& gc = gradient_c_[k];
-      for (int row = 0; row < rows; ++row) {
-        V8 j;
-        for (int i = 0; i < 8; ++i) j[i] = jc[row][i][l];
-        for (int c = 0; c < (D == 9 ? 8 : 6); ++c) b.col[c] += j * jc[row][c][l];
-        gc.a += j * res.r[row][l];
-        for (int c = 0; c < 3; ++c) e[c].a += j * jp[row][c][l];
-        if constexpr (D == 9) {
-          const double last = k2[row][l];
-          b.col[8] += j * last;
-          b.corner += last * last;
-          gc.b += last * res.r[row][l];
-          for (int c = 0; c < 3; ++c) e[c].b += last * jp[row][c][l];
-        }
+    read(0);
+    add(t);
+    add(t + 3);
+    if constexpr (D == 9) {
+      V8 a[6];
+      for (int i = 0; i < 6; ++i) a[i] = t[i];
+      read(1);
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) f[3 * i + j] += t[i] * a[j] + t[3 + i] * a[3 + j];
+    }
+    if constexpr (kGeneral) {
+      if (l_.has_depth) {
+        read(equations_.lines - 1);
+        add(t);
       }
     }
   }
 
-  void factor_point(std::int64_t p, const double* damping) {
-    double* li = &inverse_l_[6 * p];
-    inverse_cholesky(&c_[6 * p], damping, li);
-    const double* g = &gradient_p_[3 * p];
-    double* y = &scaled_gradient_[3 * p];
-    y[0] = li[0] * g[0];
-    y[1] = li[1] * g[0] + li[2] * g[1];
-    y[2] = li[3] * g[0] + li[4] * g[1] + li[5] * g[2];
-    for (std::int64_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
-      const Column<D>* in = &e_[3 * e];
-      Column<D>* out = &z_[3 * e];
-      out[0].a = in[0].a * li[0];
-      out[1].a = in[0].a * li[1] + in[1].a * li[2];
-      out[2].a = in[0].a * li[3] + in[1].a * li[4] + in[2].a * li[5];
+  // Z of the edges that end in a slot: with E = (x x C; C; F), its columns from those of C L^-T and F L^-T.
+  [[gnu::always_inline]] void store_edges(std::int64_t slot, const Packed& li, const V8 (&x)[3], const V8 (&y)[3],
+                                          const V8 (&c)[6], const V8* f, Column<D>* sums) {
+    const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
+    V8 columns[3][8], ninth[8] = {};
+    for (int i = 0; i < 3; ++i) {
+      V8 w[3];
+      const V8* a = full[i];
+      w[0] = a[0] * li[0];
+      w[1] = a[0] * li[1] + a[1] * li[2];
+      w[2] = a[0] * li[3] + a[1] * li[4] + a[2] * li[5];
+      for (int col = 0; col < 3; ++col) columns[col][3 + i] = w[col];
       if constexpr (D == 9) {
-        out[0].b = in[0].b * li[0];
-        out[1].b = in[0].b * li[1] + in[1].b * li[2];
-        out[2].b = in[0].b * li[3] + in[1].b * li[4] + in[2].b * li[5];
+        const V8* b = f + 3 * i;
+        w[0] = b[0] * li[0];
+        w[1] = b[0] * li[1] + b[1] * li[2];
+        w[2] = b[0] * li[3] + b[1] * li[4] + b[2] * li[5];
+        for (int col = 0; col < 3; ++col) (i < 2 ? columns[col][6 + i] : ninth[col]) = w[col];
       }
+    }
+    for (int col = 0; col < 3; ++col) {
+      pose_row(x, columns[col] + 3, columns[col]);
+      if constexpr (D == 6) columns[col][6] = columns[col][7] = V8{};
+      transpose(columns[col]);
+    }
+    if constexpr (D == 9) transpose(ninth);
+    const std::int32_t* edge = &l_.slot_edge[kLanes * slot];
+    for (int l = 0; l < kLanes; ++l) {
+      if (edge[l] < 0) continue;
+      Edge<D>& z = z_[edge[l]];
+      for (int col = 0; col < 3; ++col) z.a[col] = columns[col][l];
+      if constexpr (D == 9) z.b = ninth[l];
+      const double v[3] = {y[0][l], y[1][l], y[2][l]};
+      add_product(sums[l_.edge_column[edge[l]]], z, v);
     }
   }
 
-  // -gc + Z L^-1 gp.
-  void reduce_gradient() {
-    for (std::int64_t k = 0; k < l_.n_free; ++k) {
-      rhs_[k].a = -gradient_c_[k].a;
-      if constexpr (D == 9) rhs_[k].b = -gradient_c_[k].b;
-    }
-    for (std::int64_t p = 0; p < l_.n_points; ++p)
-      for (std::int64_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e)
-        add_scaled(rhs_[l_.edge_column[e]], &z_[3 * e], &scaled_gradient_[3 * p], 1.0);
-  }
-
-  // Sum over the edges of a point of (three columns)' (the keyframe's step).
-  void project_step(std::int64_t p, const Column<D>* columns, double* out) const {
-    V8 acc[3] = {};
-    double last[3] = {};
-    for (std::int64_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
-      const Column<D>& x = step_[l_.edge_column[e]];
-      for (int c = 0; c < 3; ++c) {
-        acc[c] += columns[3 * e + c].a * x.a;
-        if constexpr (D == 9) last[c] += columns[3 * e + c].b * x.b;
+  // Z' step of a batch: sums over the edges of each point.
+  [[gnu::always_inline]] void project_step(std::int64_t batch, V8 (&out)[3]) const {
+    V8 acc[3][8], last[8];
+    for (int l = 0; l < kLanes; ++l) {
+      V8 a[3] = {}, b{};
+      const std::int64_t p = kLanes * batch + l;
+      for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
+        const Column<D>& x = step_[l_.edge_column[e]];
+        for (int c = 0; c < 3; ++c) a[c] += z_[e].a[c] * x.a;
+        if constexpr (D == 9) b += z_[e].b * x.b;
       }
+      for (int c = 0; c < 3; ++c) acc[c][l] = a[c];
+      last[l] = b;
     }
-    for (int c = 0; c < 3; ++c) out[c] = sum(acc[c]) + last[c];
+    for (int c = 0; c < 3; ++c) out[c] = sums(acc[c]);
+    if constexpr (D == 9) {
+      transpose(last);
+      for (int c = 0; c < 3; ++c) out[c] += last[c];
+    }
   }
 
   // Row i of -Z Z' from the diagonal on; `block` finds the block of a column.
   template <class Find>
-  void add_row(std::int64_t i, Find block) {
+  void add_row(std::int64_t i, Find block) const {
     for (std::int64_t k = l_.keyframe_edge[i]; k < l_.keyframe_edge[i + 1]; ++k) {
-      const std::int64_t e = l_.edges_of_keyframe[k], end = l_.edge_point_end[e];
-      for (std::int64_t f = e; f < end; ++f) subtract_product(block(l_.edge_column[f]), &z_[3 * e], &z_[3 * f]);
+      const std::int32_t e = l_.edges_of_keyframe[k], end = l_.edge_end[e];
+      for (std::int32_t f = e; f < end; ++f) subtract_product(block(l_.edge_column[f]), z_[e], z_[f]);
     }
   }
 
   // B and the damping of keyframe k, onto its diagonal block.
   void add_diagonal(std::int64_t k, double* out, std::int64_t stride) const {
     for (int r = 0; r < D; ++r) {
-      for (int c = 0; c < D; ++c) out[r * stride + c] += symmetric_entry(b_[k], r, c);
+      for (int c = 0; c < D; ++c) out[r * stride + c] += entry(equations_.b[k], r, c);
       out[r * (stride + 1)] += damping_c_[k * D + r];
     }
+  }
+
+  void add_sums(Column<D>* out) const {
+    for (std::int64_t chunk = 0; chunk < l_.n_chunks(); ++chunk) {
+      for (std::int64_t k = 0; k < l_.n_free; ++k) {
+        out[k].a += sums_[chunk * l_.n_free + k].a;
+        if constexpr (D == 9) out[k].b += sums_[chunk * l_.n_free + k].b;
+      }
+    }
+  }
+
+  Polished total() const {
+    Polished out;
+    for (const Polished& part : part_) {
+      out.before += part.before;
+      out.after += part.after;
+    }
+    return out;
   }
 
   void load_step(const double* step) {
@@ -332,11 +405,15 @@ class Kernel {
 
   Layout l_;
   Rows rows_;
-  double gradient_norm_ = 0;
-  Buffer<Block<D>> b_, row_;
-  Buffer<Column<D>> e_, z_, gradient_c_, rhs_, step_, product_;
-  Buffer<double> c_, gradient_p_, inverse_l_, scaled_gradient_;
+  Pool pool_;
+  Equations<D> equations_;
+  Buffer<Edge<D>> z_;
+  Buffer<Block<D>> row_;
+  Buffer<Column<D>> rhs_, step_, sums_;  // sums_: of each chunk
+  Buffer<V8> inverse_l_, scaled_gradient_, damping_p_;
   std::vector<double> damping_c_;
+  std::vector<Polished> part_;
+  std::vector<Buffer<Images>> images_;
 };
 
 }  // namespace ba

@@ -1,12 +1,18 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A problem sorted for the kernels: observations by point and keyframe, edges, images. Made once, then only read.
+// A problem sorted for the kernels: points in batches of eight, observations in slots, edges, images. Made once, then
+// only read.
+//
+// A lane is a point. Points are numbered anew by their number of observations, most first, so that the eight of a batch
+// have about as many; slot j of a batch holds observation j of each. Lanes that have fewer are padded. So sums over the
+// observations of a point need no gathering, and neither do the points.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <numeric>
 #include <vector>
 
 #include "project.hpp"
@@ -30,92 +36,72 @@ struct StateView {
 
 class Layout {
  public:
-  explicit Layout(const ProblemView& p, bool own_intrinsics) : own_intrinsics(own_intrinsics) {
-    sort_observations(p);
-    copy_cameras(p);
-    find_edges();
-    index_edges_by_keyframe();
-    find_images();
-  }
-
-  // Whether every keyframe has its own f, k1, k2.
-  bool own_intrinsics;
-  bool has_depth = false;
-  Lens lens = Lens::kPinhole;
-  std::int64_t n_keyframes = 0, n_points = 0, n_obs = 0, n_cameras = 0, n_free = 0;
-  // Observations, padded to whole registers by repeating the last one. obs_edge is -1 where the keyframe is fixed.
-  std::vector<std::int32_t> obs_keyframe, obs_camera, obs_point, obs_image, obs_edge;
-  Buffer<double> u, v, inverse_sigma, depth, inverse_depth_sigma;
-  // Edges: distinct (point, free keyframe), sorted; those of point p are point_edge[p] to point_edge[p + 1].
-  std::vector<std::int32_t> edge_column;
-  std::vector<std::int64_t> point_edge, edge_point_end;
-  // The same by keyframe: edges_of_keyframe[keyframe_edge[k]] to [keyframe_edge[k + 1]].
-  std::vector<std::int64_t> keyframe_edge, edges_of_keyframe;
-  // Images: distinct keyframe * n_cameras + camera.
-  std::vector<std::int64_t> images;
-  std::vector<double> camera_rotation, camera_translation, params;
-  std::vector<std::uint8_t> model;
-
- private:
-  // Up to this many (keyframe, camera) pairs images are numbered by a table, beyond it by searching.
-  static constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
-
-  std::vector<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
-
-  void sort_observations(const ProblemView& p) {
+  Layout(const ProblemView& p, bool own_intrinsics) : own_intrinsics(own_intrinsics) {
     n_keyframes = p.n_keyframes;
     n_points = p.n_points;
     n_obs = p.n_obs;
     n_cameras = p.n_cameras;
     has_depth = p.depth != nullptr;
-    column_.assign(n_keyframes, -1);
-    n_free = 0;
-    for (std::int64_t k = 0; k < n_keyframes; ++k)
-      if (!p.fixed[k]) column_[k] = static_cast<std::int32_t>(n_free++);
-    // Order by (point, keyframe): rows of one edge stand together.
-    std::vector<std::int64_t> order(n_obs);
-    for (std::int64_t i = 0; i < n_obs; ++i) order[i] = i;
-    const auto before = [&p](std::int64_t a, std::int64_t b) {
-      return p.point[a] != p.point[b] ? p.point[a] < p.point[b] : p.keyframe[a] < p.keyframe[b];
-    };
-    // The back-end's windows come in this order already.
-    if (!std::is_sorted(order.begin(), order.end(), before)) std::stable_sort(order.begin(), order.end(), before);
-    const std::int64_t padded = (n_obs + kLanes - 1) / kLanes * kLanes;
-    obs_keyframe.resize(padded);
-    obs_camera.resize(padded);
-    obs_point.resize(padded);
-    u.resize(padded);
-    v.resize(padded);
-    inverse_sigma.resize(padded);
-    if (has_depth) {
-      depth.resize(padded);
-      inverse_depth_sigma.resize(padded);
-    }
-    for (std::int64_t i = 0; i < padded; ++i) {
-      const std::int64_t o = order[std::min(i, n_obs - 1)];
-      obs_keyframe[i] = static_cast<std::int32_t>(p.keyframe[o]);
-      obs_camera[i] = static_cast<std::int32_t>(p.camera[o]);
-      obs_point[i] = static_cast<std::int32_t>(p.point[o]);
-      u[i] = p.uv[2 * o];
-      v[i] = p.uv[2 * o + 1];
-      inverse_sigma[i] = 1.0 / p.sigma[o];
-      if (has_depth) {
-        const bool measured = !std::isnan(p.depth[o]);
-        depth[i] = measured ? p.depth[o] : 0.0;
-        inverse_depth_sigma[i] = measured ? 1.0 / p.depth_sigma[o] : 0.0;
-      }
-    }
+    copy_cameras(p);
+    number_keyframes(p);
+    const std::vector<std::int64_t> order = sorted(p), first = number_points(p);
+    number_images(p);
+    fill_slots(p, order, first);
+    find_edges(p, order, first);
+    index_by_keyframe();
+    cut_chunks();
   }
+
+  // Whether every keyframe has its own f, k1, k2.
+  bool own_intrinsics;
+  bool has_depth = false;
+  // Whether a keyframe sees a point in more than one image.
+  bool has_rigs = false;
+  Lens lens = Lens::kPinhole;
+  std::int64_t n_keyframes = 0, n_points = 0, n_obs = 0, n_cameras = 0, n_free = 0, n_batches = 0;
+  // The caller's number of each point of ours; the last is repeated to fill the last batch.
+  std::vector<std::int32_t> point;
+  // Slots of batch b: slot_begin[b] to slot_begin[b + 1]. By slot and lane: image, edge that ends here (or -1), whether
+  // the edge is that of the slot before, what was measured. inverse_sigma is 0 where there is nothing.
+  std::vector<std::int64_t> slot_begin;
+  std::vector<std::int32_t> slot_image, slot_edge;
+  Buffer<double> same_edge, u, v, inverse_sigma, depth, inverse_depth_sigma;
+  // Edges: distinct (point, free keyframe), sorted; those of our point p are point_edge[p] to point_edge[p + 1].
+  std::vector<std::int32_t> edge_column, point_edge, edge_end;  // edge_end: of the edges of the same point
+  // The same by keyframe: edges_of_keyframe[keyframe_edge[k]] to [keyframe_edge[k + 1]].
+  std::vector<std::int64_t> keyframe_edge;
+  std::vector<std::int32_t> edges_of_keyframe;
+  // Observations (8 slot + lane) by free keyframe, and their points (of ours), filled up to whole registers by -1.
+  std::vector<std::int64_t> keyframe_seen;
+  std::vector<std::int32_t> seen, seen_point;
+  // Images: distinct keyframe * n_cameras + camera.
+  std::vector<std::int64_t> images;
+  // Parts of the batches, about equal, that can be worked on at the same time; the problem alone decides them.
+  std::vector<std::int64_t> chunks;
+  std::vector<double> camera_rotation, camera_translation, params;
+  std::vector<std::uint8_t> model;
+
+  std::int64_t n_slots() const { return slot_begin.back(); }
+  std::int64_t n_edges() const { return static_cast<std::int64_t>(edge_column.size()); }
+  std::int64_t n_chunks() const { return static_cast<std::int64_t>(chunks.size()) - 1; }
+  // Lanes of a batch that are points, not padding.
+  int lanes(std::int64_t batch) const {
+    return static_cast<int>(std::min<std::int64_t>(kLanes, n_points - kLanes * batch));
+  }
+
+ private:
+  // Up to this many (keyframe, camera) pairs images are numbered by a table, beyond it by searching.
+  static constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
+  static constexpr std::int64_t kMaxChunks = 32, kMinChunkSlots = 64;
+
+  std::vector<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
+  std::vector<std::int32_t> table_;   // image of each (keyframe, camera), if there are few
 
   void copy_cameras(const ProblemView& p) {
     camera_rotation.assign(p.camera_rotation, p.camera_rotation + 9 * n_cameras);
     camera_translation.assign(p.camera_translation, p.camera_translation + 3 * n_cameras);
     params.assign(p.params, p.params + kParams * n_cameras);
     model.assign(p.model, p.model + n_cameras);
-    choose_lens();
-  }
-
-  void choose_lens() {
     lens = own_intrinsics ? Lens::kRadial : Lens::kPinhole;
     for (std::int64_t c = 0; c < n_cameras; ++c) {
       const double* k = &params[kParams * c];
@@ -127,60 +113,171 @@ class Layout {
     }
   }
 
-  void find_edges() {
-    point_edge.assign(n_points + 1, 0);
-    obs_edge.assign(obs_keyframe.size(), -1);
-    std::int64_t i = 0;
-    for (std::int64_t p = 0; p < n_points; ++p) {
-      std::int32_t last = -1;
-      for (; i < n_obs && obs_point[i] == p; ++i) {
-        const std::int32_t column = column_[obs_keyframe[i]];
-        if (column < 0) continue;
-        if (column != last) edge_column.push_back(column);
-        last = column;
-        obs_edge[i] = static_cast<std::int32_t>(edge_column.size()) - 1;
-      }
-      point_edge[p + 1] = static_cast<std::int64_t>(edge_column.size());
-    }
+  void number_keyframes(const ProblemView& p) {
+    column_.assign(n_keyframes, -1);
+    for (std::int64_t k = 0; k < n_keyframes; ++k)
+      if (!p.fixed[k]) column_[k] = static_cast<std::int32_t>(n_free++);
   }
 
-  void index_edges_by_keyframe() {
-    keyframe_edge.assign(n_free + 1, 0);
-    for (std::int32_t k : edge_column) ++keyframe_edge[k + 1];
-    for (std::int64_t k = 0; k < n_free; ++k) keyframe_edge[k + 1] += keyframe_edge[k];
-    edges_of_keyframe.resize(edge_column.size());
-    edge_point_end.resize(edge_column.size());
-    std::vector<std::int64_t> next(keyframe_edge.begin(), keyframe_edge.end() - 1);
-    for (std::int64_t p = 0; p < n_points; ++p) {
-      for (std::int64_t e = point_edge[p]; e < point_edge[p + 1]; ++e) {
-        edges_of_keyframe[next[edge_column[e]]++] = e;
-        edge_point_end[e] = point_edge[p + 1];
-      }
-    }
-  }
-
-  void find_images() {
-    const auto key = [this](std::size_t o) {
-      return static_cast<std::int64_t>(obs_keyframe[o]) * n_cameras + obs_camera[o];
+  // Order of the observations by (point, keyframe); empty if that is theirs already, as in the back-end's windows.
+  std::vector<std::int64_t> sorted(const ProblemView& p) const {
+    const auto before = [&p](std::int64_t a, std::int64_t b) {
+      return p.point[a] != p.point[b] ? p.point[a] < p.point[b] : p.keyframe[a] < p.keyframe[b];
     };
-    obs_image.resize(obs_keyframe.size());
-    if (n_keyframes * n_cameras <= kTableLimit) {
-      std::vector<std::int32_t> number(n_keyframes * n_cameras, -1);
-      for (std::size_t o = 0; o < obs_keyframe.size(); ++o) number[key(o)] = 0;
-      for (std::int64_t i = 0; i < n_keyframes * n_cameras; ++i) {
-        if (number[i] < 0) continue;
-        number[i] = static_cast<std::int32_t>(images.size());
-        images.push_back(i);
-      }
-      for (std::size_t o = 0; o < obs_keyframe.size(); ++o) obs_image[o] = number[key(o)];
+    std::int64_t i = 1;
+    while (i < n_obs && !before(i, i - 1)) ++i;
+    if (i >= n_obs) return {};
+    std::vector<std::int64_t> order(n_obs);
+    std::iota(order.begin(), order.end(), std::int64_t{0});
+    std::stable_sort(order.begin(), order.end(), before);
+    return order;
+  }
+
+  // Number points and give batches their slots; returns where each of our points' observations begin, and how many.
+  std::vector<std::int64_t> number_points(const ProblemView& p) {
+    std::vector<std::int64_t> begin(n_points + 1, 0);
+    for (std::int64_t o = 0; o < n_obs; ++o) ++begin[p.point[o] + 1];
+    const std::int64_t most = *std::max_element(begin.begin(), begin.end());
+    std::vector<std::int64_t> place(most + 2, 0);  // of the points with so many observations, most first
+    for (std::int64_t i = 0; i < n_points; ++i) ++place[most - begin[i + 1] + 1];
+    std::partial_sum(place.begin(), place.end(), place.begin());
+    n_batches = (n_points + kLanes - 1) / kLanes;
+    point.resize(kLanes * n_batches);
+    for (std::int64_t i = 0; i < n_points; ++i) point[place[most - begin[i + 1]]++] = static_cast<std::int32_t>(i);
+    for (std::int64_t i = n_points; i < kLanes * n_batches; ++i) point[i] = point[n_points - 1];
+    slot_begin.assign(n_batches + 1, 0);
+    for (std::int64_t b = 0; b < n_batches; ++b) slot_begin[b + 1] = slot_begin[b] + begin[point[kLanes * b] + 1];
+    std::partial_sum(begin.begin(), begin.end(), begin.begin());
+    std::vector<std::int64_t> first(2 * point.size(), 0);
+    for (std::int64_t i = 0; i < n_points; ++i) {
+      first[2 * i] = begin[point[i]];
+      first[2 * i + 1] = begin[point[i] + 1] - begin[point[i]];
+    }
+    return first;
+  }
+
+  std::int64_t image_key(const ProblemView& p, std::int64_t o) const { return p.keyframe[o] * n_cameras + p.camera[o]; }
+
+  void number_images(const ProblemView& p) {
+    const std::int64_t pairs = n_keyframes * n_cameras;
+    if (pairs > kTableLimit) {
+      images.resize(n_obs);
+      for (std::int64_t o = 0; o < n_obs; ++o) images[o] = image_key(p, o);
+      std::sort(images.begin(), images.end());
+      images.erase(std::unique(images.begin(), images.end()), images.end());
       return;
     }
-    for (std::size_t o = 0; o < obs_keyframe.size(); ++o) images.push_back(key(o));
-    std::sort(images.begin(), images.end());
-    images.erase(std::unique(images.begin(), images.end()), images.end());
-    for (std::size_t o = 0; o < obs_keyframe.size(); ++o)
-      obs_image[o] =
-          static_cast<std::int32_t>(std::lower_bound(images.begin(), images.end(), key(o)) - images.begin());
+    table_.assign(pairs, -1);
+    for (std::int64_t o = 0; o < n_obs; ++o) table_[image_key(p, o)] = 0;
+    for (std::int64_t i = 0; i < pairs; ++i) {
+      if (table_[i] < 0) continue;
+      table_[i] = static_cast<std::int32_t>(images.size());
+      images.push_back(i);
+    }
+  }
+
+  std::int32_t image_of(std::int64_t key) const {
+    if (!table_.empty()) return table_[key];
+    return static_cast<std::int32_t>(std::lower_bound(images.begin(), images.end(), key) - images.begin());
+  }
+
+  void fill_slots(const ProblemView& p, const std::vector<std::int64_t>& order, const std::vector<std::int64_t>& first) {
+    const std::int64_t size = kLanes * n_slots();
+    slot_image.assign(size, 0);
+    u.assign(size, 0.0);
+    v.assign(size, 0.0);
+    inverse_sigma.assign(size, 0.0);
+    depth.assign(has_depth ? size : 0, 0.0);
+    inverse_depth_sigma.assign(depth.size(), 0.0);
+    for (std::int64_t i = 0; i < n_points; ++i) {
+      for (std::int64_t j = 0; j < first[2 * i + 1]; ++j) {
+        const std::int64_t o = order.empty() ? first[2 * i] + j : order[first[2 * i] + j];
+        const std::int64_t at = kLanes * (slot_begin[i / kLanes] + j) + i % kLanes;
+        slot_image[at] = image_of(image_key(p, o));
+        u[at] = p.uv[2 * o];
+        v[at] = p.uv[2 * o + 1];
+        inverse_sigma[at] = 1.0 / p.sigma[o];
+        if (has_depth && !std::isnan(p.depth[o])) {
+          depth[at] = p.depth[o];
+          inverse_depth_sigma[at] = 1.0 / p.depth_sigma[o];
+        }
+      }
+    }
+  }
+
+  void find_edges(const ProblemView& p, const std::vector<std::int64_t>& order, const std::vector<std::int64_t>& first) {
+    slot_edge.assign(slot_image.size(), -1);
+    same_edge.assign(slot_image.size(), 0.0);
+    point_edge.assign(point.size() + 1, 0);
+    edge_column.reserve(n_obs);
+    for (std::int64_t i = 0; i < n_points; ++i) {
+      std::int32_t last = -1;
+      for (std::int64_t j = 0; j < first[2 * i + 1]; ++j) {
+        const std::int64_t o = order.empty() ? first[2 * i] + j : order[first[2 * i] + j];
+        const std::int64_t at = kLanes * (slot_begin[i / kLanes] + j) + i % kLanes;
+        const std::int32_t column = column_[p.keyframe[o]];
+        if (column < 0) continue;
+        if (column == last) {
+          has_rigs = true;
+          same_edge[at] = 1.0;
+          slot_edge[at - kLanes] = -1;
+        } else {
+          edge_column.push_back(column);
+        }
+        slot_edge[at] = static_cast<std::int32_t>(edge_column.size()) - 1;
+        last = column;
+      }
+      point_edge[i + 1] = static_cast<std::int32_t>(edge_column.size());
+    }
+    for (std::size_t i = n_points; i < point.size(); ++i) point_edge[i + 1] = point_edge[i];
+  }
+
+  void index_by_keyframe() {
+    keyframe_edge.assign(n_free + 1, 0);
+    for (std::int32_t k : edge_column) ++keyframe_edge[k + 1];
+    std::partial_sum(keyframe_edge.begin(), keyframe_edge.end(), keyframe_edge.begin());
+    edges_of_keyframe.resize(edge_column.size());
+    edge_end.resize(edge_column.size());
+    std::vector<std::int64_t> next(keyframe_edge.begin(), keyframe_edge.end() - 1);
+    for (std::int64_t p = 0; p < n_points; ++p) {
+      for (std::int32_t e = point_edge[p]; e < point_edge[p + 1]; ++e) {
+        edges_of_keyframe[next[edge_column[e]]++] = e;
+        edge_end[e] = point_edge[p + 1];
+      }
+    }
+    list_seen();
+  }
+
+  void list_seen() {
+    const auto each = [this](auto take) {
+      for (std::int64_t b = 0; b < n_batches; ++b)
+        for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at)
+          if (inverse_sigma[at] != 0.0) take(column_[images[slot_image[at]] / n_cameras], at, kLanes * b + at % kLanes);
+    };
+    keyframe_seen.assign(n_free + 1, 0);
+    each([this](std::int32_t k, std::int64_t, std::int64_t) {
+      if (k >= 0) ++keyframe_seen[k + 1];
+    });
+    for (std::int64_t k = 0; k < n_free; ++k)
+      keyframe_seen[k + 1] = keyframe_seen[k] + (keyframe_seen[k + 1] + kLanes - 1) / kLanes * kLanes;
+    seen.assign(keyframe_seen[n_free], -1);
+    seen_point.assign(seen.size(), 0);
+    std::vector<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
+    each([this, &next](std::int32_t k, std::int64_t at, std::int64_t p) {
+      if (k < 0) return;
+      seen[next[k]] = static_cast<std::int32_t>(at);
+      seen_point[next[k]++] = static_cast<std::int32_t>(p);
+    });
+  }
+
+  void cut_chunks() {
+    const std::int64_t count = std::clamp<std::int64_t>(n_slots() / kMinChunkSlots, 1, kMaxChunks);
+    chunks.push_back(0);
+    for (std::int64_t i = 1; i <= count; ++i) {
+      const auto end = std::lower_bound(slot_begin.begin(), slot_begin.end(), n_slots() * i / count);
+      chunks.push_back(std::max<std::int64_t>(chunks.back(), end - slot_begin.begin()));
+    }
+    chunks.back() = n_batches;
   }
 };
 

@@ -75,7 +75,8 @@ template <int D>
 ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point, const Doubles& uv, const Doubles& sigma,
                     const Doubles& depth, const Doubles& depth_sigma, const Doubles& camera_rotation,
                     const Doubles& camera_translation, const Array<std::uint8_t>& model, const Doubles& params,
-                    const Array<bool>& fixed, int loss, double loss_scale, int cheirality, const StateArrays& start) {
+                    const Array<bool>& fixed, int loss, double loss_scale, int cheirality, int threads,
+                    const StateArrays& start) {
   ba::ProblemView problem =
       view(keyframe, camera, point, uv, sigma, camera_rotation, camera_translation, model, params, start);
   problem.depth = depth.size() ? depth.data() : nullptr;
@@ -84,7 +85,7 @@ ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point,
   const ba::Rules rules{static_cast<ba::Loss>(loss), loss_scale, static_cast<ba::Cheirality>(cheirality)};
   const ba::StateView state = view(start);
   py::gil_scoped_release release;
-  return new ba::Kernel<D>(problem, rules, state);
+  return new ba::Kernel<D>(problem, rules, state, threads);
 }
 
 template <int D>
@@ -106,7 +107,7 @@ void bind(py::module_& m, const char* name) {
       .def(py::init(&make<D>), py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"), py::arg("uv"),
            py::arg("sigma_px"), py::arg("depth_m"), py::arg("depth_sigma_m"), py::arg("camera_rotation"),
            py::arg("camera_translation"), py::arg("camera_model"), py::arg("camera_params"), py::arg("fixed"),
-           py::arg("loss"), py::arg("loss_scale"), py::arg("cheirality"), py::arg("start"))
+           py::arg("loss"), py::arg("loss_scale"), py::arg("cheirality"), py::arg("threads"), py::arg("start"))
       .def_property_readonly("n_free", &K::n_free)
       .def_property_readonly("gradient_norm", &K::gradient_norm)
       .def("linearise",
@@ -124,13 +125,12 @@ void bind(py::module_& m, const char* name) {
              const Doubles& start = std::get<2>(s);
              Doubles points = empty({start.shape(0), 3});
              double* out = points.mutable_data();
-             std::copy_n(start.data(), start.size(), out);
-             double value = 0;
+             ba::Polished value;
              {
                py::gil_scoped_release release;
                value = k.polish_points(view(s), out, steps);
              }
-             return py::make_tuple(value, points);
+             return py::make_tuple(value.before, value.after, points);
            })
       .def("diagonals",
            [](const K& k) {

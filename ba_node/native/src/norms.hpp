@@ -28,24 +28,25 @@ inline void in_camera(const ProblemView& p, const StateView& s, std::int64_t o, 
 
 template <Lens kLens>
 void residual_norms_as(const ProblemView& p, const StateView& s, double* out) {
-  Lanes in{};
-  Projected q;
   for (std::int64_t first = 0; first < p.n_obs; first += kLanes) {
     const int count = static_cast<int>(std::min<std::int64_t>(kLanes, p.n_obs - first));
+    V8 x[3] = {};
+    Cameras cameras{};
     for (int l = 0; l < kLanes; ++l) {
       const std::int64_t o = first + std::min(l, count - 1);
-      double x[3];
-      in_camera(p, s, o, x);
-      for (int i = 0; i < 3; ++i) in.x[i][l] = x[i];
-      for (int i = 0; i < kParams; ++i) in.param[i][l] = p.params[kParams * p.camera[o] + i];
-      in.fisheye[l] = p.model[p.camera[o]];
+      double y[3];
+      in_camera(p, s, o, y);
+      for (int i = 0; i < 3; ++i) x[i][l] = y[i];
+      for (int i = 0; i < kParams; ++i) cameras.param[i][l] = p.params[kParams * p.camera[o] + i];
+      cameras.fisheye[l] = p.model[p.camera[o]];
     }
-    project<kLens, false>(in, q);
+    Projected q;
+    project<kLens, false>(x, cameras, q);
     for (int l = 0; l < count; ++l) {
       const std::int64_t o = first + l;
       const double du = q.uv[0][l] - p.uv[2 * o], dv = q.uv[1][l] - p.uv[2 * o + 1];
       const double norm = std::sqrt(du * du + dv * dv) / p.sigma[o];
-      const bool counts = in.x[2][l] > kMinDepth && !std::isnan(norm);
+      const bool counts = x[2][l] > kMinDepth && !std::isnan(norm);
       out[o] = counts ? norm : std::numeric_limits<double>::infinity();
     }
   }
