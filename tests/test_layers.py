@@ -22,7 +22,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "window": ("window",),
     "backend": ("backend",),
     "services": ("messages", "io", "evaluation", "synthetic"),
-    "tools": ("ros", "offline", "cli"),
+    "tools": ("ros", "offline", "thesis", "cli"),
 }
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
@@ -30,7 +30,8 @@ SAME = {
     "scene": {"measurements"},
     "io": {"messages"},
     "offline": {"ros"},
-    "cli": {"offline", "ros"},
+    "thesis": {"offline"},
+    "cli": {"offline", "ros", "thesis"},
 }
 ROS_ONLY = (
     "rclpy",

@@ -16,11 +16,11 @@ from types import ModuleType
 from typing import NoReturn
 
 from ba_node import __version__
-from ba_node.cli import convert, demo, evaluate, params, play, replay, solve, steps, synth
+from ba_node.cli import convert, demo, evaluate, params, play, replay, solve, steps, synth, thesis
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rsplit(".", 1)[1]: module
-    for module in (replay, play, solve, convert, evaluate, synth, demo, params, steps)
+    for module in (replay, play, solve, convert, evaluate, synth, demo, params, steps, thesis)
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130

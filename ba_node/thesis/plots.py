@@ -1,0 +1,169 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of an experiment, from its records alone."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ba_node.thesis.experiments import Experiment
+
+Record = Mapping[str, Any]
+Records = Mapping[str, Record]
+Plot = Callable[[Experiment, Records], Figure]
+
+# Okabe-Ito colours, told apart by colour-blind readers; then the same dashed.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_STYLES = ("-", "--", ":")
+_MEASURED, _PREDICTED = "#D55E00", "#0072B2"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that needs no display."""
+    figure = Figure(figsize=(width, height), dpi=80, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG; the same figure gives the same bytes with the same version of matplotlib."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def style(index: int) -> dict[str, Any]:
+    """Return how the curve of a number is drawn."""
+    return {"color": COLOURS[index % len(COLOURS)], "ls": _STYLES[index // len(COLOURS) % len(_STYLES)], "lw": 1.4}
+
+
+def curves(experiment: Experiment, records: Records) -> Figure:
+    """Draw objective and norm of the gradient against steps taken and against time."""
+    figure = new_figure(13.0, 9.0)
+    axes = figure.subplots(2, 2, sharey="row")
+    runs = {label: record for label, record in records.items() if len(record.get("trace", ())) > 1}
+    for index, (label, record) in enumerate(runs.items()):
+        rows = [row for row in record["trace"] if row["accepted"]]
+        for line, name in zip(axes, ("objective", "gradient_norm"), strict=True):
+            values = [row[name] if row[name] and row[name] > 0.0 else math.nan for row in rows]
+            line[0].plot(range(len(rows)), values, label=label, **style(index))
+            line[1].plot([row["time_s"] for row in rows], values, label=label, **style(index))
+    for line, name in zip(axes, ("objective", "norm of the gradient"), strict=True):
+        for axis, unit in zip(line, ("steps taken", "processor time [s]"), strict=True):
+            axis.set(yscale="log", xlabel=unit)
+            axis.grid(visible=True, alpha=0.3)
+        line[0].set_ylabel(name)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    figure.suptitle(experiment.heading)
+    return figure
+
+
+def taylor(experiment: Experiment, records: Records) -> Figure:
+    """Draw the remainder of the Taylor series against the step."""
+    figure = new_figure(6.5, 4.5)
+    axis = figure.subplots()
+    for label, record in records.items():
+        tau, remainder = (np.array(record["data"][name]) for name in ("tau", "remainder"))
+        axis.loglog(tau, remainder, "o-", color=COLOURS[0], label=label)
+        axis.loglog(tau, remainder[4] * (tau / tau[4]) ** 2, "--", color=COLOURS[1], label="slope 2")
+    axis.set(xlabel="τ", ylabel="|F(u + τδ) - F(u) - τJδ|", title=experiment.heading)
+    axis.grid(visible=True, which="both", alpha=0.3)
+    axis.legend(frameon=False)
+    return figure
+
+
+def reprojection(experiment: Experiment, records: Records) -> Figure:
+    """Draw measured and predicted points of some images, before above after."""
+    images = next(record["images"] for record in records.values() if record.get("images"))
+    columns = min(5, len(images))
+    blocks = -(-len(images) // columns)
+    figure = new_figure(max(3.4 * columns, 9.0), (3.0 if columns > 2 else 4.5) * 2 * blocks)
+    axes = figure.subplots(2 * blocks, columns, squeeze=False)
+    for index, image in enumerate(images):
+        for below, when in enumerate(("before", "after")):
+            axis = axes[2 * (index // columns) + below, index % columns]
+            measured, predicted = np.array(image["measured"]), np.array(image[when])
+            lines = np.stack([measured, predicted], axis=1)
+            axis.plot(*lines.transpose(2, 1, 0), color=COLOURS[2], lw=0.8)
+            axis.plot(*measured.T, "o", mfc="none", color=_MEASURED, ms=3.5, mew=0.7)
+            axis.plot(*predicted.T, ".", color=_PREDICTED, ms=2.5)
+            axis.set_title(f"image {image['image']}, {when}", fontsize=9)
+            axis.invert_yaxis()
+            axis.tick_params(labelsize=7)
+    for axis in axes.flat:
+        axis.set_visible(axis.has_data())
+    figure.suptitle(f"{experiment.heading} [px]; rings: measured, dots: predicted")
+    return figure
+
+
+def histograms(experiment: Experiment, records: Records) -> Figure:
+    """Draw the distributions of reprojection errors and of the gradient's entries, with a Gaussian as wide."""
+    figure = new_figure(12.0, 4.5)
+    axes = figure.subplots(1, 2)
+    record = next(iter(records.values()))
+    parts = (
+        (record["residuals"], "reprojection error [px]"),
+        (record["gradient"]["histogram"], "entry of the gradient"),
+    )
+    for axis, (found, name) in zip(axes, parts, strict=True):
+        edges = np.linspace(found["low"], found["high"], len(found["counts"]) + 1)
+        width = edges[1] - edges[0]
+        density = np.array(found["counts"]) / (sum(found["counts"]) * width)
+        axis.bar(edges[:-1], density, width, align="edge", color=COLOURS[5])
+        z = (edges - found["mean"]) / found["sigma"]
+        gauss = np.exp(-0.5 * z * z) / (found["sigma"] * math.sqrt(2.0 * math.pi))
+        axis.plot(edges, gauss, color=COLOURS[1], label="Gaussian of the same mean and variance")
+        axis.set(
+            xlabel=name, ylabel="density", yscale="log", ylim=(max(density[density > 0.0].min() / 3.0, 1e-12), None)
+        )
+        axis.legend(frameon=False, fontsize=8)
+    figure.suptitle(experiment.heading)
+    return figure
+
+
+def layout(experiment: Experiment, records: Records) -> Figure:
+    """Draw cameras and points in space, and which blocks of E are not zero."""
+    data = next(record["data"] for record in records.values() if "cameras" in record.get("data", {}))
+    cameras, points = np.array(data["cameras"]), np.array(data["points"])
+    figure = new_figure(12.0, 5.5)
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    space.plot(*points.T, ".", color=_PREDICTED, ms=1.5 if len(points) > 1000 else 3.0)
+    space.plot(*cameras.T, "^-", color=_MEASURED, ms=4.0, lw=0.6)
+    space.set_aspect("equal")
+    pattern = figure.add_subplot(1, 2, 2)
+    pattern.plot(data["point"], data["image"], ",", color="black")
+    pattern.set(xlabel="point", ylabel="image", title="blocks of E", ylim=(len(cameras) - 0.5, -0.5))
+    figure.suptitle(experiment.heading)
+    return figure
+
+
+def growth(experiment: Experiment, records: Records) -> Figure:
+    """Draw time against the number of observations, a line for each word before the comma of the labels."""
+    figure = new_figure(6.5, 4.5)
+    axis = figure.subplots()
+    for index, kind in enumerate(dict.fromkeys(label.split(",")[0] for label in records)):
+        rows = [record["figures"] for label, record in records.items() if label.split(",")[0] == kind]
+        x, y = (np.array([row[name] for row in rows]) for name in ("observations", "seconds"))
+        exponent = float(np.polyfit(np.log(x), np.log(y), 1)[0])
+        axis.loglog(x, y, marker="o", label=f"{kind}: N^{exponent:.2f}", **style(index))
+    axis.set(xlabel="observations N", ylabel="processor time [s]", title=experiment.heading)
+    axis.grid(visible=True, which="both", alpha=0.3)
+    axis.legend(frameon=False)
+    return figure
+
+
+PLOTS: dict[str, Plot] = {
+    "curves": curves,
+    "taylor": taylor,
+    "reprojection": reprojection,
+    "histograms": histograms,
+    "layout": layout,
+    "growth": growth,
+}

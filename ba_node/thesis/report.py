@@ -1,0 +1,97 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Put tables, pictures and verdicts on pages: one HTML file that holds all, Markdown with pictures beside it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ba_node.io.files import whole_file
+from ba_node.thesis.experiments import Experiment
+from ba_node.thesis.plots import PLOTS, png
+from ba_node.thesis.quantities import figures
+from ba_node.thesis.tables import Table, table
+
+Record = Mapping[str, Any]
+
+INTRO = (
+    "The experiments of Z. Qu, Efficient Optimization for Robust Bundle Adjustment, master's thesis, TU Munich, 2018,"
+    " repeated. Times are processor time of one thread; the thesis's are Matlab's on another machine, so only ratios"
+    " compare: they stand in parentheses. Steps are those taken, as the thesis counts; a rejected one is tried again."
+)
+_STYLE = (
+    "body{font-family:sans-serif;max-width:75em;margin:auto;padding:1em}table{border-collapse:collapse;margin:1em 0}"
+    "td,th{border:1px solid #bbb;padding:.2em .6em;text-align:right}td:first-child,th:first-child{text-align:left}"
+    "td:last-child{text-align:left}img{max-width:100%}"
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """An experiment that has been run.
+
+    Attributes:
+        experiment: what it is.
+        records: of its cases, by label.
+    """
+
+    experiment: Experiment
+    records: Mapping[str, Record]
+
+    @property
+    def figures(self) -> dict[str, dict[str, float | str | None]]:
+        """Return the figures of each case."""
+        return {label: figures(record) for label, record in self.records.items()}
+
+    def table(self) -> Table:
+        """Return its table."""
+        return table(self.experiment, self.figures)
+
+    def pictures(self) -> dict[str, bytes]:
+        """Return its pictures as PNG, by name."""
+        return {name: png(PLOTS[name](self.experiment, self.records)) for name in self.experiment.plots}
+
+
+def write_report(folder: Path, sections: Sequence[Section], verdicts: Table | None) -> Path:
+    """Write report.html and report.md with its images; return the former.
+
+    Args:
+        folder: exists.
+        sections: what has been run.
+        verdicts: on the thesis's claims; None to leave them out.
+    """
+    title = "The thesis's experiments"
+    page = [f"<!doctype html><meta charset='utf-8'><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
+    text = [f"# {title}\n", f"{INTRO}\n"]
+    page.append(f"<p>{html.escape(INTRO)}</p>")
+    if verdicts is not None:
+        page.append(f"<h2>Claims</h2>\n{verdicts.html()}")
+        text += ["## Claims\n", verdicts.markdown()]
+    images = folder / "images"
+    images.mkdir(exist_ok=True)
+    for section in sections:
+        experiment, shown = section.experiment, section.table()
+        page.append(f"<h2 id='{experiment.name}'>{html.escape(experiment.heading)}</h2>\n{shown.html()}")
+        text += [f"## {experiment.heading}\n", shown.markdown()]
+        if experiment.note:
+            page.append(f"<p>{html.escape(experiment.note)}</p>")
+            text.append(f"{experiment.note}\n")
+        for name, picture in section.pictures().items():
+            file = images / f"{experiment.name}-{name}.png"
+            _write(file, picture)
+            encoded = base64.b64encode(picture).decode()
+            page.append(f"<img alt='{experiment.name} {name}' src='data:image/png;base64,{encoded}'>")
+            text.append(f"![{name}](images/{file.name})\n")
+    _write(folder / "report.md", "\n".join(text).encode())
+    _write(folder / "report.html", "\n".join(page).encode())
+    return folder / "report.html"
+
+
+def _write(path: Path, content: bytes) -> None:
+    with whole_file(path) as stream:
+        stream.write(content)
