@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ba_node import window
+from ba_node import archive, window
 from ba_node.core import geometry, methods, solver
 from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport, Status
 from ba_node.measurements import CameraRig, Keyframe, Measurement
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.core.problem import Cameras, State
     from ba_node.core.result import Iteration
+    from ba_node.scene.map_content import MapContent
     from ba_node.scene.tables import IntArray
 
 FINISHED_KEPT = 8
@@ -182,6 +183,41 @@ class Backend:
         reached[self.scene.order[:end]] = True
         self.scene.keyframes.solved[due[reached[due]]] = True
         return dataclasses.replace(self._estimate(taking_part), **extra)
+
+    def reset(self) -> None:
+        """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
+        self.finished = []
+        self._renew(None, self.scene.next_cameras or self.scene.cameras)
+
+    def snapshot(self) -> MapContent:
+        """Return a copy of all that is known, for a file; see docs/map_format.md."""
+        current = None if self._current is None else self.scene.find_keyframe(self._current)
+        delivered = tuple(self._delivered)
+        return archive.pack(
+            archive.Known(
+                self.scene,
+                self.finished,
+                self._report,
+                self._correction,
+                current,
+                self._settled,
+                delivered,
+                self.solve_count,
+            )
+        )
+
+    def take_over(self, known: archive.Known) -> None:
+        """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
+
+        Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.
+        """
+        self.scene, self._report, self._correction = known.scene, known.report, known.correction
+        self.scene.config = self.config.scene
+        self.finished = known.finished[-FINISHED_KEPT:]
+        self._current = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
+        self._settled = known.settled
+        self._delivered = deque(known.delivered, maxlen=_LEARN_FROM)
+        self.solve_count = max(self.solve_count, known.solve_count)
 
     def rms_px(self, state: str = "refined") -> float:
         """Return the root mean square reprojection error per coordinate over all observations of the map, px.

@@ -20,7 +20,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "core": ("core",),
     "scene": ("measurements", "estimate", "scene"),
     "window": ("window",),
-    "backend": ("backend",),
+    "backend": ("archive", "backend"),
     "services": ("messages", "io", "evaluation", "synthetic"),
     "tools": ("ros", "offline", "thesis", "cli"),
 }
@@ -28,6 +28,7 @@ RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in nam
 # Who may use its neighbours in a layer, and which of them.
 SAME = {
     "scene": {"measurements"},
+    "backend": {"archive"},
     "io": {"messages"},
     "offline": {"ros"},
     "thesis": {"offline"},

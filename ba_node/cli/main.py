@@ -24,7 +24,16 @@ COMMANDS: dict[str, ModuleType] = {
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130
-_ROS_PACKAGES = ("rclpy", "ba_msgs", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rcl_interfaces", "std_srvs")
+_ROS_PACKAGES = (
+    "rclpy",
+    "ba_msgs",
+    "std_msgs",
+    "std_srvs",
+    "geometry_msgs",
+    "sensor_msgs",
+    "nav_msgs",
+    "rcl_interfaces",
+)
 
 
 class Parser(argparse.ArgumentParser):

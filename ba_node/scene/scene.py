@@ -149,6 +149,13 @@ class Scene:
         back = geometry.inverse(table.input_rotation[rows], table.input_position[rows])
         return geometry.compose(table.rotation[rows], table.position[rows], *back)
 
+    def index(self) -> None:
+        """Find anew what follows from the tables: the rows of ids, and which observations belong to a landmark."""
+        self._index_keyframes()
+        self._landmark_rows = IdIndex()
+        self._landmark_rows.insert(self.landmarks.track_id, np.arange(len(self.landmarks)))
+        self._link()
+
     def _set_rig(self, rig: CameraRig) -> None:
         cameras = ingest.rig_cameras(rig, self.log)
         if cameras is None or (self.cameras is not None and _same(cameras, self.cameras)):
@@ -284,8 +291,7 @@ class Scene:
         renumbered = table.keep(keep)
         self.sightings.keyframe[:] = renumbered[self.sightings.keyframe]
         self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
-        self._keyframe_rows = {int(k): row for row, k in enumerate(table.keyframe_id)}
-        self._order = None
+        self._index_keyframes()
 
     def _limit_landmarks(self) -> None:
         """Forget the landmarks seen longest ago, ties by row, once there are too many; again a tenth at once."""
@@ -307,6 +313,13 @@ class Scene:
             [Block(b.camera, int(before[b.begin]), int(before[b.end])) for b in blocks] for blocks in self.blocks
         ]
         self.sightings.keep(keep)
+        self._link()
+
+    def _index_keyframes(self) -> None:
+        self._keyframe_rows = {int(k): row for row, k in enumerate(self.keyframes.keyframe_id)}
+        self._order = None
+
+    def _link(self) -> None:
         landmark = self.sightings.landmark
         order = np.argsort(landmark, kind="stable")
         same = landmark[order[1:]] == landmark[order[:-1]]

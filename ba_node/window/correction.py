@@ -64,13 +64,18 @@ class MapCorrection:
         published: map from odom, gated and smoothed; None before the first update.
     """
 
-    def __init__(self) -> None:
-        """Start without one."""
-        self.published: Transform | None = None
-        self._target: Transform | None = None
-        self._candidate: Transform | None = None
-        self._agreeing = 0
-        self._stamp_ns = 0
+    def __init__(self, transforms: tuple[Transform, ...] = (), agreeing: int = 0, stamp_ns: int = 0) -> None:
+        """Start without one, or with what :meth:`state` gave."""
+        self.published: Transform | None = transforms[0] if transforms else None
+        self._target: Transform | None = transforms[1] if transforms else None
+        self._candidate: Transform | None = transforms[2] if len(transforms) > 2 else None
+        self._agreeing = agreeing
+        self._stamp_ns = stamp_ns
+
+    def state(self) -> tuple[tuple[Transform, ...], int, int]:
+        """Return all that is known: transforms, how many solves agree, the newest stamp (ns)."""
+        known = (self.published, self._target, self._candidate)
+        return tuple(one for one in known if one is not None), self._agreeing, self._stamp_ns
 
     def update(self, config: FramesConfig, found: Transform, body: Transform, stamp_ns: int) -> Move:
         """Take in the correction that a solve found.

@@ -1,0 +1,136 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write a map to one .npz file and read it back, bit for bit; docs/map_format.md describes the file.
+
+An .npz is a zip archive of .npy arrays, which ``numpy.load`` and readers in many languages open. One more member,
+``map.json``, holds the version of the format and what is no array. Every member carries a checksum, so that damage is
+noticed; members are not compressed and carry no time, so the same map gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ba_node import __version__, archive
+from ba_node.io.files import whole_file
+from ba_node.scene.map_content import MapContent, MapError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ba_node.config import SceneConfig
+
+FORMAT = "ba_node map"
+VERSION = 1
+_HEAD = "map.json"
+_SUFFIX = ".npy"
+# Not written, but what other tools write may be compressed.
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# What numpy, zipfile and zlib raise on archives that are cut off, altered, or made on purpose to be strange.
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, NotImplementedError, RuntimeError)
+
+
+class MapFileError(ValueError):
+    """A file that is no map, a damaged one, or one of a newer format."""
+
+
+def write_map(path: Path | str, content: MapContent) -> None:
+    """Write a file that is whole and on the disk when this returns; before, an older one of the name stays.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    head = {"format": FORMAT, "version": VERSION, "written_by": f"ba_node {__version__}", **content.facts}
+    with whole_file(path, durable=True) as stream, zipfile.ZipFile(stream, "w") as file:
+        file.writestr(zipfile.ZipInfo(_HEAD), json.dumps(head, indent=1, allow_nan=False))
+        for name, array in content.arrays.items():
+            with file.open(zipfile.ZipInfo(name + _SUFFIX), "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, version=(1, 0), allow_pickle=False)
+
+
+def read_map(path: Path | str) -> MapContent:
+    """Read a file as it is; whether its parts fit together is for the back-end to judge, see :func:`load_map`.
+
+    Raises:
+        MapFileError: it cannot be opened, is no map or damaged, or has a newer format.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            return _read(stream)
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except MapFileError as error:
+        raise MapFileError(f"{path}: {error}") from None
+
+
+def load_map(path: Path | str, config: SceneConfig) -> archive.Known:
+    """Return what a file holds, for :meth:`Backend.take_over`.
+
+    Raises:
+        MapFileError: as :func:`read_map`; or the parts of the file contradict each other.
+    """
+    content = read_map(path)
+    try:
+        return archive.unpack(content, config)
+    except MapError as error:
+        raise MapFileError(f"{path}: damaged: {error}") from error
+
+
+def _read(stream: Any) -> MapContent:
+    if not zipfile.is_zipfile(stream):
+        stream.seek(0)
+        is_cut = stream.read(2) == b"PK"
+        raise MapFileError("cut off or damaged" if is_cut else "not a map: expected an .npz file of ba_node")
+    try:
+        with zipfile.ZipFile(stream) as file:
+            if any(item.compress_type not in _COMPRESSIONS for item in file.infolist()):
+                raise MapFileError("damaged: a member is compressed in a way that is not used")
+            if _HEAD not in file.namelist():
+                raise MapFileError(f"not a map: it has no {_HEAD}, which save_map writes")
+            facts = _head(file.read(_HEAD))
+            names = [name for name in file.namelist() if name.endswith(_SUFFIX)]
+            return MapContent({name.removesuffix(_SUFFIX): _array(file.read(name)) for name in names}, facts)
+    except MapFileError:
+        raise
+    except MemoryError:
+        raise MapFileError("damaged, or too large for the memory of this machine") from None
+    except _DAMAGE as error:
+        raise MapFileError(f"damaged: {error}") from error
+
+
+def _head(data: bytes) -> dict[str, Any]:
+    head = json.loads(data)
+    if not isinstance(head, dict) or head.get("format") != FORMAT:
+        raise MapFileError(f"not a map: {_HEAD} does not say format {FORMAT!r}")
+    version = head.get("version")
+    if type(version) is not int or version < 1:
+        raise MapFileError(f"damaged: version = {version!r}, expected a number")
+    if version > VERSION:
+        writer = head.get("written_by", "a newer ba_node")
+        raise MapFileError(f"format version {version}, written by {writer}; this ba_node reads up to {VERSION}: update")
+    return {name: value for name, value in head.items() if name not in ("format", "version", "written_by")}
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    """Return the array in an .npy file; one that claims another size than it has would cost all memory."""
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    except Exception as error:  # it parses the text as Python, and raises whatever that does
+        raise MapFileError(f"damaged: {error}") from error
+    if version != (1, 0):
+        raise MapFileError(f"damaged: array of .npy version {version}, expected (1, 0)")
+    size = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
+    if dtype.hasobject or size != len(data) - stream.tell():
+        raise MapFileError(f"damaged: an array {shape} of {dtype} in {len(data)} bytes")
+    stream.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    return array

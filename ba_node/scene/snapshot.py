@@ -1,0 +1,212 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Copy a scene into plain arrays and facts, and build a scene from them that goes on as the first would have.
+
+What follows from the rest (links between the views of a landmark, counts of views, ids to rows) is not copied.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ba_node.core.cameras import N_PARAMS, Model
+from ba_node.core.problem import Cameras
+from ba_node.measurements import FeatureTracks
+from ba_node.scene import ingest
+from ba_node.scene.map_content import (
+    MapContent,
+    prefixed,
+    require,
+    require_all,
+    require_index,
+    require_unique,
+    within,
+)
+from ba_node.scene.records import Block, Keyframes, Landmarks, Sightings
+from ba_node.scene.rejections import NOTES_KEPT, NOTICES, REASONS, RejectionLog
+from ba_node.scene.scene import Scene
+from ba_node.scene.tables import Column, Table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from ba_node.config import SceneConfig
+
+_DERIVED = ("last", "views", "previous")
+_TABLES: dict[str, type[Table]] = {"keyframes": Keyframes, "landmarks": Landmarks, "sightings": Sightings}
+_CAMERAS = {
+    "rotation": Column(np.float64, (3, 3)),
+    "translation": Column(np.float64, (3,)),
+    "model": Column(np.uint8),
+    "params": Column(np.float64, (N_PARAMS,)),
+}
+_BLOCKS = {name: Column(np.int64) for name in ("keyframe", "camera", "begin", "end")}
+_PENDING = {"keyframe_id": Column(np.uint64), "camera": Column(np.int64), "count": Column(np.int64)}
+_PENDING_ROWS = {
+    "track_id": Column(np.uint64),
+    "uv": Column(np.float64, (2,)),
+    "sigma_px": Column(np.float64),
+    "depth_m": Column(np.float64),
+}
+_ROTATION_TOLERANCE = 1e-6
+_FINITE = np.finfo(float).max
+
+
+def take(scene: Scene) -> MapContent:
+    """Return a copy of all that a scene holds; later changes of the scene do not reach it."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for group, kind in _TABLES.items():
+        arrays |= prefixed(group, ((name, getattr(getattr(scene, group), name)) for name in _saved(kind)))
+    for group, cameras in (("cameras", scene.cameras), ("next_cameras", scene.next_cameras)):
+        if cameras is not None:
+            arrays |= prefixed(group, ((name, getattr(cameras, name)) for name in _CAMERAS))
+    blocks = [(row, *block) for row, of_row in enumerate(scene.blocks) for block in of_row]
+    arrays |= prefixed("blocks", zip(_BLOCKS, np.array(blocks, np.int64).reshape(-1, len(_BLOCKS)).T, strict=True))
+    arrays |= _pending_arrays(scene.pending)
+    facts = {
+        "session_id": scene.session_id,
+        "frame_id": scene.frame_id,
+        "rejected": dict(sorted(scene.log.rejected.items())),
+        "notices": dict(sorted(scene.log.notices.items())),
+        "rejection_notes": list(scene.log.notes),
+    }
+    return MapContent(arrays, facts)
+
+
+def build(content: MapContent, config: SceneConfig) -> Scene:
+    """Return a scene with this content.
+
+    Raises:
+        MapError: it is not a whole and consistent map.
+    """
+    session_id = content.fact("session_id", (int, type(None)))
+    require(session_id is None or 0 <= session_id < 2**32, f"session_id = {session_id}, expected 32 bits")
+    scene = Scene(config, session_id)
+    scene.frame_id = content.fact("frame_id", str)
+    scene.cameras, scene.next_cameras = _cameras(content, "cameras"), _cameras(content, "next_cameras")
+    columns = {group: content.columns(group, _saved(kind)) for group, kind in _TABLES.items()}
+    n = {group: len(next(iter(found.values()))) for group, found in columns.items()}
+    _check_keyframes(columns["keyframes"])
+    _check_landmarks(columns["landmarks"])
+    _check_sightings(columns["sightings"], n, 0 if scene.cameras is None else len(scene.cameras.model))
+    for group, found in columns.items():
+        getattr(scene, group).append(n[group], **found)
+    scene.blocks = _blocks(content, columns["sightings"], n)
+    scene.pending = _pending(content, session_id)
+    _restore_log(content, scene)
+    scene.index()
+    return scene
+
+
+def _saved(kind: type[Table]) -> dict[str, Column]:
+    return {name: column for name, column in kind.COLUMNS.items() if name not in _DERIVED}
+
+
+def _cameras(content: MapContent, group: str) -> Cameras | None:
+    if not any(name.startswith(f"{group}/") for name in content.arrays):
+        return None
+    found = content.columns(group, _CAMERAS)
+    require(len(found["model"]), f"{group}: no camera in it")
+    require_rotations(found["rotation"], f"{group}/rotation")
+    require_all(within(found["translation"], _FINITE), f"{group}/translation", found["translation"], "finite numbers")
+    known = np.array([int(model) for model in Model])
+    require_all(np.isin(found["model"], known), f"{group}/model", found["model"], f"one of {known.tolist()}")
+    good = np.isfinite(found["params"]).all(axis=1) & (found["params"][:, :2] > 0).all(axis=1)
+    require_all(good, f"{group}/params", found["params"], "finite numbers with fx, fy > 0")
+    return Cameras(**{name: np.array(values) for name, values in found.items()})
+
+
+def require_rotations(rotation: NDArray[np.float64], name: str) -> None:
+    """Raise MapError unless (n, 3, 3) are rotations."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).reshape(-1, 9).max(axis=1, initial=0.0)
+        good = (off <= _ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0)
+    require_all(good, name, rotation, "a rotation")
+
+
+def _check_keyframes(found: Mapping[str, NDArray[Any]]) -> None:
+    require_unique(found["keyframe_id"], "keyframes/keyframe_id")
+    for prefix in ("", "input_"):
+        require_rotations(found[f"{prefix}rotation"], f"keyframes/{prefix}rotation")
+        position = found[f"{prefix}position"]
+        limit = ingest.MAX_POSITION_M if prefix else _FINITE
+        require_all(within(position, limit), f"keyframes/{prefix}position", position, "finite numbers")
+
+
+def _check_landmarks(found: Mapping[str, NDArray[Any]]) -> None:
+    require_unique(found["track_id"], "landmarks/track_id")
+    for name in ("position", "guess"):
+        good = within(found[name], _FINITE) | ~found[f"has_{name}"]
+        require_all(good, f"landmarks/{name}", found[name], f"finite numbers where has_{name}")
+
+
+def _check_sightings(found: Mapping[str, NDArray[Any]], n: Mapping[str, int], n_cameras: int) -> None:
+    for name, limit in (("keyframe", n["keyframes"]), ("landmark", n["landmarks"]), ("camera", n_cameras)):
+        require_index(found[name], limit, f"sightings/{name}")
+    require_all(within(found["uv"], ingest.MAX_PIXEL), "sightings/uv", found["uv"], f"at most {ingest.MAX_PIXEL:g} px")
+    sigma, depth = found["sigma_px"], found["depth_m"]
+    require_all((sigma > 0) & np.isfinite(sigma), "sightings/sigma_px", sigma, "a number > 0")
+    require_all(np.isnan(depth) | ((depth > 0) & np.isfinite(depth)), "sightings/depth_m", depth, "NaN or a number > 0")
+    where = found["keyframe"].astype(np.int64) * max(n_cameras, 1) + found["camera"]
+    require_unique(where * max(n["landmarks"], 1) + found["landmark"], "sightings: keyframe, camera and landmark")
+
+
+def _blocks(content: MapContent, seen: Mapping[str, NDArray[Any]], n: Mapping[str, int]) -> list[list[Block]]:
+    found = content.columns("blocks", _BLOCKS)
+    require_index(found["keyframe"], n["keyframes"], "blocks/keyframe")
+    begin, end = found["begin"], found["end"]
+    require_all((begin >= 0) & (begin <= end) & (end <= n["sightings"]), "blocks/begin", begin, "rows of sightings")
+    order = np.argsort(begin, kind="stable")
+    order = order[end[order] > begin[order]]
+    length = (end - begin)[order]
+    whole = len(order) == 0 or (begin[order[0]] == 0 and bool((begin[order[1:]] == end[order[:-1]]).all()))
+    require(whole and length.sum() == n["sightings"], "blocks do not cover the rows of sightings once each")
+    for name in ("keyframe", "camera"):
+        told = np.repeat(found[name][order], length)
+        require(np.array_equal(told, seen[name]), f"blocks/{name} contradicts sightings/{name}")
+    blocks: list[list[Block]] = [[] for _ in range(n["keyframes"])]
+    for row, *block in zip(*(found[name].tolist() for name in _BLOCKS), strict=True):
+        blocks[row].append(Block(*block))
+    return blocks
+
+
+def _pending_arrays(pending: list[FeatureTracks]) -> dict[str, NDArray[Any]]:
+    heads = {
+        "keyframe_id": np.array([tracks.keyframe_id for tracks in pending], np.uint64),
+        "camera": np.array([tracks.camera_index for tracks in pending], np.int64),
+        "count": np.array([len(tracks.track_id) for tracks in pending], np.int64),
+    }
+    empty = {name: np.empty((0, *column.shape), column.dtype) for name, column in _PENDING_ROWS.items()}
+    rows = {name: np.concatenate([empty[name], *(getattr(tracks, name) for tracks in pending)]) for name in empty}
+    return prefixed("pending", heads.items()) | prefixed("pending_rows", rows.items())
+
+
+def _pending(content: MapContent, session_id: int | None) -> list[FeatureTracks]:
+    heads, rows = content.columns("pending", _PENDING), content.columns("pending_rows", _PENDING_ROWS)
+    count = heads["count"]
+    require_all(count >= 0, "pending/count", count, "a count")
+    require(count.sum() == len(rows["track_id"]), f"pending_rows has {len(rows['track_id'])} rows, not {count.sum()}")
+    require(session_id is not None or not len(count), "tracks wait, but the map has no session_id")
+    waiting = []
+    begin = 0
+    for key, camera, n in zip(*(heads[name].tolist() for name in _PENDING), strict=True):
+        ids, uv, sigma_px, depth_m = (np.array(rows[name][begin : begin + n]) for name in _PENDING_ROWS)
+        tracks = FeatureTracks(session_id or 0, key, camera, ids, uv, sigma_px, depth_m)
+        clean = ingest.clean_tracks(tracks, RejectionLog())
+        require(clean is not None and len(clean.track_id) == n, f"pending_rows: tracks of keyframe {key} are not sound")
+        waiting.append(tracks)
+        begin += n
+    return waiting
+
+
+def _restore_log(content: MapContent, scene: Scene) -> None:
+    for name, known, counter in (("rejected", REASONS, scene.log.rejected), ("notices", NOTICES, scene.log.notices)):
+        # A reason of another version of ba_node is dropped: its name could not be explained.
+        counter.update({key: n for key, n in content.counts(name).items() if key in known})
+    notes = content.fact("rejection_notes", list)
+    require(all(isinstance(note, str) for note in notes), "rejection_notes: expected texts")
+    scene.log.notes.extend(notes[-NOTES_KEPT:])
