@@ -73,7 +73,9 @@ def type_hash(type_name: str) -> str:
 
 
 def encode(type_name: str, message: Any) -> bytes:
-    """Return a message as little-endian CDR."""
+    """Return a message as little-endian CDR; one that is serialised already as it is."""
+    if isinstance(message, bytes):
+        return message
     return bytes(typestore().serialize_cdr(message, type_name, little_endian=True))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_NS = 1_000_000_000
+NS_PER_S = 1_000_000_000
 
 
 class ConversionError(ValueError):
@@ -36,15 +36,21 @@ class MessageFactory(Protocol):
 
 def stamp_ns_from_message(stamp: Any) -> int:
     """Return a ``builtin_interfaces/Time`` in ns."""
-    return int(stamp.sec) * _NS + int(stamp.nanosec)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def stamp_parts(stamp_ns: int) -> tuple[int, int]:
+    """Return seconds and nanoseconds of a ``builtin_interfaces/Time``; raise ConversionError if a stamp exceeds it."""
+    # Floor division keeps nanosec in [0, 1e9) for times before the epoch too.
+    sec, nanosec = divmod(int(stamp_ns), NS_PER_S)
+    if not -(2**31) <= sec < 2**31:
+        raise ConversionError(f"stamp {stamp_ns} ns does not fit into a message: its seconds ({sec}) exceed 32 bits")
+    return sec, nanosec
 
 
 def header_message(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any:
     """Return a ``std_msgs/Header``; raise ConversionError if the stamp exceeds it."""
-    # Floor division keeps nanosec in [0, 1e9) for times before the epoch too.
-    sec, nanosec = divmod(int(stamp_ns), _NS)
-    if not -(2**31) <= sec < 2**31:
-        raise ConversionError(f"stamp {stamp_ns} ns does not fit into a message: its seconds ({sec}) exceed 32 bits")
+    sec, nanosec = stamp_parts(stamp_ns)
     stamp = factory.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
     return factory.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 

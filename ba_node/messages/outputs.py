@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ba_node.estimate import Cloud, Estimate, Poses, SolveReport
-from ba_node.messages.factory import MessageFactory, float32, header_message, pose_message
+from ba_node.estimate import Cloud, Estimate, SolveReport
+from ba_node.messages.factory import MessageFactory, float32, header_message
+from ba_node.messages.serialised import cloud_message, path_message, pose_messages
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,11 +25,8 @@ OUTPUT_TYPES = {
     "points": "sensor_msgs/msg/PointCloud2",
     "report": "ba_msgs/msg/SolverReport",
 }
-# One point as it is published and as it is written to a file: little endian, 20 bytes.
+# One point as it is published and as it is written to a file: five little-endian words.
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rms_px", "<f4"), ("views", "<u4")])
-
-# Values of sensor_msgs/PointField.
-_POINT_FIELD = {"<f4": 7, "<u4": 6}
 
 
 class _Everything(Container[str]):
@@ -49,17 +47,19 @@ def output_messages(
 
     Returns:
         (topic below the node's name, type, message) in the order to publish; one pose for each refined keyframe.
+        Poses, path and points are bytes, serialised already (``serialised.py``).
     """
     out: list[tuple[str, Any]] = []
     if estimate.report.status.usable:
         if "refined_keyframes" in wanted:
             out.append(("refined_keyframes", _refined(factory, estimate)))
         if "pose" in wanted:
-            out += [("pose", pose) for pose in _stamped(factory, estimate.refined, estimate.frame_id)]
+            out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
         if "path" in wanted:
-            out.append(("path", _path(factory, estimate, config.path_max_poses)))
+            poses = estimate.trajectory[-config.path_max_poses :]
+            out.append(("path", path_message(poses, estimate.stamp_ns, estimate.frame_id)))
         if "points" in wanted:
-            out.append(("points", _points(factory, estimate, config.points_max)))
+            out.append(("points", _points(estimate, config.points_max)))
     if "report" in wanted:
         out.append(("report", _report(factory, estimate)))
     return [(topic, OUTPUT_TYPES[topic], message) for topic, message in out]
@@ -72,23 +72,11 @@ def point_records(cloud: Cloud, limit: int | None = None) -> NDArray[np.void]:
     if limit is not None and n > limit:
         rows = np.arange(limit) * n // limit
         n = limit
-    records = np.empty(n, dtype=POINT_DTYPE)
-    for column, name in enumerate("xyz"):
-        records[name] = float32(cloud.position[rows, column])
-    records["rms_px"] = cloud.rms_px[rows]
-    records["views"] = cloud.views[rows]
-    return records
-
-
-def _stamped(factory: MessageFactory, poses: Poses, frame_id: str) -> list[Any]:
-    return [
-        factory.make(
-            OUTPUT_TYPES["pose"],
-            header=header_message(factory, stamp, frame_id),
-            pose=pose_message(factory, position, orientation),
-        )
-        for stamp, position, orientation in zip(poses.stamp_ns.tolist(), poses.position, poses.orientation, strict=True)
-    ]
+    words = np.empty((n, 5), "<f4")
+    words[:, :3] = float32(cloud.position[rows])
+    words[:, 3] = cloud.rms_px[rows]
+    words.view("<u4")[:, 4] = cloud.views[rows]
+    return words.view(POINT_DTYPE)[:, 0]
 
 
 def _refined(factory: MessageFactory, estimate: Estimate) -> Any:
@@ -104,34 +92,10 @@ def _refined(factory: MessageFactory, estimate: Estimate) -> Any:
     )
 
 
-def _path(factory: MessageFactory, estimate: Estimate, limit: int) -> Any:
-    return factory.make(
-        OUTPUT_TYPES["path"],
-        header=header_message(factory, estimate.stamp_ns, estimate.frame_id),
-        poses=_stamped(factory, estimate.trajectory[-limit:], estimate.frame_id),
-    )
-
-
-def _points(factory: MessageFactory, estimate: Estimate, limit: int) -> Any:
+def _points(estimate: Estimate, limit: int) -> bytes:
     records = point_records(estimate.cloud, limit)
-    size = POINT_DTYPE.itemsize
-    assert POINT_DTYPE.fields is not None
-    fields = [
-        factory.make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=_POINT_FIELD[kind.str], count=1)
-        for name, (kind, offset, *_) in POINT_DTYPE.fields.items()
-    ]
-    return factory.make(
-        OUTPUT_TYPES["points"],
-        header=header_message(factory, estimate.stamp_ns, estimate.frame_id),
-        height=1,
-        width=len(records),
-        fields=fields,
-        is_bigendian=False,
-        point_step=size,
-        row_step=size * len(records),
-        data=factory.array(records.view(np.uint8)),
-        is_dense=all(bool(np.isfinite(records[name]).all()) for name in "xyz"),
-    )
+    dense = all(bool(np.isfinite(records[name]).all()) for name in "xyz")
+    return cloud_message(records, estimate.stamp_ns, estimate.frame_id, dense=dense)
 
 
 def _report(factory: MessageFactory, estimate: Estimate) -> Any:
