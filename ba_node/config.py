@@ -288,6 +288,9 @@ class OutputConfig:
 class NodeConfig:
     """How the node runs. Not used offline, except for names."""
 
+    autostart: bool = _param(
+        True, "Configure and activate at start; false leaves both to `ros2 lifecycle set` or a manager.", live=False
+    )
     inbox_size: int = _param(
         500,
         "Messages that wait for the solver; beyond it the oldest tracks are dropped and counted.",

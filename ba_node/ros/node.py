@@ -1,26 +1,32 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Connect topics and parameters to the worker. Everything in this file runs on the executor's thread."""
+"""Put the node together: parameters, worker and components, made and destroyed with the states of a managed node.
+
+Everything in this file runs on the executor's thread.
+
+============  ==========================================================================================
+configure     a new back-end with an empty map, its worker, and all components with their topics
+activate      data is taken and results are published
+deactivate    the map stays, data is ignored and counted; a solve that runs is finished, not published
+cleanup       components are destroyed, the map is dropped; a solve that runs ends after its iteration
+shutdown      as cleanup, for good
+============  ==========================================================================================
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import pickle
 import time
-from collections import Counter
+import traceback
 from typing import TYPE_CHECKING, Any
 
-from rclpy.node import Node
-
 from ba_node.backend import Backend
-from ba_node.estimate import Estimate, SolveReport, Status
-from ba_node.measurements import CameraRig
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, measurement_from_message, output_messages
-from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.estimate import Estimate
+from ba_node.ros.component import Component, Host
 from ba_node.ros.inbox import Inbox
+from ba_node.ros.inputs import Inputs
+from ba_node.ros.lifecycle import ManagedNode
 from ba_node.ros.parameters import Parameters
+from ba_node.ros.publishing import Publishing
 from ba_node.ros.throttle import Throttle
 from ba_node.ros.worker import Notice, Worker
 
@@ -28,10 +34,14 @@ if TYPE_CHECKING:
     from ba_node.config import Config
 
 NODE_NAME = "ba_node"
+# In the order in which they are made and get estimates; destroyed in reverse. What feeds the worker comes last.
+COMPONENTS: tuple[type[Component], ...] = (Publishing, Inputs)
 _LOG_PERIOD_S = 5.0
+# For a worker that is idle; one that solves ends by itself.
+_STOP_S = 0.02
 
 
-class BaNode(Node):  # type: ignore[misc]  # rclpy is not typed
+class BaNode(ManagedNode):
     """The ROS node: subscribes to keyframes, tracks and cameras, publishes what the worker makes of them.
 
     Raises:
@@ -42,90 +52,108 @@ class BaNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """Make the node; :meth:`start` sets it to work."""
         super().__init__(NODE_NAME, **node_options)
         self._settings = Parameters(self, self._reconfigure)
-        config = self._settings.config
-        self._inbox = Inbox(config.node.inbox_size)
-        self._wake = self.create_guard_condition(self._publish)
-        backend = Backend(config, clock=time.perf_counter)
-        self._worker = Worker(backend, self._inbox, config.node.settle_time_s, self._wake.trigger)
-        self._factory = RclpyFactory()
         self._throttle = Throttle(_LOG_PERIOD_S)
-        self._unreadable: Counter[str] = Counter()
-        self._rigs: dict[str, bytes] = {}
-        self._outputs = {
-            topic: self.create_publisher(message_class(kind), f"~/{topic}", qos.for_output(topic))
-            for topic, kind in OUTPUT_TYPES.items()
-        }
-        for topic, kind in INPUT_TYPES.items():
-            receive = functools.partial(self._receive, topic, kind)
-            for profile in qos.for_input(topic, config.node.queue_depth):
-                self.create_subscription(message_class(kind), topic, receive, profile)
+        # Lives as long as the node: a worker that is still in its last iteration may trigger it after cleanup.
+        self._wake = self.create_guard_condition(self._distribute)
+        self._host: Host | None = None
+        self._components: list[Component] = []
+        self._leaving: list[Worker] = []
+        self._refined_before = 0
 
     @property
     def keyframes_refined(self) -> int:
         """Return how many keyframes have been refined so far."""
-        return self._worker.refined
+        return self._refined_before + (self._host.worker.refined if self._host else 0)
 
     def start(self) -> None:
-        """Start the worker."""
-        self._worker.start()
+        """Configure and activate, if ``node.autostart`` says so; a failure is logged and leaves the node running."""
+        if self._settings.config.node.autostart and self.request("configure"):
+            self.request("activate")
 
     def stop(self) -> None:
         """End the worker, during a solve after its current iteration."""
-        if not self._worker.stop():
+        self.cleanup()
+        if not all(worker.stop() for worker in self._leaving):
             self.get_logger().error("the solver did not stop in time, leaving it")
 
-    def _receive(self, topic: str, kind: str, message: Any) -> None:
-        """Hand a message to the worker. What cannot be read is counted; it must not end the node."""
-        try:
-            measurement = measurement_from_message(kind, message)
-            if isinstance(measurement, CameraRig) and not self._is_news(topic, measurement):
-                return
-            self._inbox.put(measurement, time.monotonic())
-        except Exception as error:
-            self._unreadable["unreadable"] += 1
-            text = f"{self.resolve_topic_name(topic)}: {error}; dropped (unreadable = {self._unreadable['unreadable']})"
-            self._log(Notice("unreadable", text))
+    def configure(self) -> None:
+        """Make an empty map and everything that works on it."""
+        self.cleanup()
+        config = self._settings.config
+        inbox = Inbox(config.node.inbox_size)
+        backend = Backend(config, clock=time.perf_counter)
+        worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
+        self._host = Host(self, config, inbox, worker, self._log)
+        worker.start()
+        for kind in COMPONENTS:
+            self._components.append(kind(self._host))
 
-    def _is_news(self, topic: str, rig: CameraRig) -> bool:
-        """Return False for cameras that came before (drivers repeat them with each image) or that a rig overrules."""
-        content = pickle.dumps(rig)
-        known = self._rigs.get(topic) == content
-        if topic == "camera_info" and "camera_rig" in self._rigs:
-            self._log(Notice("camera_info", "camera_info is ignored: camera_rig has told the cameras"))
-            return False
-        self._rigs[topic] = content
-        return not known
+    def activate(self) -> None:
+        """Take data and publish."""
+        host = self._configured()
+        host.active = True
+        host.ignoring.discard("inactive")
+        for component in self._components:
+            component.activate()
+
+    def deactivate(self) -> None:
+        """Hold the map, and ignore data."""
+        host = self._configured()
+        host.active = False
+        host.ignoring.add("inactive")
+        for component in reversed(self._components):
+            component.deactivate()
+
+    def cleanup(self) -> None:
+        """Drop the map and destroy all components. Does not wait for a solve that runs: its thread ends by itself."""
+        if self._host is None:
+            return
+        host, self._host = self._host, None
+        host.active = False
+        self._components.clear()
+        self._leaving = [worker for worker in [*self._leaving, host.worker] if not worker.stop(_STOP_S)]
+        self._refined_before += host.worker.refined
+        host.at_cleanup.close()
+
+    def _configured(self) -> Host:
+        assert self._host is not None, "rclpy's state machine lets only a configured node do this"
+        return self._host
 
     def _reconfigure(self, config: Config) -> None:
-        self._inbox.post(lambda backend: backend.configure(config))
+        """Pass on a change of parameters; an unconfigured node takes it when it is configured."""
+        host = self._host
+        if host is None:
+            return
+        before, host.config = host.config, config
+        host.inbox.post(lambda backend: backend.configure(config))
+        for component in self._components:
+            component.reconfigure(before)
 
-    def _publish(self) -> None:
-        """Publish what the worker has made. Path and points replace each other: only the newest are sent."""
-        outputs = self._worker.outputs()
+    def _distribute(self) -> None:
+        """Give the components what the worker has made."""
+        host = self._host
+        if host is None:
+            return
+        outputs = host.worker.outputs()
         estimates = [output for output in outputs if isinstance(output, Estimate)]
         newest = next((e for e in reversed(estimates) if e.report.status.usable), None)
         for output in outputs:
             if isinstance(output, Notice):
                 self._log(output)
-            else:
-                self._send(output, latched=output is newest)
-                self._log_report(output.report)
+            elif host.active:
+                for component in self._components:
+                    self._deliver(component, output, newest=output is newest)
 
-    def _send(self, estimate: Estimate, *, latched: bool) -> None:
-        wanted = {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
-        # Latched topics are for those who come later.
-        wanted = wanted.union(qos.LATCHED_OUTPUTS) if latched else wanted.difference(qos.LATCHED_OUTPUTS)
-        rejected = {**estimate.report.rejected, **self._unreadable}
-        estimate = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, rejected=rejected))
-        for topic, _, message in output_messages(self._factory, estimate, self._settings.config.output, wanted):
-            self._outputs[topic].publish(message)
-
-    def _log_report(self, report: SolveReport) -> None:
-        """Say why a solve gave nothing. That the first keyframes are not enough is nothing to warn about."""
-        if not report.status.usable and self._throttle.passes(report.status.name, time.monotonic()):
-            log = self.get_logger()
-            text = f"keyframe {report.newest_keyframe_id} was not refined: {report.reason}"
-            (log.info if report.status is Status.SKIPPED else log.warning)(text)
+    def _deliver(self, component: Component, estimate: Estimate, newest: bool) -> None:
+        """Give an estimate to a component; a fault in one must not keep it from the others."""
+        try:
+            component.take(estimate, newest)
+        except Exception as error:
+            if not self.context.ok():
+                raise  # a signal ended the context between two messages
+            name = type(component).__name__
+            text = f"internal error in {name}, going on: {type(error).__name__}: {error}\n{traceback.format_exc()}"
+            self._log(Notice(f"failure {name}", text, is_error=True))
 
     def _log(self, notice: Notice) -> None:
         """Log a notice, the same one not more often than every few seconds."""

@@ -30,6 +30,20 @@ from ba_node.ros.domain import free_domain, isolation
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 30.0
 FACTORY = RclpyFactory()
+_SLOW_SOLVE = """
+import sys, time
+from ba_node import backend
+
+def solve(self, on_iteration):
+    print("solving", flush=True)
+    while on_iteration(None):
+        time.sleep(0.01)
+
+backend.Backend.solve = solve
+backend.Backend.ready = property(lambda self: len(self.scene.keyframes) > 0)
+from ba_node.ros.main import main
+sys.exit(main())
+"""
 
 
 @pytest.fixture(scope="session")
@@ -139,6 +153,10 @@ class Peer:
         else:
             self.publishers["camera_rig"].publish(conversion.rig_message(FACTORY, measurement, stamp_ns))
 
+    def all_acknowledged(self) -> bool:
+        """Return True once the node has received everything that was sent."""
+        return all(publisher.wait_for_all_acked() for publisher in self.publishers.values())
+
     def until(self, condition: Callable[[], Any], what: str, timeout_s: float = TIMEOUT_S) -> None:
         """Take messages until a condition holds."""
         end = time.monotonic() + timeout_s
@@ -191,3 +209,9 @@ def make_peer(domain: int) -> Iterator[Callable[..., Peer]]:  # noqa: ARG001
     yield make
     for peer in made:
         peer.close()
+
+
+@pytest.fixture
+def slow_solve() -> str:
+    """Return a program: the node with a solve that goes on until it is stopped, and says when it has begun."""
+    return _SLOW_SOLVE

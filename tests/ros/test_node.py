@@ -305,25 +305,11 @@ def test_wrong_arguments_end_with_one_line(start_node: StartNode, arguments: tup
     assert "Traceback" not in node.err
 
 
-SLOW_SOLVE = """
-import sys, time
-from ba_node import backend
-
-def solve(self, on_iteration):
-    print("solving", flush=True)
-    while on_iteration(None):
-        time.sleep(0.01)
-
-backend.Backend.solve = solve
-backend.Backend.ready = property(lambda self: len(self.scene.keyframes) > 0)
-from ba_node.ros.main import main
-sys.exit(main())
-"""
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_quickly_during_a_solve(start_node: StartNode, make_peer: MakePeer, number: int) -> None:
-    node, peer = start_node(python=SLOW_SOLVE), make_peer()
+def test_a_signal_ends_it_quickly_during_a_solve(
+    start_node: StartNode, make_peer: MakePeer, slow_solve: str, number: int
+) -> None:
+    node, peer = start_node(python=slow_solve), make_peer()
     peer.advertise()
     peer.connect()
     peer.publish(Keyframe(0, 1, 1, "odom", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))

@@ -1,0 +1,65 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Subscribe to keyframes, tracks, guesses and cameras, and hand them to the worker."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+import time
+from typing import Any
+
+from ba_node.measurements import CameraRig
+from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
+from ba_node.ros import qos
+from ba_node.ros.component import Component, Host
+from ba_node.ros.convert import message_class
+from ba_node.ros.worker import Notice
+
+
+class Inputs(Component):
+    """The inputs of the node. Cameras are taken at any time: they may be sent only once, before the node is active."""
+
+    def __init__(self, host: Host) -> None:
+        """Subscribe."""
+        super().__init__(host)
+        self._rigs: dict[str, bytes] = {}
+        self._last: dict[str, Any] = {}
+        for topic, kind in INPUT_TYPES.items():
+            receive = functools.partial(self._receive, topic, kind)
+            for profile in qos.for_input(topic, host.config.node.queue_depth):
+                self.subscription(message_class(kind), topic, receive, profile)
+
+    def _receive(self, topic: str, kind: str, message: Any) -> None:
+        """Hand a message to the worker. What cannot be read is counted; it must not end the node."""
+        counted = self.host.counted
+        if self.host.ignoring and topic not in qos.LATCHED_INPUTS:
+            counted.update(self.host.ignoring)
+            return
+        if topic in qos.LATCHED_INPUTS and self._came_twice(topic, message):
+            return
+        try:
+            measurement = measurement_from_message(kind, message)
+            if isinstance(measurement, CameraRig) and not self._is_news(topic, measurement):
+                return
+            self.host.inbox.put(measurement, time.monotonic())
+        except Exception as error:
+            counted["unreadable"] += 1
+            name = self.host.node.resolve_topic_name(topic)
+            self.host.log(Notice("unreadable", f"{name}: {error}; dropped (unreadable = {counted['unreadable']})"))
+
+    def _came_twice(self, topic: str, message: Any) -> bool:
+        """Return True for what the other subscription of this topic has brought already."""
+        again = bool(self._last.get(topic) == message)
+        self._last[topic] = message
+        return again
+
+    def _is_news(self, topic: str, rig: CameraRig) -> bool:
+        """Return False for cameras that came before (drivers repeat them with each image) or that a rig overrules."""
+        content = pickle.dumps(rig)
+        known = self._rigs.get(topic) == content
+        if topic == "camera_info" and "camera_rig" in self._rigs:
+            self.host.log(Notice("camera_info", "camera_info is ignored: camera_rig has told the cameras"))
+            return False
+        self._rigs[topic] = content
+        return not known
