@@ -36,11 +36,11 @@ import numpy as np
 
 from ba_node import archive, window
 from ba_node.core import geometry, methods, solver
-from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport, Status
+from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.scene import Scene
-from ba_node.window import quality
+from ba_node.window import full, quality
 from ba_node.window.correction import MapCorrection, Transform
 from ba_node.window.covariance import covariances
 from ba_node.window.view import view
@@ -172,7 +172,7 @@ class Backend:
         newest = int(self.scene.keyframes.keyframe_id[taking_part[-1]])
         extra: dict[str, Any] = {}
         if isinstance(selection, str):
-            self._report = self._base_report(newest, Status.SKIPPED, selection)
+            self._report = dataclasses.replace(self._base_report(newest), reason=selection)
         else:
             taking_part = _taking_part(self.scene, selection)
             self._report, state = self._solve(newest, selection, on_iteration)
@@ -184,10 +184,36 @@ class Backend:
         self.scene.keyframes.solved[due[reached[due]]] = True
         return dataclasses.replace(self._estimate(taking_part), **extra)
 
+    def estimate(self) -> Estimate:
+        """Return all that is known, with the report of the last solve."""
+        return self._estimate(self.scene.order)
+
+    def merge(self, taken: full.Copy, solved: full.Solved) -> tuple[Estimate, int] | None:
+        """Put the result of a solve of everything into the map, see ``window/full.py``.
+
+        Returns:
+            What is known now, and how many later keyframes followed; None if the result was of no use or its map is
+            no longer the current one: nothing has changed then.
+        """
+        result = solved.result
+        followed = None
+        if result.status.usable and result.state.is_finite():
+            followed = full.put(self.scene, self.config, taken, result.state)
+        if followed is None:
+            return None
+        self.solve_count += 1
+        newest = int(self.scene.order[-1])
+        figures = quality.figures(taken.selection, result, solved.norms)
+        report = self._base_report(int(self.scene.keyframes.keyframe_id[newest]))
+        self._report = dataclasses.replace(report, **figures)
+        self._correct(newest)
+        return self.estimate(), followed
+
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
         self.finished = []
         self._renew(None, self.scene.next_cameras or self.scene.cameras)
+        self._report = SolveReport(reason="reset: the map is empty")
 
     def snapshot(self) -> MapContent:
         """Return a copy of all that is known, for a file; see docs/map_format.md."""
@@ -239,24 +265,8 @@ class Backend:
         )
         elapsed = self._clock() - began
         merged = window.merge(self.scene, selection, result, self.config.tracks.outlier_px, self.config.solver.backend)
-        report = dataclasses.replace(
-            self._base_report(newest, result.status, result.reason),
-            method=result.method,
-            iterations=max(len(result.trace) - 1, 0),
-            accepted_iterations=result.accepted_iterations,
-            linear_iterations=result.linear_iterations,
-            objective_before=result.objective_before,
-            objective_after=result.objective_after,
-            gradient_norm=result.gradient_norm,
-            rms_px_before=quality.rms_of_norms_px(selection, selection.norms),
-            rms_px_after=quality.rms_of_norms_px(selection, merged.norms),
-            keyframes=int(np.count_nonzero(~problem.fixed)),
-            fixed_keyframes=int(np.count_nonzero(problem.fixed)),
-            landmarks=problem.n_points,
-            observations=len(problem.observations),
-            outliers=len(selection.rows) - len(problem.observations),
-            solve_time_s=elapsed,
-        )
+        figures = quality.figures(selection, result, merged.norms)
+        report = dataclasses.replace(self._base_report(newest), **figures, solve_time_s=elapsed)
         return report, merged.state
 
     def _correct(self, row: int) -> None:
@@ -272,7 +282,8 @@ class Backend:
 
     def _extras(self, selection: window.Selection, state: State, refined: IntArray) -> dict[str, Any]:
         """Return what was asked for beside the estimate, with rows as in ``refined``."""
-        place = np.searchsorted(_places(self.scene)[refined], _places(self.scene)[selection.keyframes])
+        places = self.scene.places()
+        place = np.searchsorted(places[refined], places[selection.keyframes])
         found: dict[str, Any] = {}
         if self.extras.covariance:
             measured = self.scene.keyframes.input_position[selection.keyframes]
@@ -284,13 +295,11 @@ class Backend:
             found["view"] = view(selection.problem, state, place, len(refined))
         return found
 
-    def _base_report(self, newest: int, status: Status, reason: str) -> SolveReport:
+    def _base_report(self, newest: int) -> SolveReport:
         return SolveReport(
             session_id=self.scene.session_id or 0,
             solve_count=self.solve_count,
             newest_keyframe_id=newest,
-            status=status,
-            reason=reason,
             method=self.config.solver.method,
             rejected=dict(sorted(self.rejected.items())),
         )
@@ -302,7 +311,7 @@ class Backend:
         rows = scene.landmark_order
         rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
         return Estimate(
-            stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]),
+            stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]) if len(scene.order) else 0,
             frame_id=self.config.frames.map_frame,
             refined=_poses(scene, refined),
             trajectory=_poses(scene, scene.order),
@@ -379,13 +388,6 @@ def _taking_part(scene: Scene, selection: window.Selection) -> IntArray:
     marked[selection.window] = True
     marked[selection.keyframes] = True
     return scene.order[marked[scene.order]]
-
-
-def _places(scene: Scene) -> IntArray:
-    """Return the place of each row of keyframes in the order of time."""
-    place = np.empty(len(scene.order), np.intp)
-    place[scene.order] = np.arange(len(place))
-    return place
 
 
 def _poses(scene: Scene, rows: IntArray) -> Poses:

@@ -75,6 +75,20 @@ class Scene:
         """Return the row of a keyframe, None if it is not known."""
         return self._keyframe_rows.get(keyframe_id)
 
+    def find_keyframes(self, keyframe_ids: IdArray) -> IntArray:
+        """Return the row of each keyframe, -1 where it is not known."""
+        return np.array([self._keyframe_rows.get(key, -1) for key in keyframe_ids.tolist()], np.intp)
+
+    def find_landmarks(self, track_ids: IdArray) -> IntArray:
+        """Return the row of each track, -1 where it is not known."""
+        return self._landmark_rows.find(track_ids)
+
+    def places(self) -> IntArray:
+        """Return the place of each row of keyframes in the order of time."""
+        place = np.empty(len(self.order), np.intp)
+        place[self.order] = np.arange(len(place))
+        return place
+
     def cameras_of(self, keyframe_row: int) -> set[int]:
         """Return the indices of the cameras that delivered for a keyframe."""
         return {block.camera for block in self.blocks[keyframe_row]}

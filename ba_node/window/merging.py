@@ -38,7 +38,7 @@ def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float,
     state = result.state
     if not result.status.usable or not state.is_finite():
         return Merged(selection.norms, None)
-    state = _scaled(scene, selection, state)
+    state = scaled(selection, scene.keyframes.input_position[selection.keyframes], state)
     free = ~selection.problem.fixed
     rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
     rows = selection.keyframes[free]
@@ -49,17 +49,22 @@ def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float,
     scene.landmarks.has_position[selection.landmarks] = True
     whole = dataclasses.replace(selection.problem, observations=selection.sightings)
     norms = native_kernels.residual_norms(whole, state, backend)
-    _judge(scene, selection, norms, outlier_px)
+    judge(scene, selection, norms, outlier_px)
     _displace(scene, selection.lost)
     return Merged(norms, state)
 
 
-def _scaled(scene: Scene, selection: Selection, state: State) -> State:
-    """Give the parts whose scale floats the scale of the front-end's steps."""
+def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
+    """Give the parts whose scale floats the scale of some steps: the front-end's, unless the map has one already.
+
+    Args:
+        selection: what was solved.
+        measured: (n_kf, 3) positions of its keyframes in that scale, m.
+        state: the solution.
+    """
     obs = selection.problem.observations
     anchor_of_point = np.full(selection.problem.n_points, -1)
     anchor_of_point[obs.point] = selection.unscaled[obs.keyframe]
-    measured = scene.keyframes.input_position[selection.keyframes]
     rotation, position = geometry.inverse(state.rotation, state.translation)
     points = state.points.copy()
     for anchor in np.unique(selection.unscaled[selection.unscaled >= 0]):
@@ -73,7 +78,7 @@ def _scaled(scene: Scene, selection: Selection, state: State) -> State:
     return dataclasses.replace(state, translation=translation, points=points)
 
 
-def _judge(scene: Scene, selection: Selection, norm: FloatArray, outlier_px: float) -> None:
+def judge(scene: Scene, selection: Selection, norm: FloatArray, outlier_px: float) -> None:
     """Mark the observations to leave out next time, and note the error of each point.
 
     The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point with

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ba_node.window.problems import problem_of
 
 if TYPE_CHECKING:
     from ba_node.config import Config
+    from ba_node.core.result import Result
     from ba_node.scene.scene import Scene
     from ba_node.scene.tables import FloatArray
     from ba_node.window.selection import Selection
@@ -38,6 +39,35 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
     error = (norms * selection.sightings.sigma_px)[selection.believed]
     error = error[np.isfinite(error)]
     return float(np.sqrt(np.mean(error * error) / 2.0)) if len(error) else 0.0
+
+
+def figures(selection: Selection, result: Result, norms: FloatArray) -> dict[str, Any]:
+    """Return how a solve went, by the names of a report.
+
+    Args:
+        selection: what was solved.
+        result: what came of it.
+        norms: (n_all,) sizes of the residuals after it, as ``Selection.norms``.
+    """
+    problem = selection.problem
+    return {
+        "status": result.status,
+        "reason": result.reason,
+        "method": result.method,
+        "iterations": max(len(result.trace) - 1, 0),
+        "accepted_iterations": result.accepted_iterations,
+        "linear_iterations": result.linear_iterations,
+        "objective_before": result.objective_before,
+        "objective_after": result.objective_after,
+        "gradient_norm": result.gradient_norm,
+        "rms_px_before": rms_of_norms_px(selection, selection.norms),
+        "rms_px_after": rms_of_norms_px(selection, norms),
+        "keyframes": int(np.count_nonzero(~problem.fixed)),
+        "fixed_keyframes": int(np.count_nonzero(problem.fixed)),
+        "landmarks": problem.n_points,
+        "observations": len(problem.observations),
+        "outliers": len(selection.rows) - len(problem.observations),
+    }
 
 
 def rms_px(scene: Scene, config: Config, state: str) -> float:

@@ -197,10 +197,8 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     """
     guess = np.where(scene.landmarks.has_guess[landmarks, None], scene.landmarks.guess[landmarks], np.nan)
     rows = scene.views_of(landmarks)
-    place = np.empty(len(scene.keyframes), np.intp)
-    place[scene.order] = np.arange(len(scene.order))
     first = np.full(len(scene.landmarks), len(scene.order) - 1)
-    np.minimum.at(first, scene.sightings.landmark[rows], place[scene.sightings.keyframe[rows]])
+    np.minimum.at(first, scene.sightings.landmark[rows], scene.places()[scene.sightings.keyframe[rows]])
     rotation, translation = scene.corrections(scene.order[first[landmarks]])
     return np.asarray((rotation @ guess[:, :, None])[..., 0] + translation)
 

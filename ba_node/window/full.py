@@ -1,0 +1,252 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Refine everything that is kept, on a copy, while windows go on being solved; then put the result in.
+
+Between the copy and the result keyframes and points come, move and go. With ``A`` the pose (world from body) that a
+keyframe k of the copy has when the result comes, and ``B`` the one that the result gives it, the correction at k is
+
+    C_k = B inverse(A),         for one camera    C_k(x) = s_k R_C x + t_C,
+
+s_k being the median, over the points of k in the result, of how much farther from k they are than before: where scale
+drifts, the map has another scale at each of its ends.
+
+- A keyframe of the copy gets B, a point of the copy its new place.
+- Every other keyframe is moved by the correction of the last one of the copy before it, every other point by the
+  correction of the keyframe that saw it first: what came later keeps its place relative to the end of the copy.
+- Then the keyframes after the copy and a window before are solved, all others that see their points being fixed: what
+  came later has seen points of the copy as well, and these have moved.
+- A point that lost its place meanwhile stays without. What was forgotten is passed over, and the result of a map that
+  is no longer the current one altogether.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ba_node.core import geometry, methods, native_kernels, solver
+from ba_node.window.merging import judge, merge, scaled
+from ba_node.window.problems import problem_of
+from ba_node.window.selection import Selection, select
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.config import Config, SolverConfig
+    from ba_node.core.options import SolverOptions
+    from ba_node.core.problem import State
+    from ba_node.core.result import Iteration, Result
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
+
+MAX_ITERATIONS = 50
+# A window is solved again and again, everything once: it is worth more digits.
+_FUNCTION_TOLERANCE = 1e-6
+# Fewer points than this tell a keyframe no scale of its own.
+_MIN_POINTS = 3
+# Windows are not to wait long for it.
+_MAX_JOINED = 100
+
+
+def options(config: SolverConfig, method: str = "", max_iterations: int = 0) -> SolverOptions:
+    """Return the choices for a solve of everything: those of the parameters but for what is given, and finer."""
+    tolerance = min(config.function_tolerance, _FUNCTION_TOLERANCE)
+    changed = dataclasses.replace(
+        config,
+        method=method or config.method,
+        max_iterations=max_iterations or MAX_ITERATIONS,
+        function_tolerance=tolerance,
+    )
+    return methods.from_config(changed)
+
+
+class Solved(NamedTuple):
+    """What the solver made of a copy, and the sizes of the residuals after it, as ``Selection.norms``."""
+
+    result: Result
+    norms: FloatArray
+
+
+@dataclass(frozen=True)
+class Copy:
+    """The problem of everything that was kept at a moment, and by which ids to find its parts again.
+
+    Attributes:
+        scene: where it is from; asked only whether it is still the current one.
+        selection: the problem. Its rows hold at that moment only.
+        keyframe_id: (n_kf,) uint64.
+        track_id: (n_pt,) uint64.
+        placed: (n_pt,) True where the point had a position.
+        position: (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it.
+    """
+
+    scene: Scene
+    selection: Selection
+    keyframe_id: IdArray
+    track_id: IdArray
+    placed: BoolArray
+    position: FloatArray
+
+    def solve(
+        self,
+        chosen: SolverOptions,
+        *,
+        clock: Callable[[], float] = lambda: 0.0,
+        on_iteration: Callable[[Iteration], bool] | None = None,
+    ) -> Solved:
+        """Solve, on any thread. The scene is not touched."""
+        result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration)
+        whole = dataclasses.replace(self.selection.problem, observations=self.selection.sightings)
+        return Solved(result, native_kernels.residual_norms(whole, result.state, chosen.backend))
+
+
+@dataclass(frozen=True)
+class _Similarity:
+    """x -> scale * rotation x + translation: (n,), (n, 3, 3), (n, 3)."""
+
+    scale: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+
+    def move(self, which: IntArray, points: FloatArray) -> FloatArray:
+        """Return points moved, each by one of the transforms."""
+        turned = (self.rotation[which] @ points[:, :, None])[..., 0]
+        return np.asarray(self.scale[which, None] * turned + self.translation[which])
+
+
+def copy(scene: Scene, config: Config) -> Copy | str:
+    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
+    sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
+    selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
+    if isinstance(selection, str):
+        return selection
+    return Copy(
+        scene,
+        selection,
+        scene.keyframes.keyframe_id[selection.keyframes],
+        scene.landmarks.track_id[selection.landmarks],
+        scene.landmarks.has_position[selection.landmarks],
+        scene.keyframes.position[selection.keyframes],
+    )
+
+
+def put(scene: Scene, config: Config, taken: Copy, state: State) -> int | None:
+    """Put the result for a copy into the map.
+
+    Returns:
+        How many refined keyframes that are not of the copy followed; None if nothing of the copy is left.
+    """
+    state = scaled(taken.selection, taken.position, state)
+    keyframes = scene.find_keyframes(taken.keyframe_id)
+    here = keyframes >= 0
+    if scene is not taken.scene or not here.any():
+        return None
+    table, points = scene.keyframes, scene.landmarks
+    rotation, position = geometry.inverse(state.rotation, state.translation)
+    rotation, position = geometry.nearest_rotation(rotation), position + taken.selection.origin
+    found = state.points + taken.selection.origin
+    landmarks = scene.find_landmarks(taken.track_id)
+    kept = (landmarks >= 0) & (~taken.placed | points.has_position[landmarks])
+
+    similarity = _corrections(scene, taken, (rotation, position, found), keyframes, landmarks)
+    member = np.full(len(table), -1)
+    member[keyframes[here]] = np.flatnonzero(here)
+    anchor = _anchors(member[scene.order])
+    anchor_of_row = np.empty(len(table), np.intp)
+    anchor_of_row[scene.order] = anchor
+
+    _follow_points(scene, landmarks[kept], anchor_of_row, similarity)
+    others = np.flatnonzero((member < 0) & table.refined)
+    which = anchor_of_row[others]
+    table.position[others] = similarity.move(which, table.position[others])
+    table.rotation[others] = geometry.nearest_rotation(similarity.rotation[which] @ table.rotation[others])
+
+    table.rotation[keyframes[here]], table.position[keyframes[here]] = rotation[here], position[here]
+    table.refined[keyframes[here]] = True
+    points.position[landmarks[kept]] = found[kept]
+    points.has_position[landmarks[kept]] = True
+    scene.settle_poses()
+    _judge(scene, config, taken.selection, keyframes[here], landmarks[kept])
+    _join(scene, config, len(table) - 1 - int(scene.places()[keyframes[here]].max()))
+    return len(others)
+
+
+def _join(scene: Scene, config: Config, later: int) -> None:
+    """Refine the keyframes on both sides of the seam against all that is older."""
+    if later == 0:
+        return
+    size = min(later + config.window.max_keyframes, _MAX_JOINED)
+    wide = dataclasses.replace(config.window, max_keyframes=size, max_fixed_keyframes=len(scene.keyframes))
+    selection = select(scene, dataclasses.replace(config, window=wide))
+    if not isinstance(selection, str):
+        result = solver.solve(selection.problem, options(config.solver, max_iterations=config.solver.max_iterations))
+        merge(scene, selection, result, config.tracks.outlier_px, config.solver.backend)
+
+
+def _corrections(
+    scene: Scene,
+    taken: Copy,
+    result: tuple[FloatArray, FloatArray, FloatArray],
+    keyframes: IntArray,
+    landmarks: IntArray,
+) -> _Similarity:
+    """Return the correction at each keyframe of the copy; senseless at those that are forgotten."""
+    rotation, position, found = result
+    before = (scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes])
+    turn = rotation @ np.swapaxes(before[0], -1, -2)
+    scale = np.ones(len(keyframes))
+    obs = taken.selection.problem.observations
+    known = (landmarks >= 0) & taken.placed & scene.landmarks.has_position[landmarks]
+    usable = known[obs.point] & (keyframes >= 0)[obs.keyframe] & (taken.selection.unscaled >= 0)[obs.keyframe]
+    at, point = obs.keyframe[usable], obs.point[usable]
+    far = np.linalg.norm(found[point] - position[at], axis=1)
+    was = np.linalg.norm(scene.landmarks.position[landmarks[point]] - before[1][at], axis=1)
+    sound = (far > 0) & (was > 0)
+    for k in np.unique(at[sound]):
+        ratio = (far / np.where(was > 0, was, 1.0))[sound & (at == k)]
+        if len(ratio) >= _MIN_POINTS:
+            scale[k] = np.median(ratio)
+    return _Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
+
+
+def _anchors(member: IntArray) -> IntArray:
+    """Return for each keyframe, oldest first, the last member before it; before the first member, that one.
+
+    Args:
+        member: (n,) number of each keyframe in the copy, -1 for others.
+    """
+    at = np.maximum.accumulate(np.where(member >= 0, np.arange(len(member)), -1))
+    return np.asarray(member[np.where(at < 0, int(np.argmax(member >= 0)), at)])
+
+
+def _follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: _Similarity) -> None:
+    """Move the points that the result does not place with the keyframe that saw them first."""
+    follows = scene.landmarks.has_position.copy()
+    follows[updated] = False
+    places = scene.places()
+    first = np.zeros(len(scene.landmarks), np.intp)
+    first[scene.sightings.landmark] = len(places) - 1
+    np.minimum.at(first, scene.sightings.landmark, places[scene.sightings.keyframe])
+    rows = np.flatnonzero(follows)
+    which = anchor_of_row[scene.order[first[rows]]]
+    scene.landmarks.position[rows] = similarity.move(which, scene.landmarks.position[rows])
+
+
+def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArray, landmarks: IntArray) -> None:
+    """Judge what the keyframes of the copy saw of its points anew; later ones have their windows for that."""
+    is_ours = np.zeros(len(scene.keyframes), bool)
+    is_ours[keyframes] = True
+    rows = scene.views_of(landmarks)
+    rows = rows[is_ours[scene.sightings.keyframe[rows]]]
+    origin = selection.origin
+    problem = problem_of(
+        scene, rows, keyframes, landmarks, origin, scene.landmarks.position[landmarks] - origin, config
+    )
+    now = dataclasses.replace(
+        selection, problem=problem, sightings=problem.observations, rows=rows, keyframes=keyframes, landmarks=landmarks
+    )
+    norms = native_kernels.residual_norms(problem, problem.start, config.solver.backend)
+    judge(scene, now, norms, config.tracks.outlier_px)
