@@ -310,6 +310,37 @@ class NodeConfig:
 
 
 @dataclass(frozen=True)
+class DiagnosticsConfig:
+    """When /diagnostics warns. See docs/diagnostics.md."""
+
+    silence_s: float = _param(
+        5.0, "Without a keyframe for this long the inputs are stale.", unit="s", minimum=0.1, maximum=86400.0
+    )
+    recent_s: float = _param(
+        10.0, "What was dropped or turned away counts for this long.", unit="s", minimum=1.0, maximum=3600.0
+    )
+    queue_warn_share: float = _param(
+        0.5, "Share of node.inbox_size that waits from which on the queue warns.", minimum=0.0, maximum=1.0
+    )
+    latency_warn_s: float = _param(
+        0.2, "95th percentile from arrival to publication that warns.", unit="s", minimum=0.0, maximum=1e6
+    )
+    latency_error_s: float = _param(1.0, "The same as an error.", unit="s", minimum=0.0, maximum=1e6)
+    rms_warn_px: float = _param(
+        2.0, "Root mean square residual after a solve that warns.", unit="px", minimum=0.0, maximum=1e6
+    )
+    rms_error_px: float = _param(10.0, "The same as an error.", unit="px", minimum=0.0, maximum=1e6)
+    inliers_warn_share: float = _param(
+        0.7, "Share of observations that are believed below which it warns.", minimum=0.0, maximum=1.0
+    )
+    inliers_error_share: float = _param(0.3, "The same as an error.", minimum=0.0, maximum=1.0)
+    memory_warn_mb: float = _param(
+        2000.0, "Memory of the process (resident) that warns.", unit="MB", minimum=0.0, maximum=1e9
+    )
+    memory_error_mb: float = _param(8000.0, "The same as an error.", unit="MB", minimum=0.0, maximum=1e9)
+
+
+@dataclass(frozen=True)
 class Config:
     """All parameters, in groups. Immutable; a change makes a new one with :meth:`with_values`."""
 
@@ -320,6 +351,7 @@ class Config:
     frames: FramesConfig = field(default_factory=FramesConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     node: NodeConfig = field(default_factory=NodeConfig)
+    diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
 
     def values(self) -> dict[str, Value]:
         """Return every parameter by its full name, in declaration order."""

@@ -136,12 +136,14 @@ class WindowView:
         rms_px: (n,) root mean square residual per coordinate of each keyframe, px; NaN without observations.
         links: (m, 2) pairs of keyframes that see common points.
         shared: (m,) number of their common points.
+        frusta: (n_cam, 5, 3) what each camera sees, in the body: its centre, then the corners at a depth of 1 m.
     """
 
     free: NDArray[np.bool_]
     rms_px: FloatArray
     links: NDArray[np.intp]
     shared: NDArray[np.intp]
+    frusta: FloatArray
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse
 
-from ba_node.core import objective
+from ba_node.core import cameras, geometry, objective
 from ba_node.estimate import WindowView
 
 if TYPE_CHECKING:
-    from ba_node.core.problem import Observations, Problem, State
+    from ba_node.core.problem import Cameras, Observations, Problem, State
     from ba_node.scene.tables import FloatArray, IntArray
 
 
@@ -30,7 +30,7 @@ def view(problem: Problem, state: State, place: IntArray, n: int) -> WindowView:
     free[place] = ~problem.fixed
     rms_px[place] = _rms_by_keyframe(problem, state)
     links, shared = _links(problem.observations, problem.n_keyframes, problem.n_points)
-    return WindowView(free, rms_px, place[links], shared)
+    return WindowView(free, rms_px, place[links], shared, _frusta(problem.cameras))
 
 
 def _rms_by_keyframe(problem: Problem, state: State) -> FloatArray:
@@ -50,3 +50,15 @@ def _links(obs: Observations, n_kf: int, n_points: int) -> tuple[IntArray, IntAr
     sees.data[:] = 1.0
     common = scipy.sparse.triu(sees @ sees.T, k=1).tocoo()
     return np.stack([common.row, common.col], axis=1).astype(np.intp), common.data.astype(np.intp)
+
+
+def _frusta(rig: Cameras) -> FloatArray:
+    """Return the centre and the corners of each camera's view in the body, (n_cam, 5, 3), at a depth of 1 m.
+
+    The size of the images is not kept: they are taken to reach as far on the other side of the principal point.
+    """
+    fx, fy, cx, cy = (rig.params[:, i] for i in (cameras.FX, cameras.FY, 2, 3))
+    half = np.abs(np.stack([cx / fx, cy / fy, np.ones(len(fx))], axis=1))
+    signs = np.array([[0, 0, 0], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+    rotation, position = geometry.inverse(rig.rotation, rig.translation)
+    return np.asarray((half[:, None, :] * signs) @ np.swapaxes(rotation, 1, 2) + position[:, None, :])

@@ -25,4 +25,5 @@ def test_view_tells_who_sees_the_same_and_how_well() -> None:
     assert got.free.tolist() == [False, False, True, True]
     assert got.links.tolist() == [[0, 2], [2, 3]]
     assert got.shared.tolist() == [2, 1]
+    np.testing.assert_allclose(got.frusta[0], [[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]])
     np.testing.assert_allclose(got.rms_px, [2.5, np.nan, 0.0, 0.0])

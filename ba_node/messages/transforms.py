@@ -1,0 +1,94 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Make messages of the correction map -> odom and of poses with their covariance, and read /tf_static."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.messages.factory import MessageFactory, header_message, pose_message
+from ba_node.window.correction import Transform
+
+if TYPE_CHECKING:
+    from ba_node.estimate import Correction, Estimate
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+COVARIANCE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:
+    """Return a ``tf2_msgs/TFMessage`` with map -> odom."""
+    (x, y, z), (qx, qy, qz, qw) = correction.position.tolist(), correction.orientation.tolist()
+    transform = factory.make(
+        "geometry_msgs/msg/Transform",
+        translation=factory.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=factory.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    )
+    stamped = factory.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header_message(factory, stamp_ns, map_frame),
+        child_frame_id=correction.odom_frame,
+        transform=transform,
+    )
+    return factory.make(TF_TYPE, transforms=[stamped])
+
+
+def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any]:
+    """Return a ``geometry_msgs/PoseWithCovarianceStamped`` for each refined keyframe; all zeros where unknown."""
+    assert estimate.covariance is not None
+    poses, covariance = estimate.refined, np.nan_to_num(estimate.covariance, nan=0.0)
+    return [
+        factory.make(
+            COVARIANCE_TYPE,
+            header=header_message(factory, int(poses.stamp_ns[k]), estimate.frame_id),
+            pose=factory.make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=pose_message(factory, poses.position[k], poses.orientation[k]),
+                covariance=factory.fixed(covariance[k].ravel()),
+            ),
+        )
+        for k in range(len(poses))
+    ]
+
+
+class StaticTree:
+    """What /tf_static says: where each frame sits in its parent."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._parents: dict[str, tuple[str, Transform]] = {}
+
+    def add(self, message: Any) -> None:
+        """Take in a ``tf2_msgs/TFMessage``; a frame that is named again sits where it is said last."""
+        for stamped in message.transforms:
+            t, q = stamped.transform.translation, stamped.transform.rotation
+            quaternion = np.array([q.x, q.y, q.z, q.w])
+            position = np.array([t.x, t.y, t.z])
+            if np.isfinite(position).all() and np.isfinite(quaternion).all() and np.linalg.norm(quaternion) > 0.0:
+                placed = Transform(geometry.matrix_from_quaternion(quaternion), position)
+                self._parents[_name(stamped.child_frame_id)] = (_name(stamped.header.frame_id), placed)
+
+    def find(self, base: str, frame: str) -> Transform | None:
+        """Return base from frame, None while the way from one to the other is not known."""
+        up, down = self._way_up(_name(base)), self._way_up(_name(frame))
+        common = next((name for name in down if name in up), None)
+        return None if common is None else up[common].inverse().after(down[common])
+
+    def _way_up(self, frame: str) -> dict[str, Transform]:
+        """Return ancestor from frame, for the frame itself and all its ancestors, nearest first."""
+        way = {frame: Transform(np.eye(3), np.zeros(3))}
+        while frame in self._parents:
+            parent, placed = self._parents[frame]
+            if parent in way:
+                break  # a circle, which tf does not allow
+            way[parent] = placed.after(way[frame])
+            frame = parent
+        return way
+
+
+def _name(frame: str) -> str:
+    """Return a frame's name without the leading slash of ROS 1."""
+    return frame.removeprefix("/")
