@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 from ba_node.estimate import SolveReport, Status
 from ba_node.messages.factory import MessageFactory, header_message
+from ba_node.messages.topics import SHARED_TYPES
 
 if TYPE_CHECKING:
     from ba_node.config import DiagnosticsConfig
-
-DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 class Level(enum.IntEnum):
@@ -108,7 +107,7 @@ def diagnostics_message(factory: MessageFactory, findings: list[Finding], node: 
         )
         for finding in findings
     ]
-    return factory.make(DIAGNOSTICS_TYPE, header=header_message(factory, stamp_ns, ""), status=statuses)
+    return factory.make(SHARED_TYPES["/diagnostics"], header=header_message(factory, stamp_ns, ""), status=statuses)
 
 
 def _inputs(health: Health, limits: DiagnosticsConfig) -> Finding:

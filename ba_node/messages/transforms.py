@@ -10,13 +10,11 @@ import numpy as np
 
 from ba_node.core import geometry
 from ba_node.messages.factory import MessageFactory, header_message, pose_message
+from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
 from ba_node.window.correction import Transform
 
 if TYPE_CHECKING:
     from ba_node.estimate import Correction, Estimate
-
-TF_TYPE = "tf2_msgs/msg/TFMessage"
-COVARIANCE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
 def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:
@@ -33,7 +31,7 @@ def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, 
         child_frame_id=correction.odom_frame,
         transform=transform,
     )
-    return factory.make(TF_TYPE, transforms=[stamped])
+    return factory.make(SHARED_TYPES["/tf"], transforms=[stamped])
 
 
 def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any]:
@@ -42,7 +40,7 @@ def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any
     poses, covariance = estimate.refined, np.nan_to_num(estimate.covariance, nan=0.0)
     return [
         factory.make(
-            COVARIANCE_TYPE,
+            SIDE_TYPES["pose_with_covariance"],
             header=header_message(factory, int(poses.stamp_ns[k]), estimate.frame_id),
             pose=factory.make(
                 "geometry_msgs/msg/PoseWithCovariance",

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from ba_node.config import Config
     from ba_node.estimate import Estimate
+    from ba_node.measurements import CameraRig
     from ba_node.ros.inbox import Inbox
     from ba_node.ros.worker import Notice, Worker
 
@@ -47,6 +48,9 @@ class Host:
         log: log a Notice, the same one not more often than every few seconds.
         active: True between activate and deactivate.
         ignoring: why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken.
+        arrived: messages that came in, by topic; ignored ones too.
+        place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
+        tf: what becomes of the transform map -> odom, in words.
     """
 
     node: Any
@@ -57,6 +61,9 @@ class Host:
     active: bool = False
     ignoring: set[str] = field(default_factory=lambda: {"inactive"})
     counted: Counter[str] = field(default_factory=Counter)
+    arrived: Counter[str] = field(default_factory=Counter)
+    place_cameras: Callable[[CameraRig], CameraRig | None] = lambda rig: rig
+    tf: str = ""
     at_cleanup: ExitStack = field(default_factory=ExitStack)
 
 

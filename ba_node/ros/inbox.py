@@ -52,6 +52,11 @@ class Inbox:
         with self._changed:
             return self._dropped
 
+    def __len__(self) -> int:
+        """Return how many measurements wait."""
+        with self._changed:
+            return sum(len(lane) for lane in self._lanes.values())
+
     @property
     def closed(self) -> bool:
         """Return True once :meth:`close` was called."""

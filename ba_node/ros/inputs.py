@@ -9,7 +9,7 @@ import pickle
 import time
 from typing import Any
 
-from ba_node.measurements import CameraRig
+from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
 from ba_node.ros import qos
 from ba_node.ros.component import Component, Host
@@ -33,14 +33,17 @@ class Inputs(Component):
     def _receive(self, topic: str, kind: str, message: Any) -> None:
         """Hand a message to the worker. What cannot be read is counted; it must not end the node."""
         counted = self.host.counted
+        self.host.arrived[topic] += 1
         if self.host.ignoring and topic not in qos.LATCHED_INPUTS:
             counted.update(self.host.ignoring)
             return
         if topic in qos.LATCHED_INPUTS and self._came_twice(topic, message):
             return
         try:
-            measurement = measurement_from_message(kind, message)
-            if isinstance(measurement, CameraRig) and not self._is_news(topic, measurement):
+            measurement: Measurement | None = measurement_from_message(kind, message)
+            if isinstance(measurement, CameraRig):
+                measurement = self.host.place_cameras(measurement) if self._is_news(topic, measurement) else None
+            if measurement is None:
                 return
             self.host.inbox.put(measurement, time.monotonic())
         except Exception as error:

@@ -22,11 +22,15 @@ from typing import TYPE_CHECKING, Any
 from ba_node.backend import Backend
 from ba_node.estimate import Estimate
 from ba_node.ros.component import Component, Host
+from ba_node.ros.diagnostics import Diagnostics
 from ba_node.ros.inbox import Inbox
 from ba_node.ros.inputs import Inputs
 from ba_node.ros.lifecycle import ManagedNode
+from ba_node.ros.map_transform import MapTransform
 from ba_node.ros.parameters import Parameters
 from ba_node.ros.publishing import Publishing
+from ba_node.ros.side_outputs import SideOutputs
+from ba_node.ros.static_frames import StaticFrames
 from ba_node.ros.throttle import Throttle
 from ba_node.ros.worker import Notice, Worker
 
@@ -35,7 +39,7 @@ if TYPE_CHECKING:
 
 NODE_NAME = "ba_node"
 # In the order in which they are made and get estimates; destroyed in reverse. What feeds the worker comes last.
-COMPONENTS: tuple[type[Component], ...] = (Publishing, Inputs)
+COMPONENTS: tuple[type[Component], ...] = (Publishing, MapTransform, SideOutputs, Diagnostics, StaticFrames, Inputs)
 _LOG_PERIOD_S = 5.0
 # For a worker that is idle; one that solves ends by itself.
 _STOP_S = 0.02

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -17,8 +18,10 @@ from typing import Any
 
 import pytest
 import rclpy
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RclpyParameter
 
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages import conversion
@@ -26,6 +29,7 @@ from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.domain import free_domain, isolation
+from ba_node.synthetic import SyntheticData
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 30.0
@@ -153,6 +157,27 @@ class Peer:
         else:
             self.publishers["camera_rig"].publish(conversion.rig_message(FACTORY, measurement, stamp_ns))
 
+    def play(self, data: SyntheticData, session_id: int = 0) -> None:
+        """Publish a recording, each keyframe when the one before was solved; listens to the reports for that."""
+        if not any(s.topic_name.endswith("ba_node/report") for s in self.node.subscriptions):
+            self.listen("report")
+            self.connect()
+        self.publish(data.rig)
+        for keyframe, images in zip(data.keyframes, data.tracks, strict=True):
+            self.publish(dataclasses.replace(keyframe, session_id=session_id))
+            for image in images:
+                self.publish(dataclasses.replace(image, session_id=session_id), keyframe.stamp_ns)
+            self.await_report(session_id, keyframe.keyframe_id)
+
+    def await_report(self, session_id: int, keyframe_id: int) -> None:
+        """Wait until the last report is that of a keyframe."""
+        reports, wanted = self.received["report"], (session_id, keyframe_id)
+
+        def has_come() -> bool:
+            return bool(reports) and (reports[-1].session_id, reports[-1].newest_keyframe_id) == wanted
+
+        self.until(has_come, f"a report on keyframe {keyframe_id}")
+
     def all_acknowledged(self) -> bool:
         """Return True once the node has received everything that was sent."""
         return all(publisher.wait_for_all_acked() for publisher in self.publishers.values())
@@ -176,6 +201,12 @@ class Peer:
         future = self.send(kind, service, request)
         self.until(future.done, f"an answer of {service}")
         return future.result()
+
+    def set(self, name: str, value: Any) -> Any:
+        """Set a parameter of the node and return the result."""
+        parameter = RclpyParameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[parameter])
+        return self.call(SetParameters, "ba_node/set_parameters", request).results[0]
 
     def close(self) -> None:
         self.executor.shutdown()
