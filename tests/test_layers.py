@@ -38,6 +38,7 @@ ROS_ONLY = (
     "rclpy",
     "action_msgs",
     "ba_msgs",
+    "diagnostic_msgs",
     "geometry_msgs",
     "nav_msgs",
     "rcl_interfaces",
@@ -45,6 +46,7 @@ ROS_ONLY = (
     "std_msgs",
     "std_srvs",
     "tf2_msgs",
+    "visualization_msgs",
 )
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

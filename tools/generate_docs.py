@@ -18,6 +18,7 @@ from ba_node.core.methods import CATALOGUE
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
 from ba_node.messages.commands import ACTION_TYPES, SERVICE_TYPES
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
 
@@ -41,6 +42,14 @@ OUTPUTS = {
     "path": ("latched", "Poses of all keyframes kept, newest `output.path_max_poses`."),
     "points": ("latched", "The map: fields x, y, z (m), rms_px (float32), views (uint32)."),
     "report": ("reliable", "How each solve went, failed and skipped ones too."),
+}
+SIDE_OUTPUTS = {
+    "pose_with_covariance": ("reliable", "As `~/pose`, with a covariance; see docs/frames.md. Only while subscribed."),
+    "markers": ("latched", "Frusta, links between keyframes, residual colours. Only while subscribed."),
+}
+SHARED_OUTPUTS = {
+    "/tf": ("reliable", "`map -> odom`, see docs/frames.md. Needs tf2_msgs."),
+    "/diagnostics": ("reliable", "How the node fares, once a second, see docs/diagnostics.md."),
 }
 SERVICES = {
     "reset": "Forget the map and begin anew; the cameras stay.",
@@ -86,7 +95,8 @@ def topics_markdown() -> str:
     parts = [TOPICS_INTRO]
     for title, prefix, types, about in (
         ("Inputs", "", INPUT_TYPES, INPUTS),
-        ("Outputs", "~/", OUTPUT_TYPES, OUTPUTS),
+        ("Outputs", "~/", OUTPUT_TYPES | SIDE_TYPES, OUTPUTS | SIDE_OUTPUTS),
+        ("Outputs that all of ROS shares", "", SHARED_TYPES, SHARED_OUTPUTS),
     ):
         if types.keys() != about.keys():
             raise SystemExit(f"tools/generate_docs.py describes {sorted(about)}, the node has {sorted(types)}")
