@@ -292,7 +292,8 @@ class Backend:
                 selection, state, measured, methods.from_config(self.config.solver)
             )
         if self.extras.view:
-            found["view"] = view(selection.problem, state, place, len(refined))
+            good = ~self.scene.sightings.outlier[selection.rows[selection.believed]]
+            found["view"] = view(selection.problem, state, good, place, len(refined))
         return found
 
     def _base_report(self, newest: int) -> SolveReport:

@@ -38,7 +38,7 @@ _BLUE, _GREY, _UNKNOWN = (0.25, 0.5, 1.0, 1.0), (0.6, 0.6, 0.6, 0.6), (1.0, 0.0,
 # From the centre to the corners, and around.
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]]).ravel()
 # Opacity of a link with hardly a common point.
-_FAINTEST = 0.15
+_FAINTEST = 0.05
 
 
 def marker_array(estimate: Estimate, config: OutputConfig, *, clear: bool) -> bytes:
@@ -96,7 +96,8 @@ def _links(poses: Poses, view: WindowView, rows: NDArray[np.intp]) -> tuple[Floa
     points = poses.position[view.links[rows]].reshape(-1, 3)
     colours = np.ones((len(points), 4))
     share = view.shared[rows] / max(int(view.shared.max(initial=1)), 1)
-    colours[:, 3] = np.repeat(_FAINTEST + (1.0 - _FAINTEST) * share, 2)
+    # Squared: nearly all keyframes of a window share something, and what matters would not stand out.
+    colours[:, 3] = np.repeat(_FAINTEST + (1.0 - _FAINTEST) * share * share, 2)
     return points, colours
 
 

@@ -14,28 +14,29 @@ from ba_node.estimate import WindowView
 
 if TYPE_CHECKING:
     from ba_node.core.problem import Cameras, Observations, Problem, State
-    from ba_node.scene.tables import FloatArray, IntArray
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
 
-def view(problem: Problem, state: State, place: IntArray, n: int) -> WindowView:
+def view(problem: Problem, state: State, good: BoolArray, place: IntArray, n: int) -> WindowView:
     """Return what there is to see.
 
     Args:
         problem: as it was solved.
         state: its solution.
+        good: (n_obs,) observations that are believed after it: a wrong match says nothing about a pose.
         place: (n_kf,) row of each keyframe of the problem among the n keyframes of the estimate.
         n: keyframes of the estimate; those that are not in the problem are neither free nor linked.
     """
     free, rms_px = np.zeros(n, bool), np.full(n, np.nan)
     free[place] = ~problem.fixed
-    rms_px[place] = _rms_by_keyframe(problem, state)
+    rms_px[place] = _rms_by_keyframe(problem, state, good)
     links, shared = _links(problem.observations, problem.n_keyframes, problem.n_points)
     return WindowView(free, rms_px, place[links], shared, _frusta(problem.cameras))
 
 
-def _rms_by_keyframe(problem: Problem, state: State) -> FloatArray:
+def _rms_by_keyframe(problem: Problem, state: State, good: BoolArray) -> FloatArray:
     error = objective.reprojection_errors(problem, state)
-    seen = ~np.isnan(error[:, 0])
+    seen = good & ~np.isnan(error[:, 0])
     keyframe = problem.observations.keyframe[seen]
     total = np.bincount(keyframe, np.sum(error[seen] ** 2, axis=1), problem.n_keyframes)
     count = np.bincount(keyframe, minlength=problem.n_keyframes)

@@ -21,9 +21,11 @@ def test_view_tells_who_sees_the_same_and_how_well() -> None:
     obs = Observations(keyframe, camera, point, uv, np.ones(7), np.empty(0), np.empty(0))
     problem = Problem(state, np.array([True, False, False]), cameras, obs)
 
-    got = view(problem, state, np.array([0, 2, 3]), 4)
+    got = view(problem, state, np.ones(7, bool), np.array([0, 2, 3]), 4)
     assert got.free.tolist() == [False, False, True, True]
     assert got.links.tolist() == [[0, 2], [2, 3]]
     assert got.shared.tolist() == [2, 1]
     np.testing.assert_allclose(got.frusta[0], [[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]])
     np.testing.assert_allclose(got.rms_px, [2.5, np.nan, 0.0, 0.0])
+    believed = view(problem, state, np.arange(7) != 2, np.array([0, 2, 3]), 4)
+    np.testing.assert_allclose(believed.rms_px, [0.0, np.nan, 0.0, 0.0])
