@@ -13,7 +13,8 @@ _CAP_3000 = "cap=3000"
 # The noise of the spheres is 0.17 px, and BAL files have no sigma: three of it.
 _GAMMA = "gamma=0.5"
 _METHODS = ("LMA-CD", "BAL", "DINM", "ADINM", "local DINM", "IRLS")
-_COLUMNS = ("rmse_cameras", "rmse_points", "objective", "gradient", "steps", "solves", "seconds", "side", "end")
+_ERRORS = ("rmse_cameras", "rmse_points", "median_points")
+_COLUMNS = (*_ERRORS, "objective", "gradient", "steps", "solves", "seconds", "side", "end")
 # RMSE of cameras and of points: at the start, then in the order of _METHODS.
 _RMSE = {
     "10-289": (
@@ -53,7 +54,14 @@ _RMSE = {
         (1.35, 5.92),
     ),
 }
-_STEPS = {"10-289": 100, "50-1000": 60, "100-4000": 15, "500-5000": 3}
+_STEPS = {"10-289": 100, "50-1000": 60, "100-4000": 10, "500-5000": 2}
+# With the C++ kernels, to come nearer to an end: too large for the others.
+_MORE_STEPS = {"100-4000": 40, "500-5000": 15}
+_NATIVE = (
+    ("local DINM", "local_dinm", ()),
+    ("IRLS", "irls_huber", (_GAMMA,)),
+    ("auto, Huber", "auto", ("loss=huber", _GAMMA, "function_tolerance=0")),
+)
 _PCG_CAPS = {"10-289": 1000, "50-1000": 2000, "100-4000": 3000, "500-5000": 5000}
 _FIGURES = {
     "10-289": ("5.8", "5.9", "5.10"),
@@ -84,11 +92,12 @@ def _sphere(number: str, problem: str) -> Experiment:
                 "LMA-CD",
             )
         )
-    if problem == "500-5000":
-        cases += [
-            Case(f"{label}, C++", Run(problem, name, ("backend=native", *gamma), 30), {}, "30 steps", "LMA-CD")
-            for label, name, gamma in (("local DINM", "local_dinm", ()), ("IRLS", "irls_huber", (_GAMMA,)))
-        ]
+    more = _MORE_STEPS.get(problem, 0)
+    cases += [
+        Case(f"{label}, C++", Run(problem, name, ("backend=native", *settings), more), {}, f"{more} steps", "LMA-CD")
+        for label, name, settings in _NATIVE
+        if more
+    ]
     return Experiment(
         number,
         f"all methods on a sphere, {o.images} images, {o.points} points, {o.observations} observations",
@@ -98,7 +107,8 @@ def _sphere(number: str, problem: str) -> Experiment:
         ("layout", "curves"),
         note=f"{steps} steps each, where the thesis stops by the clock; errors are in units in which the radius is"
         f" {o.radius:g}, and {100 * o.outlier_share:g} % of the observations are outliers: neither is known of the"
-        " thesis's data, which are not published. IRLS is Huber's loss with its scale at three sigmas of the noise.",
+        " thesis's data, which are not published. IRLS is Huber's loss with its scale at three sigmas of the noise. A"
+        " few points that only two near images see can rule the RMSE of all, hence the median.",
     )
 
 

@@ -44,6 +44,7 @@ QUANTITIES: dict[str, Quantity] = {
     "side": Quantity("eliminated cameras in [steps]", ".0f"),
     "rmse_cameras": Quantity("RMSE of cameras", ".4g"),
     "rmse_points": Quantity("RMSE of points", ".4g"),
+    "median_points": Quantity("median error of points", ".4g"),
     "outside_two_px": Quantity("|error| > 2 px [%]", ".2f"),
     "gaussian_outside": Quantity("of a Gaussian as wide [%]", ".2f"),
     "kurtosis": Quantity("kurtosis (Gaussian: 3)", ".1f"),

@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from ba_node.io.json_file import write_json
+from ba_node.thesis.claims import CLAIMS
 from ba_node.thesis.experiments import Experiment
+from ba_node.thesis.judging import judge_all
+from ba_node.thesis.page import verdict_table
 from ba_node.thesis.problems import Library
 from ba_node.thesis.report import Section, write_report
 from ba_node.thesis.runner import Clock, Progress, Runner
@@ -33,7 +36,7 @@ class Repetition:
             quick: a few steps a run, and no large problem.
         """
         self._experiments = [_quick(e) for e in experiments] if quick else list(experiments)
-        self._library, self._out = Library(data), out
+        self._library, self._out, self._quick = Library(data), out, quick
 
     def missing(self) -> list[Task]:
         """Return the tasks that have no record yet.
@@ -56,8 +59,10 @@ class Repetition:
 
     def write(self, sections: Sequence[Section]) -> Path:
         """Write the pages and results.json; return the page that holds all."""
-        write_json(self._out / "results.json", results(sections))
-        return write_report(self._out, sections, None)
+        found = results(sections)
+        write_json(self._out / "results.json", found)
+        verdicts = [] if self._quick else judge_all(CLAIMS, found)
+        return write_report(self._out, sections, verdict_table(verdicts) if verdicts else None)
 
     def _tasks(self) -> list[Task]:
         return [case.task for experiment in self._experiments for case in experiment.cases]

@@ -18,7 +18,7 @@ from ba_node.core.solver import solve
 from ba_node.io.json_file import write_json
 from ba_node.offline.solver_settings import describe
 from ba_node.thesis import finals, measures
-from ba_node.thesis.problems import Library, Posed
+from ba_node.thesis.problems import NAMES, Library, Posed
 from ba_node.thesis.tasks import Measure, Run, Task, key
 
 Clock = Callable[[], float]
@@ -46,9 +46,8 @@ class Runner:
     def missing(self, tasks: Iterable[Task]) -> list[Task]:
         """Return those without a record, each once, those of the same problem together."""
         wanted = {key(task, self._library): task for task in tasks}
-        return sorted(
-            (task for name, task in wanted.items() if self._read(name) is None), key=lambda task: task.problem
-        )
+        left = (task for name, task in wanted.items() if self._read(name) is None)
+        return sorted(left, key=lambda task: NAMES.index(task.problem))
 
     def record(self, task: Task) -> Record:
         """Return the record of a task, made now if there is none.
