@@ -28,7 +28,9 @@ def generator() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["config/ba_node.yaml", "docs/methods.md", "docs/parameters.md", "docs/topics.md"])
+@pytest.mark.parametrize(
+    "name", ["config/ba_node.yaml", "docs/methods.md", "docs/parameters.md", "docs/thesis.md", "docs/topics.md"]
+)
 def test_file_is_up_to_date(name: str, generator: ModuleType) -> None:
     assert (ROOT / name).read_text() == generator.pages()[name], f"{name} is stale: run {generator.MADE_BY}"
 

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write config/ba_node.yaml, docs/parameters.md, docs/topics.md and the tables of docs/methods.md from the code.
 
+docs/thesis.md is written from docs/thesis_results.json, which `ba thesis --all` makes.
+
 Run it without arguments to write them, with --check to learn whether they are up to date (exit code 1 if not).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +24,7 @@ from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
+from ba_node.thesis.page import claims_page
 
 # A page that is written by hand holds what is generated between these lines.
 BEGIN, END = "<!-- begin: written by `{made_by}` -->\n", "<!-- end -->\n"
@@ -178,6 +182,7 @@ def pages() -> dict[str, str]:
         "config/ba_node.yaml": yaml_file(),
         "docs/parameters.md": note + parameters_page(),
         "docs/methods.md": methods_page(),
+        "docs/thesis.md": note + claims_page(json.loads((ROOT / "docs" / "thesis_results.json").read_text())),
         "docs/topics.md": note + topics_markdown(),
     }
 

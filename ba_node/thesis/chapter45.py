@@ -7,6 +7,7 @@ from __future__ import annotations
 from ba_node.synthetic import PRESETS
 from ba_node.thesis.chapter3 import CAP, CURVES, NUMPY, SOLVE_COLUMNS, STEPPED, dinm, ladybug
 from ba_node.thesis.experiments import Case, Experiment
+from ba_node.thesis.problems import LADYBUG
 from ba_node.thesis.tasks import Measure, Run
 
 _CAP_3000 = "cap=3000"
@@ -54,9 +55,9 @@ _RMSE = {
         (1.35, 5.92),
     ),
 }
-_STEPS = {"10-289": 100, "50-1000": 60, "100-4000": 10, "500-5000": 2}
+_STEPS = {"10-289": 100, "50-1000": 40, "100-4000": 8, "500-5000": 1}
 # With the C++ kernels, to come nearer to an end: too large for the others.
-_MORE_STEPS = {"100-4000": 40, "500-5000": 15}
+_MORE_STEPS = {"100-4000": 30, "500-5000": 5}
 _NATIVE = (
     ("local DINM", "local_dinm", ()),
     ("IRLS", "irls_huber", (_GAMMA,)),
@@ -160,6 +161,12 @@ CHAPTER_4 = (
         (*SOLVE_COLUMNS[:6], *STEPPED, "end"),
         ("4.3", "4.4"),
         CURVES,
+    ),
+    Experiment(
+        "linearisation",
+        "time of a linearisation with each parameterisation",
+        tuple(Case(name, Measure(LADYBUG, "linearisation", ("numpy", name))) for name in ("local", "global")),
+        ("seconds",),
     ),
     Experiment(
         "outliers",

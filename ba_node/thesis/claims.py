@@ -10,9 +10,15 @@ from ba_node.thesis.judging import Below, Breaks, Claim, Within
 _SAME = 0.999
 # So much faster is faster: more than noise of a clock.
 _FASTER = 1.2
+_SIMILAR = 1.0 / 1.05
 
 _FOUR = ("5.1", "5.2", "5.3", "5.4")
 _PAIRS = ("H-I", "C-inc", "B-diag")
+
+_UNDAMPED = (
+    "C-inc and C-diag are left after one step: where nothing damps C, a point far away jumps by -C^-1 gp however small"
+    " the region is, which holds the cameras alone."
+)
 
 CLAIMS: tuple[Claim, ...] = (
     Claim(
@@ -85,17 +91,19 @@ CLAIMS: tuple[Claim, ...] = (
                 _SAME,
             ),
         ),
+        _UNDAMPED,
     ),
     Claim(
         "INM: all but C-diag and H-diag come to similar objectives",
         "3.3.3, Figure 3.8",
         (
             *(
-                Below("3.5", "objective", other, ("C-inc",), 1.0 / 1.05)
-                for other in ("H-I", "H-inc", "C-I", "B-I", "B-inc")
+                Below("3.5", "objective", other, ("B-diag",), _SIMILAR)
+                for other in ("H-I", "H-inc", "C-I", "C-inc", "B-I", "B-inc")
             ),
-            *(Below("3.5", "objective", "C-inc", (other,), 1.05) for other in ("H-diag", "C-diag")),
+            *(Below("3.5", "objective", "B-diag", (other,), 1.05) for other in ("H-diag", "C-diag")),
         ),
+        _UNDAMPED,
     ),
     Claim(
         "INM: B-diag has the best curve of the gradient",
@@ -106,6 +114,7 @@ CLAIMS: tuple[Claim, ...] = (
         "INM: C-inc takes less time than H-I and B-diag",
         "3.3.3, Table 3.5",
         (
+            Within("3.5", "steps", "C-inc", low=25.0),
             Below("3.5", "seconds_per_solve", "C-inc", ("H-I",), _FASTER),
             Below("3.5", "seconds_per_solve", "C-inc", ("B-diag",), _FASTER),
         ),
@@ -146,11 +155,13 @@ CLAIMS: tuple[Claim, ...] = (
         "INM's gradient falls more steadily than TNM's",
         "3.3.4, Figure 3.13",
         tuple(Below("inm-tnm", "gradient_rise", f"INM:{pair}", (f"TNM:{pair}",)) for pair in _PAIRS),
+        _UNDAMPED,
     ),
     Claim(
         "INM's gradient falls deeper than TNM's",
         "3.3.4, Figure 3.13",
         tuple(Below("inm-tnm", "gradient", f"INM:{pair}", (f"TNM:{pair}",)) for pair in _PAIRS),
+        _UNDAMPED,
     ),
     Claim(
         "TNM's objective falls faster and deeper than INM's",
@@ -216,6 +227,7 @@ CLAIMS: tuple[Claim, ...] = (
         tuple(
             Below("3.9", "pcg_per_solve", "I", (other,)) for other in ("diag block of S", "B", "diag of S", "diag of B")
         ),
+        "Here M is made of the scaled matrix D^-1 S D^-1, on which PCG works.",
     ),
     Claim(
         "without a preconditioner the gradient falls deeper",
@@ -226,6 +238,7 @@ CLAIMS: tuple[Claim, ...] = (
         "a larger cap on the PCG steps is cheaper overall",
         "3.3.5, Table 3.10",
         tuple(Below("3.10", "pcg_total", "2000", (other,)) for other in ("100", "300", "500")),
+        "A cap of 500 hardly ever binds here: PCG takes some 200 steps at the mean.",
     ),
     Claim(
         "a larger cap brings the gradient down further; it should be above 700",
@@ -283,7 +296,11 @@ CLAIMS: tuple[Claim, ...] = (
     Claim(
         "local parameterisation takes less time",
         "4.2, Table 4.2",
-        (Below("4.2", "seconds_per_solve", "local", ("global",), 1.05),),
+        (
+            Below("4.2", "seconds", "local", ("global",), _FASTER),
+            Below("linearisation", "seconds", "local", ("global",), 1.05),
+        ),
+        "Of an iteration's time the derivatives are a small part; the thesis's own ratio is 1.14.",
     ),
     Claim(
         "more reprojection errors are large than in a Gaussian distribution: there are outliers",

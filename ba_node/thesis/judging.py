@@ -38,6 +38,9 @@ def figure(results: Results, experiment: str, label: str, quantity: str) -> floa
 class Check(Protocol):
     """One comparison."""
 
+    def cases(self) -> tuple[tuple[str, str], ...]:
+        """Return experiment and label of each case that it looks at."""
+
     def look(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and in words what was asked and found."""
 
@@ -52,16 +55,22 @@ class Below:
     large: tuple[str, ...]
     factor: float = 1.0
 
+    def cases(self) -> tuple[tuple[str, str], ...]:
+        """Return experiment and label of each case that it looks at."""
+        return tuple((self.experiment, label) for label in (self.small, *self.large))
+
     def look(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and what was asked and found."""
         small = figure(results, self.experiment, self.small, self.quantity)
         others = {label: figure(results, self.experiment, label, self.quantity) for label in self.large}
         good = all(small * self.factor <= value for value in others.values())
-        margin = f" by a factor of {self.factor:g}" if self.factor > 1.0 else ""
-        slack = f" within {100.0 * (1.0 / self.factor - 1.0):.2g} %" if self.factor < 1.0 else ""
+        asked = "below"
+        if self.factor > 1.0:
+            asked = f"below by a factor of {self.factor:.3g}"
+        elif self.factor < 1.0:
+            asked = f"at most {100.0 * (1.0 / self.factor - 1.0):.2g} % above"
         found = ", ".join(f"{label} {shown(self.quantity, value)}" for label, value in others.items())
-        title = QUANTITIES[self.quantity].title
-        return good, f"{title}: {self.small} {shown(self.quantity, small)} lowest{margin}{slack} of {found}"
+        return good, f"{QUANTITIES[self.quantity].title}: {self.small} {shown(self.quantity, small)} {asked} {found}"
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,10 @@ class Within:
     label: str
     low: float = -math.inf
     high: float = math.inf
+
+    def cases(self) -> tuple[tuple[str, str], ...]:
+        """Return experiment and label of each case that it looks at."""
+        return ((self.experiment, self.label),)
 
     def look(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and what was asked and found."""
@@ -93,6 +106,10 @@ class Breaks:
 
     experiments: tuple[str, ...]
     label: str
+
+    def cases(self) -> tuple[tuple[str, str], ...]:
+        """Return experiment and label of each case that it looks at."""
+        return tuple((name, self.label) for name in self.experiments)
 
     def look(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and what was asked and found."""

@@ -150,8 +150,10 @@ def layout(posed: Posed, _settings: Sequence[str], _clock: Clock) -> Measured:
 
 
 def linearisation(posed: Posed, settings: Sequence[str], clock: Clock) -> Measured:
-    """Return what one linearisation takes with the kernels of a backend, s."""
-    kernels = native_kernels.make(posed.problem, Rules(), settings[0])
+    """Return what one linearisation takes with the kernels of a backend and a parameterisation, local if none, s."""
+    backend, *parameterisation = settings
+    rules = Rules(parameterisation=parameterisation[0]) if parameterisation else Rules()
+    kernels = native_kernels.make(posed.problem, rules, backend)
     kernels.linearise(posed.problem.start)
     seconds = _fastest(lambda: kernels.linearise(posed.problem.start), clock, _REPEATS)
     return {"figures": {"seconds": seconds, "observations": float(len(posed.problem.observations))}}

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -39,6 +40,11 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
+def _title(figure: Figure, text: str) -> None:
+    """Write a title that is not wider than the figure."""
+    figure.suptitle("\n".join(textwrap.wrap(text, int(9.5 * figure.get_figwidth()))))
+
+
 def style(index: int) -> dict[str, Any]:
     """Return how the curve of a number is drawn."""
     return {"color": COLOURS[index % len(COLOURS)], "ls": _STYLES[index // len(COLOURS) % len(_STYLES)], "lw": 1.4}
@@ -61,7 +67,7 @@ def curves(experiment: Experiment, records: Records) -> Figure:
             axis.grid(visible=True, alpha=0.3)
         line[0].set_ylabel(name)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
-    figure.suptitle(experiment.heading)
+    _title(figure, experiment.heading)
     return figure
 
 
@@ -99,7 +105,7 @@ def reprojection(experiment: Experiment, records: Records) -> Figure:
             axis.tick_params(labelsize=7)
     for axis in axes.flat:
         axis.set_visible(axis.has_data())
-    figure.suptitle(f"{experiment.heading} [px]; rings: measured, dots: predicted")
+    _title(figure, f"{experiment.heading} [px]; rings: measured, dots: predicted")
     return figure
 
 
@@ -109,8 +115,8 @@ def histograms(experiment: Experiment, records: Records) -> Figure:
     axes = figure.subplots(1, 2)
     record = next(iter(records.values()))
     parts = (
-        (record["residuals"], "reprojection error [px]"),
-        (record["gradient"]["histogram"], "entry of the gradient"),
+        (record["residuals"], "reprojection error [px]; at the ends all beyond"),
+        (record["gradient"]["histogram"], "entry of the gradient; at the ends all beyond"),
     )
     for axis, (found, name) in zip(axes, parts, strict=True):
         edges = np.linspace(found["low"], found["high"], len(found["counts"]) + 1)
@@ -124,7 +130,7 @@ def histograms(experiment: Experiment, records: Records) -> Figure:
             xlabel=name, ylabel="density", yscale="log", ylim=(max(density[density > 0.0].min() / 3.0, 1e-12), None)
         )
         axis.legend(frameon=False, fontsize=8)
-    figure.suptitle(experiment.heading)
+    _title(figure, experiment.heading)
     return figure
 
 
@@ -140,7 +146,7 @@ def layout(experiment: Experiment, records: Records) -> Figure:
     pattern = figure.add_subplot(1, 2, 2)
     pattern.plot(data["point"], data["image"], ",", color="black")
     pattern.set(xlabel="point", ylabel="image", title="blocks of E", ylim=(len(cameras) - 0.5, -0.5))
-    figure.suptitle(experiment.heading)
+    _title(figure, experiment.heading)
     return figure
 
 

@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,9 @@ _FILES = (
     "ladybug-49-7776/problem-49-7776-pre.txt",
     *(f"problem-49-7776-pre.txt{suffix}" for suffix in ("", ".bz2", ".gz")),
 )
+# Of the text as it is published.
+_LADYBUG_SHA256 = "96ca2845519d89d0727953d983427ab38a42c54991cd4d73e46a4221da3c61b4"
+_LADYBUG_SIZES = (49, 7776, 31_843)
 _FRAMES = 10
 # Rises when the generator of the spheres changes, so that no old record is taken for a new one.
 _GENERATOR = 1
@@ -57,23 +58,23 @@ class Library:
         self._latest: tuple[str, Posed] | None = None
 
     def identity(self, name: str) -> str:
-        """Return what a problem is made of, the same on every machine: the hash of a file, or the generator's options.
+        """Return what a problem is made of, the same on every machine and known without its file.
 
         Raises:
-            DataError: there is no such problem, or its file is missing.
+            DataError: there is no such problem.
         """
         if name in PRESETS:
             made_of = json.dumps(dataclasses.asdict(PRESETS[name]), sort_keys=True)
             return f"sphere {_GENERATOR} {made_of}"
         if name not in NAMES:
             raise DataError(f"problem {name!r} does not exist: choose one of {', '.join(NAMES)}")
-        return f"{name} {_file_hash(self._file())}"
+        return f"{name} {_LADYBUG_SHA256}"
 
     def get(self, name: str) -> Posed:
         """Return a problem; the latest one is kept.
 
         Raises:
-            DataError: there is no such problem, or its file is missing.
+            DataError: there is no such problem, or its file is missing or another one.
         """
         if self._latest is None or self._latest[0] != name:
             self._latest = None
@@ -86,6 +87,12 @@ class Library:
             return Posed(to_problem(start_of(sphere)), to_problem(truth_of(sphere)).start)
         self.identity(name)
         bal = read_bal(self._file())
+        sizes = len(bal.cameras), len(bal.points), len(bal.observations)
+        if sizes != _LADYBUG_SIZES:
+            raise DataError(
+                f"{self._file()}: {sizes[0]} cameras, {sizes[1]} points and {sizes[2]} observations: expected"
+                f" {_LADYBUG_SIZES[0]}, {_LADYBUG_SIZES[1]} and {_LADYBUG_SIZES[2]}, the Ladybug problem of the thesis"
+            )
         return Posed(to_problem(part_of(bal, _FRAMES) if name == LADYBUG_PART else bal), None)
 
     def _file(self) -> Path:
@@ -111,8 +118,3 @@ def part_of(bal: BalProblem, n_frames: int) -> BalProblem:
         number[bal.point_index[rows]],
         bal.observations[rows],
     )
-
-
-@functools.cache
-def _file_hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

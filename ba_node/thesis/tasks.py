@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 from ba_node.config import Value
 from ba_node.core.options import SolverOptions
+from ba_node.core.scaling import INC_STEPS
 from ba_node.offline.solver_settings import describe, solver_options
 from ba_node.thesis.problems import Library
 
@@ -47,7 +48,7 @@ class Run:
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""
         options: dict[str, Value] = describe(self.options())
-        return {"run": options, "iterations": self.iterations, "images": self.images}
+        return {"run": options, "inc": INC_STEPS, "iterations": self.iterations, "images": self.images}
 
     @property
     def weight(self) -> int:

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import copy
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,12 +24,21 @@ from ba_node.thesis.judging import (
     Claim,
     Within,
     judge,
+    judge_all,
 )
+from ba_node.thesis.page import claims_page, old_cases
 from ba_node.thesis.quantities import QUANTITIES
 
+RECORDED = Path(__file__).resolve().parents[2] / "docs" / "thesis_results.json"
 MADE_UP: dict[str, dict[str, dict[str, Any]]] = {
     "e": {"a": {"seconds": 1.0, "objective": 5.0, "steps": 3.0}, "b": {"seconds": 2.0, "objective": None, "steps": 4.0}}
 }
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, dict[str, dict[str, Any]]]:
+    found: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORDED.read_text())
+    return found
 
 
 @pytest.mark.parametrize(
@@ -66,3 +78,41 @@ def test_a_claim_looks_at_what_is_run(claim: Claim) -> None:
         for name, label, quantity in used(check):
             assert label in [case.label for case in catalogue.find(name).cases], (name, label)
             assert quantity in QUANTITIES
+
+
+class TestRecorded:
+    """The figures in docs/thesis_results.json, on which docs/thesis.md rests."""
+
+    def test_they_judge_nearly_every_claim(self, recorded: dict[str, dict[str, dict[str, Any]]]) -> None:
+        left = [claim.text for claim in CLAIMS if judge(claim, recorded).word == NOT_RUN]
+        assert len(left) <= len(CLAIMS) // 5, left
+
+    @pytest.mark.parametrize("change", [0.9, 1.1])
+    def test_no_verdict_hangs_on_a_tenth_of_a_time(
+        self, change: float, recorded: dict[str, dict[str, dict[str, Any]]]
+    ) -> None:
+        words = {verdict.claim.text: verdict.word for verdict in judge_all(CLAIMS, recorded)}
+        times = {
+            (name, label, quantity)
+            for claim in CLAIMS
+            for check in claim.checks
+            for name, label, quantity in used(check)
+            if QUANTITIES[quantity].is_time and label in recorded.get(name, {})
+        }
+        assert times
+        for name, label, quantity in times:
+            moved = copy.deepcopy(recorded)
+            moved[name][label][quantity] *= change
+            for verdict in judge_all(CLAIMS, moved):
+                assert verdict.word == words[verdict.claim.text], (verdict.claim.text, label, quantity)
+
+    def test_the_page_shows_every_claim(self, recorded: dict[str, dict[str, dict[str, Any]]]) -> None:
+        page = claims_page(recorded)
+        assert all(claim.text in page for claim in CLAIMS)
+
+    def test_figures_of_another_declaration_are_marked(self, recorded: dict[str, dict[str, dict[str, Any]]]) -> None:
+        moved = copy.deepcopy(recorded)
+        moved["fig-3.1"]["remainder"]["key"] = "another"
+        assert ("fig-3.1", "remainder") in old_cases(moved)
+        row = next(line for line in claims_page(moved).splitlines() if "derivatives are right" in line)
+        assert "| holds (old) |" in row
