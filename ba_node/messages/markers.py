@@ -64,6 +64,14 @@ def marker_array(estimate: Estimate, config: OutputConfig, *, clear: bool) -> by
     return out.data()
 
 
+def no_markers(estimate: Estimate) -> bytes:
+    """Return a ``visualization_msgs/MarkerArray`` that takes everything away that was drawn before."""
+    out = Cdr()
+    out.pack("I", 1)
+    _marker(out, estimate, "", _DELETE_ALL, np.empty((0, 3)), np.empty((0, 4)))
+    return out.data()
+
+
 def _lines(estimate: Estimate, view: WindowView, config: OutputConfig) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return the ends of lines (n, 3), m, and their colours (n, 4) for each namespace."""
     refined = estimate.refined

@@ -54,7 +54,10 @@ class MapTransform(Component):
 
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Take the newest correction."""
-        if not newest or estimate.correction is None:
+        if not newest:
+            return
+        if estimate.correction is None:  # all was forgotten
+            self._estimate = self._last_stamp_ns = None
             return
         if self._estimate is None or self._estimate.report.session_id != estimate.report.session_id:
             self._last_stamp_ns = None

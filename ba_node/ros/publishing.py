@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from rclpy.event_handler import PublisherEventCallbacks
 
 from ba_node.estimate import SolveReport, Status
 from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
@@ -22,27 +24,52 @@ _LOG_PERIOD_S = 5.0
 
 
 class Publishing(Component):
-    """The outputs of the node. Path and points replace each other: only the newest are sent."""
+    """The outputs of the node; nothing is built for a topic that nobody listens to.
+
+    Path and points replace each other: only the newest are sent. Who comes later gets those of the last estimate, which
+    are built then.
+    """
 
     def __init__(self, host: Host) -> None:
         """Advertise."""
         super().__init__(host)
         self._factory = RclpyFactory()
         self._throttle = Throttle(_LOG_PERIOD_S)
-        self._outputs = {
-            topic: self.publisher(message_class(kind), f"~/{topic}", qos.for_output(topic))
-            for topic, kind in OUTPUT_TYPES.items()
-        }
+        # The estimate that latched topics are to show, and those of them that do not show it yet.
+        self._latest: Estimate | None = None
+        self._behind: set[str] = set()
+        self._outputs: dict[str, Any] = {}
+        for topic, kind in OUTPUT_TYPES.items():
+            events = PublisherEventCallbacks(matched=self._catch_up) if topic in qos.LATCHED_OUTPUTS else None
+            profile = qos.for_output(topic)
+            self._outputs[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, event_callbacks=events)
 
     def take(self, estimate: Estimate, newest: bool) -> None:
-        """Publish an estimate; latched topics even if nobody listens, for those who come later."""
-        wanted = {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
-        wanted = wanted.union(qos.LATCHED_OUTPUTS) if newest else wanted.difference(qos.LATCHED_OUTPUTS)
+        """Publish an estimate."""
+        wanted = self._heard()
+        if newest:
+            self._latest = estimate
+            self._behind = set(qos.LATCHED_OUTPUTS) - wanted
+        else:
+            wanted.difference_update(qos.LATCHED_OUTPUTS)
         rejected = {**estimate.report.rejected, **self.host.counted}
         estimate = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, rejected=rejected))
+        self._publish(estimate, wanted)
+        self._log_report(estimate.report)
+
+    def _heard(self) -> set[str]:
+        return {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
+
+    def _catch_up(self, _status: object) -> None:
+        """Give those who come late what they missed."""
+        wanted = self._behind & self._heard()
+        if self._latest is not None and wanted and self.host.active:
+            self._behind -= wanted
+            self._publish(self._latest, wanted)
+
+    def _publish(self, estimate: Estimate, wanted: set[str]) -> None:
         for topic, _, message in output_messages(self._factory, estimate, self.host.config.output, wanted):
             self._outputs[topic].publish(message)
-        self._log_report(estimate.report)
 
     def _log_report(self, report: SolveReport) -> None:
         """Say why a solve gave nothing. That the first keyframes are not enough is nothing to warn about."""

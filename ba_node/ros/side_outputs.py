@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.event_handler import PublisherEventCallbacks
 
 from ba_node.estimate import Extras
-from ba_node.messages.markers import marker_array
+from ba_node.messages.markers import marker_array, no_markers
 from ba_node.messages.topics import SIDE_TYPES
 from ba_node.messages.transforms import covariance_messages
 from ba_node.ros import qos
@@ -41,6 +41,9 @@ class SideOutputs(Component):
         if estimate.covariance is not None and self._wanted("pose_with_covariance"):
             for message in covariance_messages(self._factory, estimate):
                 self._publishers["pose_with_covariance"].publish(message)
+        if newest and len(estimate.trajectory) == 0 and self._wanted("markers"):
+            self._drawn_session = None
+            self._publishers["markers"].publish(no_markers(estimate))
         if newest and estimate.view is not None and self._wanted("markers"):
             session = estimate.report.session_id
             clear = session != self._drawn_session

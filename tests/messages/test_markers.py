@@ -12,7 +12,7 @@ from ba_node.config import OutputConfig
 from ba_node.core import geometry
 from ba_node.estimate import Estimate, WindowView
 from ba_node.io.ros_types import decode
-from ba_node.messages.markers import NAMESPACES, marker_array
+from ba_node.messages.markers import NAMESPACES, marker_array, no_markers
 
 ADD, DELETE, DELETE_ALL, LINE_LIST = 0, 2, 3, 5
 VERTICES = 16
@@ -100,6 +100,8 @@ def test_a_session_begins_with_an_empty_picture(seen: Estimate) -> None:
     data = marker_array(seen, OutputConfig(), clear=True)
     markers = decode("visualization_msgs/msg/MarkerArray", data).markers
     assert [marker.action for marker in markers] == [DELETE_ALL, ADD, ADD, ADD, ADD]
+    nothing = decode("visualization_msgs/msg/MarkerArray", no_markers(seen)).markers
+    assert [marker.action for marker in nothing] == [DELETE_ALL]
 
 
 @pytest.mark.parametrize("frame", ["m", "map", "a/long/frame"])

@@ -23,6 +23,7 @@ MakePeer = Callable[..., Any]
 TELLING = """
 import sys
 from ba_node import backend
+from ba_node.ros import publishing
 
 def telling(name):
     work = getattr(backend, name)
@@ -33,6 +34,12 @@ def telling(name):
 
 for name in ("covariances", "view"):
     setattr(backend, name, telling(name))
+build = publishing.output_messages
+def tell_topics(*arguments):
+    built = build(*arguments)
+    print("builds", *sorted({topic for topic, _, _ in built}), flush=True)
+    return built
+publishing.output_messages = tell_topics
 from ba_node.ros.main import main
 sys.exit(main())
 """
@@ -59,6 +66,13 @@ def test_nothing_is_worked_out_that_nobody_looks_at(
     peer.connect()
     peer.play(data, session_id=0)
     assert "works out" not in node.out
+    assert "builds refined_keyframes report" in node.out
+    assert "pose" not in node.out and "path" not in node.out and "points" not in node.out
+    late = make_peer()
+    late.listen("path", "points")
+    late.until(lambda: late.received["path"] and late.received["points"], "the map for one who comes late")
+    assert len(late.received["path"][0].poses) == len(data.keyframes)
+    late.close()
     subscription = watch(peer, "pose_with_covariance")
     peer.until(subscription.get_publisher_count, "the publisher")
     # The node learns of a subscriber a moment after the subscriber of it: from some solve on.
