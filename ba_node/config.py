@@ -21,6 +21,7 @@ Value = bool | int | float | str
 METHODS = ("auto", "lma_cd", "bal", "inm", "tnm", "dinm", "adinm", "local_dinm", "irls_huber", "irls_tq")
 LOSSES = ("squared", "huber", "truncated_quadratic", "cauchy", "geman_mcclure")
 BACKENDS = ("auto", "native", "numpy")
+LINEAR_SOLVERS = ("auto", "cholesky", "dense", "sparse", "pcg")
 CHEIRALITY = ("keep", "constant", "drop")
 POSES_OF = ("body", "camera")
 EXTRINSICS = ("camera_rig", "tf_static")
@@ -168,8 +169,13 @@ class SolverConfig:
 
     method: str = _param(
         "auto",
-        "Named method; auto takes dense Cholesky for windows and PCG for large maps. See docs/methods.md.",
+        "Named method. See docs/methods.md.",
         choices=METHODS,
+    )
+    linear_solver: str = _param(
+        "auto",
+        "How the reduced system is solved; auto takes what costs least. Methods with a trust region always take pcg.",
+        choices=LINEAR_SOLVERS,
     )
     backend: str = _param(
         "auto",

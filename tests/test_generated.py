@@ -55,7 +55,7 @@ def test_topics_are_latched_as_documented(generator: ModuleType) -> None:
     ("parameter", "names"),
     [
         ("method", tuple(METHODS)),
-        *((option, PARTS[option].names) for option in ("loss", "backend", "cheirality")),
+        *((option, PARTS[option].names) for option in ("loss", "backend", "cheirality", "linear_solver")),
     ],
 )
 def test_config_names_what_the_core_declares(parameter: str, names: tuple[str, ...]) -> None:

@@ -164,7 +164,9 @@ def _shown(option: str, values: dict[str, Value]) -> str:
         "damping_policy": values["damping"] == "none",
         "initial_radius": values["trust_region"] == "none",
         "loss_scale": values["loss"] == "squared",
-        **dict.fromkeys(("preconditioner", "t_eps", "max_linear_iterations"), values["linear_solver"] == "cholesky"),
+        **dict.fromkeys(
+            ("preconditioner", "t_eps", "max_linear_iterations"), values["linear_solver"] not in ("auto", "pcg")
+        ),
     }
     value = values[option]
     return "–" if idle.get(option) else f"{value:g}" if isinstance(value, float) else str(value)

@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
         f"objective {figures['objective_before']:.8g} -> {figures['objective_after']:.8g},"
         f" rms {figures['rms_px_before']:.4g} -> {figures['rms_px_after']:.4g} px"
         f" ({sizes['cameras']} cameras, {sizes['points']} points, {sizes['observations']} observations)\n"
+        f"linear solver: {figures['linear_solver']}\n"
         f"set-up {figures['setup_s']:.3f} s, solver {figures['solve_s']:.3f} s, memory {figures['peak_rss_mb']:.0f} MB"
     )
     if args.json:

@@ -139,8 +139,10 @@ _PARTS = (
         "linear_solver",
         "How S p = rhs is solved.",
         (
-            Choice("auto", "pcg with a region or with more than 3000 unknowns, else cholesky"),
-            Choice("cholesky", "exactly, dense up to 3000 unknowns, then sparse", "3.2.2", ("cd",)),
+            Choice("auto", "pcg with a region, else what costs least by the structure of the problem"),
+            Choice("cholesky", "exactly: dense or sparse, whichever costs less", "3.2.2", ("cd",)),
+            Choice("dense", "exactly: S as a whole, LAPACK's Cholesky"),
+            Choice("sparse", "exactly: S by blocks, sparse Cholesky"),
             Choice("pcg", "by conjugate gradients (Steihaug): an inexact Newton step", "Alg. 1, 3, 4"),
         ),
     ),

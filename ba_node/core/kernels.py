@@ -11,11 +11,12 @@ import scipy.sparse
 from numpy import float64
 from numpy.typing import NDArray
 
+from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.problem import State
 
 FloatArray = NDArray[float64]
 
-# Up to this many unknowns S is stored densely.
+# Up to this many unknowns numpy's kernels store S densely.
 DENSE_LIMIT = 3000
 
 
@@ -52,6 +53,15 @@ class System(Protocol):
 
     def sparse(self) -> scipy.sparse.spmatrix:
         """Return S, sparse."""
+
+    def sizes(self) -> Sizes | None:
+        """Return what each linear solver would have to do; None if that is not known."""
+
+    def factor_size(self, max_blocks: int, max_products: float) -> Factor:
+        """Return the size of the sparse factor, or how far it was counted until it was more than the limits."""
+
+    def solve_sparse(self) -> FloatArray | None:
+        """Return the solution by sparse Cholesky; None if S is not positive definite."""
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x without forming S."""

@@ -59,7 +59,11 @@ _HUBER = dataclasses.replace(_LOCAL_DINM, rules=Rules(loss="huber"))
 _TQ = dataclasses.replace(_LOCAL_DINM, rules=Rules(loss="truncated_quadratic"), annealing="gnc")
 
 _DECLARED: dict[str, Method] = {
-    "auto": Method("the node's default: exact Marquardt steps, and points that follow each", "", SolverOptions()),
+    "auto": Method(
+        "the node's default: Marquardt steps by the cheapest linear solver, and points that follow each",
+        "",
+        SolverOptions(),
+    ),
     "lma_cd": Method("Levenberg-Marquardt with Cholesky decomposition, a baseline", "3.2.2, 3.2.3", _LMA_CD),
     "bal": Method("Levenberg-Marquardt with PCG and M = B, a baseline (Agarwal et al. 2010)", "3.2.3", _BAL),
     "inm": Method("inexact Newton: a scaled region, no damping", "Alg. 5", _INM),
@@ -93,6 +97,9 @@ def options(name: str) -> SolverOptions:
 def from_config(config: SolverConfig) -> SolverOptions:
     """Return the choices that the parameters ``solver.*`` ask for."""
     chosen = options(config.method)
+    linear_solver = chosen.linear_solver
+    if config.linear_solver != "auto" and chosen.trust_region == "none":
+        linear_solver = config.linear_solver
     keeps_loss = config.loss == chosen.rules.loss
     rules = Rules(
         parameterisation=chosen.rules.parameterisation,
@@ -105,6 +112,7 @@ def from_config(config: SolverConfig) -> SolverOptions:
         rules=rules,
         annealing=chosen.annealing if keeps_loss else "none",
         backend=config.backend,
+        linear_solver=linear_solver,
         max_iterations=config.max_iterations,
         max_linear_iterations=config.max_linear_iterations,
         function_tolerance=config.function_tolerance,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.core.kernels import Demands, Kernels, System
+from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Rules, reprojection_errors
 from ba_node.core.problem import Problem, State
@@ -167,11 +168,29 @@ class _NativeSystem:
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S, block-sparse."""
-        blocks, rows, columns = self._kernel.sparse()
-        order = np.lexsort((columns, rows))
-        starts = np.searchsorted(rows[order], np.arange(len(self.rhs) // self._size + 1))
-        n = len(self.rhs)
-        return scipy.sparse.bsr_matrix((blocks[order], columns[order], starts), shape=(n, n))
+        self.factor_size(2**62, np.inf)
+        blocks, columns, starts = self._kernel.sparse()
+        n, d = len(self.rhs), self._size
+        upper = scipy.sparse.bsr_matrix((blocks, columns, starts), shape=(n, n))
+        rows = np.repeat(np.arange(n // d), np.diff(starts))
+        own = rows == columns
+        diagonal = scipy.sparse.bsr_matrix((blocks[own], columns[own], np.arange(n // d + 1)), shape=(n, n))
+        return upper + upper.T - diagonal
+
+    def sizes(self) -> Sizes:
+        """Return what each linear solver would have to do."""
+        edges, pairs = self._kernel.pairs()
+        return Sizes(len(self.rhs), self._size, edges, pairs)
+
+    def factor_size(self, max_blocks: int, max_products: float) -> Factor:
+        """Return the size of the sparse factor; found at the first call with limits that it meets."""
+        complete, blocks, products = self._kernel.analyse(max_blocks, max_products)
+        return Factor(blocks, products, complete)
+
+    def solve_sparse(self) -> FloatArray | None:
+        """Return the solution by sparse Cholesky; None if S is not positive definite."""
+        x: FloatArray | None = self._kernel.solve_sparse()
+        return x
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d)."""

@@ -8,9 +8,10 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from ba_node.core import polish, scaling
+from ba_node.core import linear, polish, scaling
 from ba_node.core.blocks import condition
 from ba_node.core.kernels import DENSE_LIMIT, Demands, System
+from ba_node.core.linear_costs import MAX_BYTES, Factor
 from ba_node.core.objective import Linearisation, Objective, Rules
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
@@ -19,6 +20,8 @@ from ba_node.core.schur_cameras import CameraReduction, FullSystem
 FloatArray = NDArray[np.float64]
 Reduction = ReducedSystem | CameraReduction | FullSystem
 
+# A sparse matrix fuller than this share is factored as a dense one, if there is the memory.
+_DENSE_SHARE = 0.1
 _POINTS = Demands()
 _SIDES: dict[str, type[ReducedSystem] | type[CameraReduction] | type[FullSystem]] = {
     "points": ReducedSystem,
@@ -113,6 +116,21 @@ class _NumpySystem:
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""
         return np.asarray(self._matrix @ x) if self._matrix is not None else self._reduction.product(x)
+
+    def sizes(self) -> None:
+        """Return nothing: dense up to DENSE_LIMIT unknowns, then whatever is asked for."""
+
+    def factor_size(self, _max_blocks: int, _max_products: float) -> Factor:
+        """Refuse to count: scipy finds its own order."""
+        return Factor(0, 0.0, complete=False)
+
+    def solve_sparse(self) -> FloatArray | None:
+        """Return the solution by scipy's sparse factorisation; None if S is not positive definite."""
+        matrix = self.sparse()
+        n = len(self.rhs)
+        if matrix.nnz > _DENSE_SHARE * n * n and 8.0 * n * n <= MAX_BYTES:
+            return linear.cholesky(np.asarray(matrix.toarray()), self.rhs).x
+        return linear.cholesky(matrix, self.rhs).x
 
     def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return both steps and the reduction of the undamped model, by J p itself."""

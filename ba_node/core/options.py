@@ -27,7 +27,7 @@ class SolverOptions:
         trust_region: D of the region.
         initial_radius: first radius, in units of the scaled step.
         schur: which unknowns are eliminated.
-        linear_solver: cholesky, pcg, or auto.
+        linear_solver: how S p = rhs is solved.
         preconditioner: M of pcg.
         polish_steps: Newton steps of every point alone after each step of the keyframes; 0 for none.
         backend: which kernels work.
@@ -78,10 +78,10 @@ class SolverOptions:
                 f"loss = {rules.loss} with loss_scale = {rules.loss_scale}: a robust loss needs the residual, in"
                 " sigmas, where it leaves the square; set loss_scale to a number > 0"
             )
-        if self.trust_region != "none" and self.linear_solver == "cholesky":
+        if self.trust_region != "none" and self.linear_solver not in ("auto", "pcg"):
             raise ChoiceError(
-                f"trust_region = {self.trust_region} with linear_solver = cholesky: only pcg stops at the boundary of a"
-                " region; take linear_solver = pcg or trust_region = none"
+                f"trust_region = {self.trust_region} with linear_solver = {self.linear_solver}: only pcg"
+                " stops at the boundary of a region; take linear_solver = pcg or trust_region = none"
             )
         if self.annealing == "gnc" and rules.loss != "truncated_quadratic":
             raise ChoiceError(

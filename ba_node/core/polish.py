@@ -20,6 +20,9 @@ _FIRST_DAMPING = 1e-4
 _MIN_DIAGONAL = 1e-6
 # A point that gains less than this share has arrived.
 _MIN_GAIN = 1e-4
+# One that its model promises less than this share does not step at all. With 1e-4 the last 1e-6 of the objective of a
+# loop of 1000 cameras took 57 iterations in place of 21.
+_MIN_PROMISE = 1e-6
 
 
 def polish_points(objective: Objective, structure: Structure, state: State, steps: int) -> tuple[float, State]:
@@ -55,7 +58,7 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         diagonal = np.maximum(np.diagonal(c, axis1=1, axis2=2), _MIN_DIAGONAL)
         inverse = inverse_cholesky3(c + damping * diagonal[:, :, None] * np.eye(3))
         scaled = inverse @ gradient[:, :, None]
-        promising = np.sum(scaled * scaled, axis=(1, 2)) > _MIN_GAIN * cost[active]
+        promising = np.sum(scaled * scaled, axis=(1, 2)) > _MIN_PROMISE * cost[active]
         move = (np.swapaxes(inverse, 1, 2) @ scaled)[..., 0]
         active[active] = promising
         if not active.any():

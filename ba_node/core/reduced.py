@@ -1,9 +1,11 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve one damped, reduced system: by Cholesky, or by PCG in the scaled space inside the trust region (Algorithm 4).
+"""Solve one damped, reduced system by the linear solver that was asked for, or by the cheapest (linear_costs.py).
 
-In the scaled space ``x~ = D x`` (3.94-3.99) the system is ``D^-1 S D^-1 x~ = D^-1 rhs``; the region, the residual that
-ends PCG, and the preconditioner all live there. Without a region D is that of the damping (Algorithm 7).
+Directly: dense S with LAPACK's Cholesky, or S by blocks with a sparse one. Or inexactly: by PCG in the scaled space
+inside the trust region (Algorithm 4). In the scaled space ``x~ = D x`` (3.94-3.99) the system is
+``D^-1 S D^-1 x~ = D^-1 rhs``; the region, the residual that ends PCG, and the preconditioner all live there. Without a
+region D is that of the damping (Algorithm 7).
 """
 
 from __future__ import annotations
@@ -11,26 +13,27 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
-from ba_node.core import blocks, linear, scaling
+from ba_node.core import blocks, linear, linear_costs, scaling
 from ba_node.core.kernels import DENSE_LIMIT, System
 from ba_node.core.options import SolverOptions
 
 FloatArray = NDArray[np.float64]
 
-# A sparse matrix fuller than this share is factored as a dense one, up to so many entries (4.8 GB).
-_DENSE_SHARE = 0.1
-_DENSE_ENTRIES = 600_000_000
-
 
 class ReducedSolver:
-    """Solve the systems of one run."""
+    """Solve the systems of one run, all in the same way.
+
+    Attributes:
+        kind: dense, sparse or pcg; empty before the first system.
+        text: the same for the report, with what it costs.
+    """
 
     def __init__(self, options: SolverOptions) -> None:
         """Keep the choices."""
         self._options = options
+        self.kind, self.text = "", ""
 
     def solve(self, system: System, hessian: tuple[FloatArray, FloatArray], radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
@@ -40,11 +43,15 @@ class ReducedSolver:
             hessian: diag(B) and diag(C), not damped.
             radius: of the region, in the scaled space; infinite for none.
         """
-        n = len(system.rhs)
-        if n == 0:
+        if len(system.rhs) == 0:
             return linear.Solution(np.zeros(0))
-        if self._by_cholesky(n):
-            return linear.cholesky(_matrix(system), system.rhs)
+        if not self.kind:
+            self._choose(system)
+        if self.kind == "dense":
+            return linear.cholesky(system.dense(), system.rhs)
+        if self.kind == "sparse":
+            x = system.solve_sparse()
+            return linear.Solution(x if x is not None and np.isfinite(x).all() else None)
         options = self._options
         scale = 1.0 / system.gather(*scaling.scaled_space(options.demands.space, hessian))
         limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius * system.radius_factor)
@@ -53,11 +60,21 @@ class ReducedSolver:
         x = None if found.x is None else scale * found.x
         return linear.Solution(x, found.iterations, found.on_boundary)
 
-    def _by_cholesky(self, n: int) -> bool:
-        options = self._options
-        if options.linear_solver == "auto":
-            return options.trust_region == "none" and n <= DENSE_LIMIT
-        return options.linear_solver == "cholesky"
+    def _choose(self, system: System) -> None:
+        """Settle on a linear solver."""
+        asked, n = self._options.linear_solver, len(system.rhs)
+        if asked == "auto" and self._options.trust_region != "none":
+            asked = "pcg"
+        sizes = system.sizes() if asked in ("auto", "cholesky", "sparse") else None
+        factor = None
+        if sizes is not None:
+            limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=asked == "cholesky")
+            factor = system.factor_size(linear_costs.max_blocks(sizes.block), limit)
+            if asked != "sparse" or not factor.complete:
+                asked = linear_costs.cheapest(sizes, factor, exact=asked == "cholesky")
+        elif asked in ("auto", "cholesky"):
+            asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
+        self.kind, self.text = asked, linear_costs.describe(asked, n, sizes, factor)
 
 
 def preconditioner(kind: str, system: System, scale: FloatArray) -> linear.Product:
@@ -94,14 +111,3 @@ def _scaled_product(system: System, scale: FloatArray) -> linear.Product:
         matrix *= scale
         return lambda x: np.asarray(matrix @ x)
     return lambda x: scale * system.product(scale * x)
-
-
-def _matrix(system: System) -> FloatArray | scipy.sparse.spmatrix:
-    """Return S in the form that is cheaper to factor."""
-    if len(system.rhs) <= DENSE_LIMIT:
-        return system.dense()
-    matrix = system.sparse()
-    n = len(system.rhs)
-    if matrix.nnz > _DENSE_SHARE * n * n and n * n <= _DENSE_ENTRIES:
-        return np.asarray(matrix.toarray())
-    return matrix

@@ -54,13 +54,17 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Result:
-    """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start."""
+    """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start.
+
+    ``linear_solver`` says how the reduced systems were solved, and what that takes; empty if there was none.
+    """
 
     state: State
     status: Status
     reason: str
     method: str
     trace: tuple[Iteration, ...]
+    linear_solver: str = ""
 
     @property
     def objective_before(self) -> float:

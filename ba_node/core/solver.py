@@ -236,4 +236,4 @@ class _Run:
     def _result(self, status: Status, reason: str) -> Result:
         if self.annealing is not None and self.annealing.active:
             self.state = self.annealing.state
-        return Result(self.state, status, reason, self.options.method, tuple(self.trace))
+        return Result(self.state, status, reason, self.options.method, tuple(self.trace), self.reduced.text)

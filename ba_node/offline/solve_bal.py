@@ -57,6 +57,7 @@ class Solution:
                 "observations": len(self.problem.observations),
             },
             "method": result.method,
+            "linear_solver": result.linear_solver,
             "options": describe(self.options),
             "status": result.status.name,
             "reason": result.reason,

@@ -9,6 +9,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <vector>
 
 #include "blocks.hpp"
@@ -17,6 +18,7 @@
 #include "polish.hpp"
 #include "pool.hpp"
 #include "rows.hpp"
+#include "sparse_schur.hpp"
 
 namespace ba {
 
@@ -43,6 +45,13 @@ class Kernel {
   Kernel& operator=(const Kernel&) = delete;
 
   std::int64_t n_free() const { return l_.n_free; }
+  std::int64_t n_edges() const { return l_.n_edges(); }
+  // Pairs of edges of a point, each edge with itself too: what S is summed from.
+  std::int64_t n_pairs() const {
+    std::int64_t total = 0;
+    for (std::int64_t e = 0; e < l_.n_edges(); ++e) total += l_.edge_end[e] - e;
+    return total;
+  }
   std::int64_t n_points() const { return l_.n_points; }
   double gradient_norm() const { return equations_.gradient_norm; }
 
@@ -137,37 +146,25 @@ class Kernel {
     });
   }
 
-  // The blocks of S that are not zero, both triangles: D x D each, with their rows and columns.
-  void sparse(std::vector<double>& blocks, std::vector<std::int64_t>& rows, std::vector<std::int64_t>& columns) {
-    std::vector<std::int32_t> place(l_.n_free, -1), touched;
-    Buffer<Block<D>> row;
-    for (std::int64_t i = 0; i < l_.n_free; ++i) {
-      touched.clear();
-      row.clear();
-      const auto find = [&](std::int32_t j) -> Block<D>& {
-        if (place[j] < 0) {
-          place[j] = static_cast<std::int32_t>(touched.size());
-          touched.push_back(j);
-          row.emplace_back();
-          clear(&row.back(), 1);
-        }
-        return row[place[j]];
-      };
-      find(static_cast<std::int32_t>(i));
-      add_row(i, find);
-      for (std::int32_t j : touched) {
-        double block[D * D];
-        write_block(row[place[j]], block, D);
-        if (j == i) add_diagonal(i, block, D);
-        for (int turned = 0; turned < (j == i ? 1 : 2); ++turned) {
-          rows.push_back(turned ? j : i);
-          columns.push_back(turned ? i : j);
-          for (int r = 0; r < D; ++r)
-            for (int c = 0; c < D; ++c) blocks.push_back(turned ? block[c * D + r] : block[r * D + c]);
-        }
-        place[j] = -1;
-      }
-    }
+  // S by blocks, and its factor if it meets the limits; found once.
+  const SparseSchur<D>& analyse(const FillLimits& limits) {
+    if (!sparse_ || !sparse_->fill().complete) sparse_ = std::make_unique<SparseSchur<D>>(l_, pool_.threads(), limits);
+    return *sparse_;
+  }
+
+  // After analyse.
+  const SparseSchur<D>& assemble_sparse() {
+    sparse_->assemble(
+        pool_, [this](std::int64_t i, auto block) { add_row(i, block); },
+        [this](std::int64_t i, double* block) { add_diagonal(i, block, D); });
+    return *sparse_;
+  }
+
+  // Solve S x = rhs by sparse Cholesky, after analyse; false if S is not positive definite.
+  bool solve_sparse(double* x) {
+    assemble_sparse();
+    rhs(x);
+    return sparse_->solve(x);
   }
 
   // S x without forming S.
@@ -414,6 +411,7 @@ class Kernel {
   std::vector<double> damping_c_;
   std::vector<Polished> part_;
   std::vector<Buffer<Images>> images_;
+  std::unique_ptr<SparseSchur<D>> sparse_;
 };
 
 }  // namespace ba

@@ -88,16 +88,19 @@ ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point,
   return new ba::Kernel<D>(problem, rules, state, threads);
 }
 
+// The upper triangle of S: blocks, rows, columns.
 template <int D>
 py::tuple sparse(ba::Kernel<D>& kernel) {
-  std::vector<double> blocks;
-  std::vector<std::int64_t> rows, columns;
+  const ba::SparseSchur<D>* schur = nullptr;
   {
     py::gil_scoped_release release;
-    kernel.sparse(blocks, rows, columns);
+    schur = &kernel.assemble_sparse();
   }
-  const auto n = static_cast<py::ssize_t>(rows.size());
-  return py::make_tuple(copy(blocks, {n, D, D}), copy(rows, {n}), copy(columns, {n}));
+  const ba::Rows32& pattern = schur->pattern();
+  const auto n = static_cast<py::ssize_t>(pattern.index.size());
+  Doubles blocks = empty({n, D, D});
+  for (py::ssize_t k = 0; k < n; ++k) ba::write_block(schur->blocks()[k], blocks.mutable_data() + k * D * D, D);
+  return py::make_tuple(blocks, copy(pattern.index, {n}), copy(pattern.start, {pattern.count() + 1}));
 }
 
 template <int D>
@@ -157,6 +160,27 @@ void bind(py::module_& m, const char* name) {
              k.dense(s);
            })
       .def("sparse", &sparse<D>)
+      .def("analyse",
+           [](K& k, std::int64_t max_blocks, double max_products) {
+             const ba::Fill* fill = nullptr;
+             {
+               py::gil_scoped_release release;
+               fill = &k.analyse({max_blocks, max_products}).fill();
+             }
+             return py::make_tuple(fill->complete, fill->blocks, fill->products);
+           })
+      .def("pairs", [](const K& k) { return py::make_tuple(k.n_edges(), k.n_pairs()); })
+      .def("solve_sparse",
+           [](K& k) -> py::object {
+             Doubles x = empty({k.n_free() * D});
+             double* out = x.mutable_data();
+             bool found = false;
+             {
+               py::gil_scoped_release release;
+               found = k.solve_sparse(out);
+             }
+             return found ? py::object(x) : py::none();
+           })
       .def("product",
            [](K& k, const Doubles& x) {
              Doubles out = empty({k.n_free() * D});

@@ -12,7 +12,7 @@
 
 namespace ba {
 
-constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4;
+constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4, kMinPromise = 1e-6;
 
 // Objectives at the start and at the end.
 struct Polished {
@@ -50,7 +50,7 @@ inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end,
     lower_times(li, sums.g, y);
     upper_times(li, y, move);
     // What the model promises is known before the step.
-    active &= ~(y[0] * y[0] + y[1] * y[1] + y[2] * y[2] <= kMinGain * sums.cost);
+    active &= ~(y[0] * y[0] + y[1] * y[1] + y[2] * y[2] <= kMinPromise * sums.cost);
     if (!any(active)) break;
     for (int i = 0; i < 3; ++i) x[i] = select(active, best[i] - move[i], best[i]);
     mu *= 0.1;

@@ -1,0 +1,135 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Choose how ``S p = rhs`` is solved from what each way would cost, counted from the structure of the problem.
+
+Each way is charged its flops at the rate that its kernel reaches, and the bytes that it must move (n unknowns in blocks
+of d, P pairs of keyframes over all points, F block products of the sparse factor, N edges = point and free keyframe):
+
+- dense:  6 d^2 P to form S, 24 n^2 bytes to lay it out, n^3 / 3 for Cholesky (LAPACK);
+- sparse: the same for S, 2 d^3 F for the factor, at a lower rate where a column and what it needs leave the cache;
+- pcg:    N blocks of d x 3 read in each of _PCG_STEPS steps; nothing is formed.
+
+The sparse factor is our own (native/src/sparse_cholesky.hpp): by blocks of the size of a camera it took 0.02 s where
+Eigen's SimplicialLLT took 0.20 s and CHOLMOD's supernodal one 0.15 s (1000 cameras on a circle, one core), and on 49
+cameras that all see each other 0.8 ms where LAPACK took 1.1, CHOLMOD 3.8 and Eigen 9 ms.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+# Rates of one core, flop/s and byte/s: measured on an AMD EPYC (AVX-512), which other work shared. Their ratios count.
+_FORM_FLOPS = 12e9
+_DENSE_FLOPS = 23e9
+_SPARSE_FLOPS = 32e9
+_SPARSE_FLOPS_LARGE = 10e9
+_BYTES = 12e9
+# Bytes that a column of the factor and its sources may take before the lower rate holds.
+_CACHE_BYTES = 5e6
+# Steps of PCG that an outer iteration is charged.
+_PCG_STEPS = 60
+# No factor may take more memory than this.
+MAX_BYTES = 4.8e9
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What is known of the structure of a problem's reduced system.
+
+    Attributes:
+        unknowns: n.
+        block: d.
+        edges: (point, free keyframe) pairs.
+        pairs: pairs of free keyframes that see the same point, over all points, each keyframe with itself too.
+    """
+
+    unknowns: int
+    block: int
+    edges: int
+    pairs: int
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What is known of the sparse Cholesky factor of S.
+
+    Attributes:
+        blocks: blocks of the factor that are not zero.
+        products: multiplications of two blocks.
+        complete: False if counting was given up because there were too many.
+    """
+
+    blocks: int
+    products: float
+    complete: bool = True
+
+
+def block_bytes(block: int) -> int:
+    """Return the memory of a padded d x d block."""
+    return 64 * 11 if block == 9 else 64 * 6
+
+
+def max_blocks(block: int) -> int:
+    """Return how many blocks a sparse factor may have."""
+    return int(MAX_BYTES / block_bytes(block))
+
+
+def dense_s(sizes: Sizes) -> float:
+    """Return the seconds of an iteration with dense S; infinite if it would not fit into memory."""
+    n = float(sizes.unknowns)
+    if 8.0 * n * n > MAX_BYTES:
+        return math.inf
+    return _form_s(sizes) + 24.0 * n * n / _BYTES + n**3 / 3.0 / _DENSE_FLOPS
+
+
+def sparse_s(sizes: Sizes, factor: Factor) -> float:
+    """Return the seconds of an iteration with sparse S."""
+    if not factor.complete:
+        return math.inf
+    columns = max(sizes.unknowns // sizes.block, 1)
+    working_set = 2.0 * factor.products / columns * block_bytes(sizes.block)
+    rate = _SPARSE_FLOPS if working_set <= _CACHE_BYTES else _SPARSE_FLOPS_LARGE
+    return _form_s(sizes) + flops(sizes, factor) / rate
+
+
+def pcg_s(sizes: Sizes) -> float:
+    """Return the seconds of an iteration with conjugate gradients."""
+    return _PCG_STEPS * 3.0 * 8.0 * sizes.block * sizes.edges / _BYTES
+
+
+def flops(sizes: Sizes, factor: Factor) -> float:
+    """Return the flops of a sparse factorisation."""
+    return 2.0 * sizes.block**3 * factor.products
+
+
+def max_products(sizes: Sizes, *, exact: bool = False) -> float:
+    """Return from how many block products on the sparse factor is not the cheapest way."""
+    spare = min(dense_s(sizes), math.inf if exact else pcg_s(sizes)) - _form_s(sizes)
+    return max(spare, 0.0) * _SPARSE_FLOPS / (2.0 * sizes.block**3)
+
+
+def cheapest(sizes: Sizes, factor: Factor, *, exact: bool = False) -> str:
+    """Return sparse, dense or pcg; pcg only where it costs less, if need be with less memory, than what is exact."""
+    costs = {"sparse": sparse_s(sizes, factor), "dense": dense_s(sizes), "pcg": pcg_s(sizes)}
+    if exact and math.isfinite(min(costs["sparse"], costs["dense"])):
+        del costs["pcg"]
+    return min(costs, key=lambda name: costs[name])
+
+
+def describe(kind: str, n: int, sizes: Sizes | None, factor: Factor | None) -> str:
+    """Return a line for the report."""
+    dense = f"{1e-9 * n**3 / 3.0:.2g}"
+    if kind == "dense":
+        return f"dense Cholesky ({n} unknowns, {dense} GFLOP)"
+    if kind == "sparse" and sizes is not None and factor is not None:
+        columns = n // sizes.block
+        share = 100.0 * factor.blocks / (columns * (columns + 1) / 2.0)
+        own = f"{1e-9 * flops(sizes, factor):.2g}"
+        return f"sparse Cholesky ({n} unknowns, fill {share:.2g} %, {own} GFLOP against {dense} dense)"
+    name = "sparse Cholesky" if kind == "sparse" else "PCG"
+    return f"{name} ({n} unknowns)"
+
+
+def _form_s(sizes: Sizes) -> float:
+    return 6.0 * sizes.block**2 * sizes.pairs / _FORM_FLOPS

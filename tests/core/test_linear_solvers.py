@@ -1,0 +1,160 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Dense, sparse and PCG give the same step; the choice between them follows their costs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ba_node import native
+from ba_node.core import linear_costs, native_kernels, solver
+from ba_node.core.kernels import System
+from ba_node.core.linear_costs import Factor, Sizes
+from ba_node.core.objective import Rules
+from ba_node.core.options import SolverOptions
+from ba_node.core.problem import Observations, Problem, State
+from ba_node.core.reduced import ReducedSolver
+from tests.core.conftest import Spec, make
+
+Make = Callable[..., tuple[Problem, State]]
+built = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
+
+
+def only(problem: Problem, kept: np.ndarray) -> Problem:
+    """Return the problem with some of its observations."""
+    fields = {
+        field.name: value[kept] if len(value := getattr(problem.observations, field.name)) else value
+        for field in dataclasses.fields(Observations)
+    }
+    return dataclasses.replace(problem, observations=Observations(**fields))
+
+
+def ring(problem: Problem, reach: int) -> Problem:
+    """Keep observations by up to ``reach`` neighbours on a ring of keyframes, so that S has a band and a corner."""
+    obs, n = problem.observations, problem.n_keyframes
+    return only(problem, (obs.keyframe - obs.point) % n < reach)
+
+
+def systems(problem: Problem, damping: float, backend: str = "native") -> tuple[System, tuple[np.ndarray, np.ndarray]]:
+    """Return the system of the start with Marquardt damping, and the diagonal of H."""
+    kernels = native_kernels.make(problem, Rules(), backend)
+    kernels.linearise(problem.start)
+    d_c, d_p = kernels.diagonals()
+    system = kernels.reduce(damping * np.maximum(d_c, 1e-6), damping * np.maximum(d_p, 1e-6))
+    return system, (d_c, d_p)
+
+
+@built
+@pytest.mark.parametrize("damping", [1e-8, 1e-4, 1.0])
+@pytest.mark.parametrize("free_intrinsics", [False, True])
+@pytest.mark.parametrize("reach", [2, 4, 13])
+def test_every_linear_solver_gives_the_dense_step(
+    reach: int, free_intrinsics: bool, damping: float, make_problem: Make
+) -> None:
+    whole, _ = make_problem(keyframes=13, points=400, free_intrinsics=free_intrinsics, fixed=2, seen_share=1.0)
+    problem = ring(whole, reach)
+    system, hessian = systems(problem, damping)
+    expected = np.linalg.solve(system.dense(), system.rhs)
+    scale = np.abs(expected).max()
+    condition = np.linalg.cond(system.dense())
+    tolerance = max(1e-8, 1e-15 * condition) * scale
+    for kind, options in {
+        "dense": SolverOptions(linear_solver="dense"),
+        "sparse": SolverOptions(linear_solver="sparse"),
+        "auto": SolverOptions(),
+    }.items():
+        found = ReducedSolver(options).solve(system, hessian, np.inf).x
+        assert found is not None, kind
+        worst = float(np.abs(found - expected).max())
+        assert worst <= tolerance, f"{kind}: off by {worst / scale:.1e}, condition {condition:.1e}"
+    if damping >= 1e-4:
+        options = SolverOptions(linear_solver="pcg", t_eps=1e-14, max_linear_iterations=20_000)
+        found = ReducedSolver(options).solve(system, hessian, np.inf).x
+        assert found is not None
+        np.testing.assert_allclose(system.product(found), system.rhs, atol=1e-9 * np.abs(system.rhs).max())
+
+
+@built
+@given(seed=st.integers(0, 10_000), keyframes=st.integers(2, 30), share=st.floats(0.02, 1.0), own=st.booleans())
+def test_sparse_solution_for_any_pattern(seed: int, keyframes: int, share: float, own: bool) -> None:
+    """Whoever shares points with whom, isolated keyframes and empty rows too."""
+    problem, _ = make(Spec(keyframes=keyframes, points=60, free_intrinsics=own, fixed=1, seed=seed))
+    kept = np.random.default_rng(seed).random(len(problem.observations)) < share
+    system, _ = systems(only(problem, kept), 1e-2)
+    factor = system.factor_size(2**40, np.inf)
+    assert factor.complete
+    x = system.solve_sparse()
+    assert x is not None
+    dense = system.dense()
+    np.testing.assert_allclose(dense @ x, system.rhs, rtol=0, atol=1e-9 * max(1.0, np.abs(system.rhs).max()))
+    np.testing.assert_array_equal(x, system.solve_sparse(), "the same numbers every time")
+    np.testing.assert_allclose(system.sparse().toarray(), dense, rtol=0, atol=1e-12 * np.abs(dense).max(initial=1e-300))
+
+
+@built
+@pytest.mark.parametrize("linear_solver", ["dense", "sparse"])
+def test_singular_system_has_no_solution(linear_solver: str, make_problem: Make) -> None:
+    """A free keyframe that sees nothing, without damping: its block of S is zero."""
+    problem, _ = make_problem(keyframes=6, fixed=1)
+    problem = only(problem, problem.observations.keyframe != 4)
+    system, hessian = systems(problem, 0.0)
+    assert ReducedSolver(SolverOptions(linear_solver=linear_solver)).solve(system, hessian, np.inf).x is None
+    result = solver.solve(problem, SolverOptions(linear_solver=linear_solver))
+    assert result.state.is_finite() and result.status.usable
+    assert result.objective_after < result.objective_before
+
+
+def test_sparse_solver_of_numpy_agrees(make_problem: Make) -> None:
+    problem, _ = make_problem(keyframes=8, points=100)
+    system, hessian = systems(problem, 1e-3, "numpy")
+    found = ReducedSolver(SolverOptions(linear_solver="sparse")).solve(system, hessian, np.inf).x
+    assert found is not None
+    np.testing.assert_allclose(found, np.linalg.solve(system.dense(), system.rhs), rtol=1e-7)
+
+
+def banded(cameras: int, reach: int) -> tuple[Sizes, Factor]:
+    """Return sizes of a chain of cameras, each sharing 100 points with each of its neighbours."""
+    blocks = cameras * (reach + 1)
+    return Sizes(9 * cameras, 9, 700 * cameras, 3000 * cameras), Factor(blocks, cameras * reach * (reach + 1) / 2.0)
+
+
+def full(cameras: int) -> tuple[Sizes, Factor]:
+    """Return sizes where all cameras see all points."""
+    edges, pairs = 1000 * cameras, 500 * cameras * (cameras + 1)
+    blocks = cameras * (cameras + 1) // 2
+    fits = blocks <= linear_costs.max_blocks(9)
+    return Sizes(9 * cameras, 9, edges, pairs), Factor(blocks, cameras**3 / 6.0, fits)
+
+
+def test_chains_are_solved_sparsely_and_large_full_systems_are_not() -> None:
+    for cameras in (20, 1000, 100_000):
+        assert linear_costs.cheapest(*banded(cameras, 11)) == "sparse", cameras
+    assert linear_costs.cheapest(*full(500), exact=True) == "dense"
+    assert linear_costs.cheapest(*full(20_000), exact=True) == "pcg", "no factor fits into memory"
+    assert linear_costs.cheapest(*full(5000)) == "pcg"
+
+
+@given(st.integers(2, 400), st.integers(1, 60))
+def test_a_factor_beyond_the_limit_is_never_the_cheapest(cameras: int, reach: int) -> None:
+    sizes, factor = banded(cameras, reach)
+    if factor.products > linear_costs.max_products(sizes):
+        assert linear_costs.cheapest(sizes, factor) != "sparse"
+
+
+@built
+def test_the_result_names_the_linear_solver(make_problem: Make) -> None:
+    problem, _ = make_problem()
+    texts = {
+        kind: solver.solve(problem, SolverOptions(linear_solver=kind)).linear_solver
+        for kind in ("auto", "dense", "sparse", "pcg")
+    }
+    assert texts["dense"] == "dense Cholesky (24 unknowns, 4.6e-06 GFLOP)"
+    assert texts["sparse"] == texts["auto"]
+    assert texts["sparse"].startswith("sparse Cholesky (24 unknowns, fill 1e+02 %, ")
+    assert texts["pcg"] == "PCG (24 unknowns)"
