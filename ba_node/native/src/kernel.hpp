@@ -27,7 +27,6 @@ class Kernel {
  public:
   Kernel(const ProblemView& problem, const Rules& rules, const StateView& start, int threads)
       : l_(problem, D == 9), rows_(l_, rules, start), pool_(threads), equations_(l_) {
-    z_.resize(l_.n_edges());
     row_.resize(pool_.threads() * l_.n_free);
     rhs_.resize(l_.n_free);
     step_.resize(l_.n_free);
@@ -39,6 +38,7 @@ class Kernel {
     part_.resize(l_.n_chunks());
     const std::int64_t most = l_.n_batches ? l_.slot_begin[1] : 0;
     for (int i = 0; i < pool_.threads(); ++i) images_.emplace_back(most);
+    find_columns();
   }
   // The parts refer to one another.
   Kernel(const Kernel&) = delete;
@@ -103,6 +103,7 @@ class Kernel {
   // Add damping to the diagonals and factor C; everything below is of this damped system.
   void factor(const double* damping_c, const double* damping_p) {
     std::copy_n(damping_c, l_.n_free * D, damping_c_.data());
+    edges_kept_ = false;
     const bool depth = l_.has_depth;
     pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
       clear(&sums_[chunk * l_.n_free], l_.n_free);
@@ -132,6 +133,7 @@ class Kernel {
   // S, symmetric, (n x n), n = n_free D.
   void dense(double* out) {
     const std::int64_t n = l_.n_free * D;
+    keep_edges();
     pool_.each(l_.n_free, [&](std::int64_t i, int thread) {
       Block<D>* row = &row_[thread * l_.n_free];
       clear(row + i, l_.n_free - i);
@@ -148,15 +150,45 @@ class Kernel {
 
   // S by blocks, and its factor if it meets the limits; found once.
   const SparseSchur<D>& analyse(const FillLimits& limits) {
-    if (!sparse_ || !sparse_->fill().complete) sparse_ = std::make_unique<SparseSchur<D>>(l_, pool_.threads(), limits);
+    if (!sparse_ || !sparse_->fill().complete) sparse_ = std::make_unique<SparseSchur<D>>(l_, limits);
     return *sparse_;
   }
 
-  // After analyse.
+  // Z of all edges is kept where it takes no more than this.
+  std::int64_t kept_bytes = std::int64_t{1} << 25;
+
+  // After analyse. Row by row with Z of all edges, or if that is large, point by point with Z of a batch.
   const SparseSchur<D>& assemble_sparse() {
-    sparse_->assemble(
-        pool_, [this](std::int64_t i, auto block) { add_row(i, block); },
-        [this](std::int64_t i, double* block) { add_diagonal(i, block, D); });
+    const auto diagonal = [this](std::int64_t i, double* block) { add_diagonal(i, block, D); };
+    if (l_.n_edges() * static_cast<std::int64_t>(sizeof(Edge<D>)) <= kept_bytes) {
+      keep_edges();
+      pool_.each(l_.n_free, [&](std::int64_t i, int) {
+        sparse_->clear_rows(i, i + 1);
+        auto row = sparse_->row(i);
+        for (std::int64_t k = l_.keyframe_edge[i]; k < l_.keyframe_edge[i + 1]; ++k) {
+          const std::int32_t e = l_.edges_of_keyframe[k], end = l_.edge_end[e];
+          row.rewind();
+          for (std::int32_t f = e; f < end; ++f) subtract_product(row(l_.edge_column[f]), z_[e], z_[f]);
+        }
+        sparse_->add_diagonal(i, diagonal);
+      });
+      return *sparse_;
+    }
+    cut_rows();
+    pool_.each(pool_.threads(), [&](std::int64_t part, int thread) {
+      const std::int64_t begin = rows_cut_[part], end = rows_cut_[part + 1];
+      sparse_->clear_rows(begin, end);
+      with_edges(begin, end, thread, [&](std::int64_t p, const Edge<D>* z) {
+        const std::int32_t first = l_.point_edge[p], last = l_.point_edge[p + 1];
+        for (std::int32_t e = first; e < last; ++e) {
+          const std::int32_t i = l_.edge_column[e];
+          if (i < begin || i >= end) continue;
+          auto row = sparse_->row(i);
+          for (std::int32_t f = e; f < last; ++f) subtract_product(row(l_.edge_column[f]), z[e - first], z[f - first]);
+        }
+      });
+      for (std::int64_t i = begin; i < end; ++i) sparse_->add_diagonal(i, diagonal);
+    });
     return *sparse_;
   }
 
@@ -174,13 +206,10 @@ class Kernel {
       Column<D>* y = &sums_[chunk * l_.n_free];
       clear(y, l_.n_free);
       for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 v[3];
+        V8 v[3], p[3];
         project_step(i, v);
-        for (int l = 0; l < l_.lanes(i); ++l) {
-          const double w[3] = {v[0][l], v[1][l], v[2][l]};
-          for (std::int32_t e = l_.point_edge[kLanes * i + l]; e < l_.point_edge[kLanes * i + l + 1]; ++e)
-            add_product(y[l_.edge_column[e]], z_[e], w);
-        }
+        upper_times(*reinterpret_cast<const Packed*>(&inverse_l_[6 * i]), v, p);
+        add_coupling(i, p, y);
       }
     });
     for (std::int64_t k = 0; k < l_.n_free; ++k) {
@@ -194,15 +223,22 @@ class Kernel {
   }
 
   void diagonal_blocks(double* out) {
-    pool_.each(l_.n_free, [&](std::int64_t k, int) {
-      Block<D> s;
-      clear(&s, 1);
-      for (std::int64_t i = l_.keyframe_edge[k]; i < l_.keyframe_edge[k + 1]; ++i) {
-        const Edge<D>& z = z_[l_.edges_of_keyframe[i]];
-        subtract_product(s, z, z);
+    std::fill_n(out, l_.n_free * D * D, 0.0);
+    cut_rows();
+    pool_.each(pool_.threads(), [&](std::int64_t part, int thread) {
+      const std::int64_t begin = rows_cut_[part], end = rows_cut_[part + 1];
+      Block<D>* own = &row_[thread * l_.n_free];
+      clear(own + begin, end - begin);
+      with_edges(begin, end, thread, [&](std::int64_t p, const Edge<D>* z) {
+        for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e, ++z) {
+          const std::int32_t k = l_.edge_column[e];
+          if (k >= begin && k < end) subtract_product(own[k], *z, *z);
+        }
+      });
+      for (std::int64_t k = begin; k < end; ++k) {
+        write_block(own[k], out + k * D * D, D);
+        add_diagonal(k, out + k * D * D, D);
       }
-      write_block(s, out + k * D * D, D);
-      add_diagonal(k, out + k * D * D, D);
     });
   }
 
@@ -235,23 +271,64 @@ class Kernel {
   }
 
  private:
-  // L^-1, L^-1 gp and Z of a batch; adds Z L^-1 gp to `sums`. kGeneral: edges of several observations, or with depth.
+  // L^-1 and y = L^-1 gp of a batch; adds Z y to `sums`.
   template <bool kGeneral>
   void factor_batch(std::int64_t batch, const V8 (&damping)[3], Column<D>* sums) {
     Packed& li = *reinterpret_cast<Packed*>(&inverse_l_[6 * batch]);
-    V8 g[3], y[3], x[3];
+    V8 g[3], y[3], p[3];
     for (int i = 0; i < 3; ++i) {
       g[i] = equations_.gradient_p[3 * batch + i];
-      x[i] = equations_.point[3 * batch + i];
       damping_p_[3 * batch + i] = damping[i];
     }
     inverse_cholesky(*reinterpret_cast<const Packed*>(&equations_.c[6 * batch]), damping, li);
     lower_times(li, g, y);
     for (int i = 0; i < 3; ++i) scaled_gradient_[3 * batch + i] = y[i];
+    upper_times(li, y, p);
+    add_coupling(batch, p, sums);
+  }
+
+  // Z of the edges of a batch; z: from the batch's first edge on. kGeneral: edges of several observations, or with depth.
+  template <bool kGeneral>
+  void edges_of_batch(std::int64_t batch, Edge<D>* z) const {
+    const V8(&x)[3] = *reinterpret_cast<const V8(*)[3]>(&equations_.point[3 * batch]);
+    const Packed& li = *reinterpret_cast<const Packed*>(&inverse_l_[6 * batch]);
     V8 c[6] = {}, f[D == 9 ? 9 : 1] = {};
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       couple<kGeneral>(slot, c, f);
-      store_edges(slot, li, x, y, c, f, sums);
+      store_edges(slot, li, x, c, f, z - l_.point_edge[kLanes * batch]);
+    }
+  }
+
+  void edges_of(std::int64_t batch, Edge<D>* z) const {
+    if (l_.has_depth || l_.has_rigs) {
+      edges_of_batch<true>(batch, z);
+    } else {
+      edges_of_batch<false>(batch, z);
+    }
+  }
+
+  // Z of all edges, once for each damping.
+  void keep_edges() {
+    if (edges_kept_) return;
+    z_.resize(l_.n_edges());
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i)
+        edges_of(i, z_.data() + l_.point_edge[kLanes * i]);
+    });
+    edges_kept_ = true;
+  }
+
+  // Call f(p, z) for each point (of ours) that one of the free keyframes [begin, end) sees; z: of its edges.
+  template <class F>
+  void with_edges(std::int64_t begin, std::int64_t end, int thread, F f) {
+    Buffer<Edge<D>>& z = scratch_[thread];
+    z.resize(most_edges_);
+    for (std::int64_t i = 0; i < l_.n_batches; ++i) {
+      if (last_column_[i] < begin || first_column_[i] >= end) continue;
+      edges_of(i, z.data());
+      const std::int32_t first = l_.point_edge[kLanes * i];
+      for (int l = 0; l < l_.lanes(i); ++l)
+        f(kLanes * i + l, z.data() + (l_.point_edge[kLanes * i + l] - first));
     }
   }
 
@@ -259,11 +336,7 @@ class Kernel {
   template <bool kGeneral>
   [[gnu::always_inline]] void couple(std::int64_t slot, V8 (&c)[6], V8* f) const {
     V8 t[8];
-    const auto read = [&](int line) {
-      const V8* record = &equations_.record[kLanes * slot * equations_.lines + line];
-      for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.lines];
-      transpose(t);
-    };
+    const auto read = [&](int line) { read_lanes(slot, line, t); };
     const auto add = [&c](const V8* a) {
       c[0] += a[0] * a[0];
       c[1] += a[1] * a[0];
@@ -298,9 +371,9 @@ class Kernel {
     }
   }
 
-  // Z of the edges that end in a slot: with E = (x x C; C; F), its columns from those of C L^-T and F L^-T.
-  [[gnu::always_inline]] void store_edges(std::int64_t slot, const Packed& li, const V8 (&x)[3], const V8 (&y)[3],
-                                          const V8 (&c)[6], const V8* f, Column<D>* sums) {
+  // Z of the edges that end in a slot, z[edge]: with E = (x x C; C; F), its columns from those of C L^-T and F L^-T.
+  [[gnu::always_inline]] void store_edges(std::int64_t slot, const Packed& li, const V8 (&x)[3], const V8 (&c)[6],
+                                          const V8* f, Edge<D>* z) const {
     const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
     V8 columns[3][8], ninth[8] = {};
     for (int i = 0; i < 3; ++i) {
@@ -327,33 +400,84 @@ class Kernel {
     const std::int32_t* edge = &l_.slot_edge[kLanes * slot];
     for (int l = 0; l < kLanes; ++l) {
       if (edge[l] < 0) continue;
-      Edge<D>& z = z_[edge[l]];
-      for (int col = 0; col < 3; ++col) z.a[col] = columns[col][l];
-      if constexpr (D == 9) z.b = ninth[l];
-      const double v[3] = {y[0][l], y[1][l], y[2][l]};
-      add_product(sums[l_.edge_column[edge[l]]], z, v);
+      for (int col = 0; col < 3; ++col) z[edge[l]].a[col] = columns[col][l];
+      if constexpr (D == 9) z[edge[l]].b = ninth[l];
     }
   }
 
-  // Z' step of a batch: sums over the edges of each point.
-  [[gnu::always_inline]] void project_step(std::int64_t batch, V8 (&out)[3]) const {
-    V8 acc[3][8], last[8];
-    for (int l = 0; l < kLanes; ++l) {
-      V8 a[3] = {}, b{};
-      const std::int64_t p = kLanes * batch + l;
-      for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
-        const Column<D>& x = step_[l_.edge_column[e]];
-        for (int c = 0; c < 3; ++c) a[c] += z_[e].a[c] * x.a;
-        if constexpr (D == 9) b += z_[e].b * x.b;
+  // Line `line` of the records of a slot, each number by lane.
+  [[gnu::always_inline]] void read_lanes(std::int64_t slot, int line, V8 (&t)[8]) const {
+    const V8* record = &equations_.record[kLanes * slot * equations_.lines + line];
+    for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.lines];
+    transpose(t);
+  }
+
+  // The free keyframe of a lane, or -1.
+  std::int32_t column_of_lane(std::int64_t at) const {
+    return l_.inverse_sigma[at] != 0.0 ? image_column_[l_.slot_image[at]] : -1;
+  }
+
+  // Add E p to sums, E = Jc'Jp, for p of the points of a batch.
+  void add_coupling(std::int64_t batch, const V8 (&p)[3], Column<D>* sums) const {
+    const V8* x = &equations_.point[3 * batch];
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
+      V8 t[8], h[3], out[8] = {}, ninth{};
+      read_lanes(slot, 0, t);
+      const V8 u = t[0] * p[0] + t[1] * p[1] + t[2] * p[2], v = t[3] * p[0] + t[4] * p[1] + t[5] * p[2];
+      for (int i = 0; i < 3; ++i) h[i] = t[i] * u + t[3 + i] * v;
+      if constexpr (D == 9) {
+        read_lanes(slot, 1, t);
+        for (int i = 0; i < 2; ++i) out[6 + i] = t[i] * u + t[3 + i] * v;
+        ninth = t[2] * u + t[5] * v;
       }
-      for (int c = 0; c < 3; ++c) acc[c][l] = a[c];
-      last[l] = b;
+      if (l_.has_depth) {
+        read_lanes(slot, equations_.lines - 1, t);
+        const V8 w = t[0] * p[0] + t[1] * p[1] + t[2] * p[2];
+        for (int i = 0; i < 3; ++i) h[i] += t[i] * w;
+      }
+      pose_row(x, h, out);
+      transpose(out);
+      for (int l = 0; l < kLanes; ++l) {
+        const std::int32_t column = column_of_lane(kLanes * slot + l);
+        if (column < 0) continue;
+        sums[column].a += out[l];
+        if constexpr (D == 9) sums[column].b += ninth[l];
+      }
     }
-    for (int c = 0; c < 3; ++c) out[c] = sums(acc[c]);
-    if constexpr (D == 9) {
-      transpose(last);
-      for (int c = 0; c < 3; ++c) out[c] += last[c];
+  }
+
+  // Z' step = L^-1 Jp' Jc step of a batch.
+  [[gnu::always_inline]] void project_step(std::int64_t batch, V8 (&out)[3]) const {
+    const V8* x = &equations_.point[3 * batch];
+    V8 z[3] = {};
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
+      V8 s[8], t[8], q[3], last{};
+      for (int l = 0; l < kLanes; ++l) {
+        const std::int32_t column = column_of_lane(kLanes * slot + l);
+        s[l] = column < 0 ? V8{} : step_[column].a;
+        if constexpr (D == 9) last[l] = column < 0 ? 0.0 : step_[column].b;
+      }
+      transpose(s);
+      q[0] = s[1] * x[2] - s[2] * x[1] + s[3];
+      q[1] = s[2] * x[0] - s[0] * x[2] + s[4];
+      q[2] = s[0] * x[1] - s[1] * x[0] + s[5];
+      V8 u{}, v{};
+      if constexpr (D == 9) {
+        read_lanes(slot, 1, t);
+        u = t[0] * s[6] + t[1] * s[7] + t[2] * last;
+        v = t[3] * s[6] + t[4] * s[7] + t[5] * last;
+      }
+      read_lanes(slot, 0, t);
+      u += t[0] * q[0] + t[1] * q[1] + t[2] * q[2];
+      v += t[3] * q[0] + t[4] * q[1] + t[5] * q[2];
+      for (int i = 0; i < 3; ++i) z[i] += t[i] * u + t[3 + i] * v;
+      if (l_.has_depth) {
+        read_lanes(slot, equations_.lines - 1, t);
+        const V8 w = t[0] * q[0] + t[1] * q[1] + t[2] * q[2];
+        for (int i = 0; i < 3; ++i) z[i] += t[i] * w;
+      }
     }
+    lower_times(*reinterpret_cast<const Packed*>(&inverse_l_[6 * batch]), z, out);
   }
 
   // Row i of -Z Z' from the diagonal on; `block` finds the block of a column.
@@ -362,6 +486,42 @@ class Kernel {
     for (std::int64_t k = l_.keyframe_edge[i]; k < l_.keyframe_edge[i + 1]; ++k) {
       const std::int32_t e = l_.edges_of_keyframe[k], end = l_.edge_end[e];
       for (std::int32_t f = e; f < end; ++f) subtract_product(block(l_.edge_column[f]), z_[e], z_[f]);
+    }
+  }
+
+  // Rows of S for each thread, about as many pairs of edges for each. What a row sums does not depend on it.
+  void cut_rows() {
+    if (!rows_cut_.empty()) return;
+    const double all = static_cast<double>(n_pairs());
+    double done = 0;
+    rows_cut_.push_back(0);
+    for (std::int64_t i = 0; i < l_.n_free; ++i) {
+      for (std::int64_t k = l_.keyframe_edge[i]; k < l_.keyframe_edge[i + 1]; ++k) {
+        const std::int32_t e = l_.edges_of_keyframe[k];
+        done += l_.edge_end[e] - e;
+      }
+      while (static_cast<int>(rows_cut_.size()) < pool_.threads() && done >= all * static_cast<double>(rows_cut_.size()) / pool_.threads())
+        rows_cut_.push_back(i + 1);
+    }
+    rows_cut_.resize(pool_.threads() + 1, l_.n_free);
+  }
+
+  // Which free keyframe each image is of, and those that see the points of each batch.
+  void find_columns() {
+    image_column_.assign(l_.images.size(), -1);
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      for (std::int64_t i = l_.keyframe_seen[k]; i < l_.keyframe_seen[k + 1]; ++i)
+        if (l_.seen[i] >= 0) image_column_[l_.slot_image[l_.seen[i]]] = static_cast<std::int32_t>(k);
+    scratch_.resize(pool_.threads());
+    first_column_.assign(l_.n_batches, static_cast<std::int32_t>(l_.n_free));
+    last_column_.assign(l_.n_batches, -1);
+    for (std::int64_t i = 0; i < l_.n_batches; ++i) {
+      const std::int32_t begin = l_.point_edge[kLanes * i], end = l_.point_edge[kLanes * (i + 1)];
+      most_edges_ = std::max<std::int64_t>(most_edges_, end - begin);
+      for (std::int32_t e = begin; e < end; ++e) {
+        first_column_[i] = std::min(first_column_[i], l_.edge_column[e]);
+        last_column_[i] = std::max(last_column_[i], l_.edge_column[e]);
+      }
     }
   }
 
@@ -405,6 +565,11 @@ class Kernel {
   Pool pool_;
   Equations<D> equations_;
   Buffer<Edge<D>> z_;
+  std::vector<Buffer<Edge<D>>> scratch_;  // of each thread: Z of a batch
+  std::int64_t most_edges_ = 0;
+  bool edges_kept_ = false;
+  std::vector<std::int64_t> rows_cut_;
+  std::vector<std::int32_t> image_column_, first_column_, last_column_;
   Buffer<Block<D>> row_;
   Buffer<Column<D>> rhs_, step_, sums_;  // sums_: of each chunk
   Buffer<V8> inverse_l_, scaled_gradient_, damping_p_;

@@ -133,17 +133,31 @@ class Layout {
     return order;
   }
 
+  // Points by the first keyframe that sees them: neighbours in memory then meet the same keyframes.
+  std::vector<std::int32_t> points_by_keyframe(const ProblemView& p) const {
+    std::vector<std::int32_t> lowest(n_points, static_cast<std::int32_t>(n_keyframes));
+    for (std::int64_t o = 0; o < n_obs; ++o)
+      lowest[p.point[o]] = std::min(lowest[p.point[o]], static_cast<std::int32_t>(p.keyframe[o]));
+    std::vector<std::int64_t> place(n_keyframes + 2, 0);
+    for (std::int32_t k : lowest) ++place[k + 1];
+    std::partial_sum(place.begin(), place.end(), place.begin());
+    std::vector<std::int32_t> out(n_points);
+    for (std::int64_t i = 0; i < n_points; ++i) out[place[lowest[i]]++] = static_cast<std::int32_t>(i);
+    return out;
+  }
+
   // Number points and give batches their slots; returns where each of our points' observations begin, and how many.
   std::vector<std::int64_t> number_points(const ProblemView& p) {
     std::vector<std::int64_t> begin(n_points + 1, 0);
     for (std::int64_t o = 0; o < n_obs; ++o) ++begin[p.point[o] + 1];
     const std::int64_t most = *std::max_element(begin.begin(), begin.end());
+    n_batches = (n_points + kLanes - 1) / kLanes;
+    point.resize(kLanes * n_batches);
+    const std::vector<std::int32_t> by_keyframe = points_by_keyframe(p);
     std::vector<std::int64_t> place(most + 2, 0);  // of the points with so many observations, most first
     for (std::int64_t i = 0; i < n_points; ++i) ++place[most - begin[i + 1] + 1];
     std::partial_sum(place.begin(), place.end(), place.begin());
-    n_batches = (n_points + kLanes - 1) / kLanes;
-    point.resize(kLanes * n_batches);
-    for (std::int64_t i = 0; i < n_points; ++i) point[place[most - begin[i + 1]]++] = static_cast<std::int32_t>(i);
+    for (std::int32_t i : by_keyframe) point[place[most - begin[i + 1]]++] = i;
     for (std::int64_t i = n_points; i < kLanes * n_batches; ++i) point[i] = point[n_points - 1];
     slot_begin.assign(n_batches + 1, 0);
     for (std::int64_t b = 0; b < n_batches; ++b) slot_begin[b + 1] = slot_begin[b] + begin[point[kLanes * b] + 1];

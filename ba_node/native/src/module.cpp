@@ -169,6 +169,7 @@ void bind(py::module_& m, const char* name) {
              }
              return py::make_tuple(fill->complete, fill->blocks, fill->products);
            })
+      .def_readwrite("kept_bytes", &K::kept_bytes)
       .def("pairs", [](const K& k) { return py::make_tuple(k.n_edges(), k.n_pairs()); })
       .def("solve_sparse",
            [](K& k) -> py::object {

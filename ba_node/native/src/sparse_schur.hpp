@@ -10,7 +10,6 @@
 
 #include "blocks.hpp"
 #include "layout.hpp"
-#include "pool.hpp"
 #include "sparse_cholesky.hpp"
 
 namespace ba {
@@ -41,32 +40,50 @@ inline Rows32 shared_points(const Layout& l) {
 template <int D>
 class SparseSchur {
  public:
-  SparseSchur(const Layout& l, int threads, const FillLimits& limits)
-      : pattern_(shared_points(l)), factor_(pattern_, limits) {
+  SparseSchur(const Layout& l, const FillLimits& limits) : pattern_(shared_points(l)), factor_(pattern_, limits) {
     blocks_.resize(factor_.fill().complete ? pattern_.index.size() : 0);
-    place_.resize(threads * l.n_free);
   }
 
   const Rows32& pattern() const { return pattern_; }
   const Fill& fill() const { return factor_.fill(); }
   const Buffer<Block<D>>& blocks() const { return blocks_; }
 
-  // add_row(i, find): add row i of -Z Z' to the blocks find(j), j >= i. add_diagonal(i, out): add B and damping, D x D.
-  template <class AddRow, class AddDiagonal>
-  void assemble(Pool& pool, AddRow add_row, AddDiagonal add_diagonal) {
-    pool.each(pattern_.count(), [&](std::int64_t i, int thread) {
-      const std::int64_t begin = pattern_.start[i], end = pattern_.start[i + 1];
-      std::int32_t* place = &place_[thread * pattern_.count()];
-      clear(&blocks_[begin], end - begin);
-      for (std::int64_t k = begin; k < end; ++k) place[pattern_.index[k]] = static_cast<std::int32_t>(k);
-      add_row(i, [&](std::int32_t j) -> Block<D>& { return blocks_[place[j]]; });
-      double own[D * D];
-      Block<D>& block = blocks_[begin];
-      write_block(block, own, D);
-      add_diagonal(i, own);
-      for (int r = 0; r < D; ++r)
-        for (int c = 0; c < D; ++c) set_entry(block, r, c, own[r * D + c]);
-    });
+  // Blocks (i, j) of a row for rising j.
+  class Row {
+   public:
+    Row(const std::int32_t* begin, const std::int32_t* end, Block<D>* blocks)
+        : begin_(begin), at_(begin), end_(end), blocks_(blocks) {}
+    void rewind() { at_ = begin_; }
+    Block<D>& operator()(std::int32_t j) {
+      // No further than this, and just there if the columns between are all in the row.
+      const std::int32_t* most = at_ + std::min<std::ptrdiff_t>(j - *at_, end_ - at_ - 1);
+      at_ = *most == j ? most : std::lower_bound(at_, most, j);
+      return blocks_[at_ - begin_];
+    }
+
+   private:
+    const std::int32_t *begin_, *at_, *end_;
+    Block<D>* blocks_;
+  };
+
+  Row row(std::int64_t i) {
+    const std::int32_t* index = pattern_.index.data();
+    return Row(index + pattern_.start[i], index + pattern_.start[i + 1], &blocks_[pattern_.start[i]]);
+  }
+
+  void clear_rows(std::int64_t begin, std::int64_t end) {
+    clear(blocks_.data() + pattern_.start[begin], pattern_.start[end] - pattern_.start[begin]);
+  }
+
+  // add(i, out): add to the D x D numbers of the diagonal block of row i.
+  template <class Add>
+  void add_diagonal(std::int64_t i, Add add) {
+    double own[D * D];
+    Block<D>& block = blocks_[pattern_.start[i]];
+    write_block(block, own, D);
+    add(i, own);
+    for (int r = 0; r < D; ++r)
+      for (int c = 0; c < D; ++c) set_entry(block, r, c, own[r * D + c]);
   }
 
   // x: right-hand side in, solution out. False if S is not positive definite.
@@ -80,7 +97,6 @@ class SparseSchur {
   Rows32 pattern_;
   SparseCholesky<D> factor_;
   Buffer<Block<D>> blocks_;
-  std::vector<std::int32_t> place_;  // of each thread: where the block of a column is
 };
 
 }  // namespace ba
