@@ -23,7 +23,9 @@ A replay solves once for every keyframe, however the messages are spaced, just b
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
 due again if it was not refined without them. A higher session id begins a new map with the same rig; the last estimate
-of the one before is kept in ``finished``. Nothing here reads a clock: the caller passes one, for the report alone.
+of the one before is kept in ``finished``. So does a keyframe far older than the newest, as when a recording is played
+again; its session id stays as the front-end has it. Nothing here reads a clock: the caller passes one, for the report
+alone.
 """
 
 from __future__ import annotations
@@ -74,6 +76,8 @@ class Backend:
         scene: the current map.
         finished: session id and last estimate of the sessions before, oldest first, the last few.
         solve_count: solves since the beginning.
+        jumps: sessions that began because the stamps jumped back.
+        jump_note: the last of these in words.
         extras: what the next solve is to work out beside the estimate.
     """
 
@@ -83,6 +87,8 @@ class Backend:
         self.scene = Scene(config.scene)
         self.finished: list[tuple[int, Estimate]] = []
         self.solve_count = 0
+        self.jumps = 0
+        self.jump_note = ""
         self.extras = Extras()
         self._clock = clock
         self._current: int | None = None
@@ -131,6 +137,7 @@ class Backend:
         if isinstance(measurement, CameraRig) and self.config.frames.poses_of == "camera":
             measurement = ingest.seen_from_first(measurement)
         if not isinstance(measurement, CameraRig) and self._opens(measurement):
+            self._note_jump(measurement)
             self._begin(measurement.session_id)
         last = self._current
         if not isinstance(measurement, Keyframe) or self.scene.find_keyframe(measurement.keyframe_id) is not None:
@@ -361,9 +368,27 @@ class Backend:
     def _opens(self, measurement: Measurement) -> bool:
         """Return True if a measurement belongs to a later session than the current."""
         current = self.scene.session_id
-        if isinstance(measurement, CameraRig) or current is None or measurement.session_id <= current:
+        if isinstance(measurement, CameraRig) or current is None or measurement.session_id < current:
+            return False
+        if measurement.session_id == current and not self._is_before_all(measurement):
             return False
         return self.scene.usable(measurement)
+
+    def _note_jump(self, measurement: Measurement) -> None:
+        if isinstance(measurement, Keyframe) and measurement.session_id == self.scene.session_id:
+            back_s = (int(self.scene.keyframes.stamp_ns.max()) - measurement.stamp_ns) * 1e-9
+            self.jumps += 1
+            self.jump_note = (
+                f"keyframe {measurement.keyframe_id} is {back_s:.1f} s older than the newest"
+                f" (scene.max_reorder_s = {self.config.scene.max_reorder_s:g}): a new session begins"
+            )
+
+    def _is_before_all(self, measurement: Measurement) -> bool:
+        """Return True if the stamps have jumped back, further than keyframes are sorted."""
+        limit_ns = int(self.config.scene.max_reorder_s * 1e9)
+        if not limit_ns or not isinstance(measurement, Keyframe) or not len(self.scene.keyframes):
+            return False
+        return int(self.scene.keyframes.stamp_ns.max()) - measurement.stamp_ns > limit_ns
 
     def _begin(self, session_id: int) -> None:
         if len(self.scene.keyframes):

@@ -122,6 +122,14 @@ class SceneConfig:
         minimum=100,
         maximum=100_000_000,
     )
+    max_reorder_s: float = _param(
+        10.0,
+        "A keyframe whose stamp is further than this before the newest begins a new session, as when a bag plays again;"
+        " closer ones are sorted in. 0: never.",
+        unit="s",
+        minimum=0.0,
+        maximum=1e9,
+    )
     max_pending: int = _param(
         200,
         "Track messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",
@@ -305,6 +313,13 @@ class NodeConfig:
         live=False,
     )
     queue_depth: int = _param(100, "QoS depth of the input subscriptions.", minimum=1, maximum=100_000, live=False)
+    silence_s: float = _param(
+        10.0,
+        "With no keyframes or tracks for this long, a warning names the topics and who publishes there; 0: never.",
+        unit="s",
+        minimum=0.0,
+        maximum=86_400.0,
+    )
     settle_time_s: float = _param(
         0.5,
         "With no new message for this long, the newest keyframe is solved with what has arrived.",
@@ -369,11 +384,27 @@ class Config:
         groups: dict[str, dict[str, Value]] = {}
         for name, value in changes.items():
             if name not in declared:
-                raise ConfigError(_unknown(name, list(declared)))
+                raise ConfigError(unknown(name, list(declared)))
             group, key = name.split(".")
             groups.setdefault(group, {})[key] = declared[name].check(value)
         replaced = {group: dataclasses.replace(getattr(self, group), **keys) for group, keys in groups.items()}
-        return dataclasses.replace(self, **replaced)
+        changed = dataclasses.replace(self, **replaced)
+        changed.check()
+        return changed
+
+    def check(self) -> None:
+        """Raise ConfigError if parameters contradict each other, each of which is valid by itself."""
+        window, scene = self.window.max_keyframes, self.scene.max_keyframes
+        if window > scene:
+            raise ConfigError(
+                f"parameter window.max_keyframes = {window}: more than are kept (scene.max_keyframes = {scene});"
+                f" lower the first or raise the second"
+            )
+        if self.solver.method.startswith("irls_") and self.solver.loss == "squared":
+            raise ConfigError(
+                f"parameter solver.loss = 'squared': method {self.solver.method!r} reweights residuals, which the"
+                f" squared loss leaves alone; choose another loss or another method"
+            )
 
 
 def _get(config: Config, name: str) -> Value:
@@ -382,7 +413,8 @@ def _get(config: Config, name: str) -> Value:
     return value
 
 
-def _unknown(name: str, known: list[str]) -> str:
+def unknown(name: str, known: list[str]) -> str:
+    """Return what to say of a parameter that does not exist: the one it is most like."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
     return f"parameter {name!r} does not exist; did you mean {near[0]!r}?"
 
@@ -419,7 +451,7 @@ def parse_assignment(text: str) -> tuple[str, Value]:
         raise ConfigError(f"{text!r}: expected name=value, for example window.max_keyframes=10")
     known = {p.name: p for p in declarations()}
     if name not in known:
-        raise ConfigError(_unknown(name, list(known)))
+        raise ConfigError(unknown(name, list(known)))
     parameter = known[name]
     return name, parameter.check(_read(raw, parameter))
 

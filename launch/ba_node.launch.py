@@ -27,6 +27,12 @@ def generate_launch_description() -> LaunchDescription:
                 description="take the time from /clock, as `ros2 bag play --clock` publishes it",
             ),
             DeclareLaunchArgument(
+                "autostart",
+                default_value="true",
+                choices=["true", "false"],
+                description="configure and activate at start; false leaves both to `ros2 lifecycle set`",
+            ),
+            DeclareLaunchArgument(
                 "log_level",
                 default_value="info",
                 choices=["debug", "info", "warn", "error", "fatal"],
@@ -39,7 +45,10 @@ def generate_launch_description() -> LaunchDescription:
                 namespace=LaunchConfiguration("namespace"),
                 parameters=[
                     LaunchConfiguration("params_file"),
-                    {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
+                    {
+                        "use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool),
+                        "node.autostart": ParameterValue(LaunchConfiguration("autostart"), value_type=bool),
+                    },
                 ],
                 arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
                 output="screen",

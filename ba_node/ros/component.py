@@ -26,6 +26,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from ba_node.ros import qos
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -48,9 +50,11 @@ class Host:
         log: log a Notice, the same one not more often than every few seconds.
         active: True between activate and deactivate.
         ignoring: why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken.
+        counted: what this side of the inbox turned away, by reason; it goes into the report.
         arrived: messages that came in, by topic; ignored ones too.
         place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
         tf: what becomes of the transform map -> odom, in words.
+        at_cleanup: what is undone when the node is cleaned up, last made first.
     """
 
     node: Any
@@ -91,13 +95,23 @@ class Component:
             newest: the last usable one of those that came together: what replaces the ones before needs only this.
         """
 
-    def publisher(self, *arguments: Any, **options: Any) -> Any:
-        """Make a publisher that is destroyed at cleanup."""
-        return self._owned("publisher", *arguments, **options)
+    def publisher(self, kind: Any, topic: str, profile: Any, **options: Any) -> Any:
+        """Make a publisher that is destroyed at cleanup. Its profile can be overridden by parameters.
 
-    def subscription(self, *arguments: Any, **options: Any) -> Any:
-        """Make a subscription that is destroyed at cleanup."""
-        return self._owned("subscription", *arguments, **options)
+        Args:
+            kind: message class.
+            topic: name, relative to the node's namespace or ``~/``.
+            profile: quality of service.
+            options: ``matched``, called when a subscriber comes or goes; others as of rclpy.
+        """
+        matched = options.pop("matched", None)
+        options = qos.for_publisher(self.host.node, topic, self.host.log, matched) | options
+        return self._owned("publisher", kind, topic, profile, **options)
+
+    def subscription(self, kind: Any, topic: str, take: Callable[[Any], None], profile: Any, **options: Any) -> Any:
+        """Make a subscription that is destroyed at cleanup. Its profile can be overridden by parameters."""
+        options = qos.for_subscription(self.host.node, topic, self.host.log) | options
+        return self._owned("subscription", kind, topic, take, profile, **options)
 
     def service(self, *arguments: Any, **options: Any) -> Any:
         """Make a service that is destroyed at cleanup."""

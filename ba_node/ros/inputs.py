@@ -27,8 +27,12 @@ class Inputs(Component):
         self._last: dict[str, Any] = {}
         for topic, kind in INPUT_TYPES.items():
             receive = functools.partial(self._receive, topic, kind)
-            for profile in qos.for_input(topic, host.config.node.queue_depth):
-                self.subscription(message_class(kind), topic, receive, profile)
+            # One solve may take long: as many messages as a window takes must be able to wait.
+            depth = max(host.config.node.queue_depth, host.config.window.max_keyframes)
+            first, *second = qos.for_input(topic, depth)
+            self.subscription(message_class(kind), topic, receive, first)
+            for profile in second:
+                self.subscription(message_class(kind), topic, receive, profile, **qos.sensor_data())
 
     def _receive(self, topic: str, kind: str, message: Any) -> None:
         """Hand a message to the worker. What cannot be read is counted; it must not end the node."""

@@ -30,6 +30,7 @@ from ba_node.ros.map_transform import MapTransform
 from ba_node.ros.parameters import Parameters
 from ba_node.ros.publishing import Publishing
 from ba_node.ros.side_outputs import SideOutputs
+from ba_node.ros.silence import Silence
 from ba_node.ros.static_frames import StaticFrames
 from ba_node.ros.throttle import Throttle
 from ba_node.ros.worker import Notice, Worker
@@ -39,7 +40,15 @@ if TYPE_CHECKING:
 
 NODE_NAME = "ba_node"
 # In the order in which they are made and get estimates; destroyed in reverse. What feeds the worker comes last.
-COMPONENTS: tuple[type[Component], ...] = (Publishing, MapTransform, SideOutputs, Diagnostics, StaticFrames, Inputs)
+COMPONENTS: tuple[type[Component], ...] = (
+    Publishing,
+    MapTransform,
+    SideOutputs,
+    Diagnostics,
+    Silence,
+    StaticFrames,
+    Inputs,
+)
 _LOG_PERIOD_S = 5.0
 # For a worker that is idle; one that solves ends by itself.
 _STOP_S = 0.02
@@ -91,6 +100,7 @@ class BaNode(ManagedNode):
         worker.start()
         for kind in COMPONENTS:
             self._components.append(kind(self._host))
+        self._settings.check_overrides()
 
     def activate(self) -> None:
         """Take data and publish."""

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter as RclpyParameter
 
-from ba_node.config import Config, ConfigError, Parameter, declarations
+from ba_node.config import Config, ConfigError, Parameter, declarations, unknown
+from ba_node.ros import qos
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,11 +61,16 @@ class Parameters:
 
     def __init__(self, node: Any, changed: Callable[[Config], None]) -> None:
         self._changed = changed
+        self._node = node
         self._declared = {parameter.name: parameter for parameter in declarations()}
         # rclpy has no public way to see overrides of parameters that nobody declared, and those are the typing errors.
         overrides: dict[str, Any] = node._parameter_overrides
         self.config = Config().with_values(
-            {name: given.value for name, given in overrides.items() if not node.has_parameter(name)}
+            {
+                name: given.value
+                for name, given in overrides.items()
+                if not node.has_parameter(name) and not name.startswith(qos.OVERRIDES)
+            }
         )
         # Declared with checked values: rclpy itself would refuse an int for a double, which YAML makes of "5".
         for name, value in self.config.values().items():
@@ -72,6 +78,17 @@ class Parameters:
         node.add_pre_set_parameters_callback(self._coerce)
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
+
+    def check_overrides(self) -> None:
+        """Refuse overrides of the QoS of topics and policies that are not there; to be called when all topics are.
+
+        Raises:
+            ConfigError: an override names none of them.
+        """
+        there = [name for name in self._node._parameters if name.startswith(qos.OVERRIDES)]
+        for name in self._node._parameter_overrides:
+            if name.startswith(qos.OVERRIDES) and name not in there:
+                raise ConfigError(unknown(name, there))
 
     def _coerce(self, given: list[Any]) -> list[Any]:
         """Turn ints given for doubles into doubles."""

@@ -8,8 +8,6 @@ import dataclasses
 import time
 from typing import TYPE_CHECKING, Any
 
-from rclpy.event_handler import PublisherEventCallbacks
-
 from ba_node.estimate import SolveReport, Status
 from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
 from ba_node.ros import qos
@@ -40,9 +38,9 @@ class Publishing(Component):
         self._behind: set[str] = set()
         self._outputs: dict[str, Any] = {}
         for topic, kind in OUTPUT_TYPES.items():
-            events = PublisherEventCallbacks(matched=self._catch_up) if topic in qos.LATCHED_OUTPUTS else None
+            matched = self._catch_up if topic in qos.LATCHED_OUTPUTS else None
             profile = qos.for_output(topic)
-            self._outputs[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, event_callbacks=events)
+            self._outputs[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, matched=matched)
 
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Publish an estimate."""

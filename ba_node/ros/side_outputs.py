@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rclpy.event_handler import PublisherEventCallbacks
-
 from ba_node.estimate import Extras
 from ba_node.messages.markers import marker_array, no_markers
 from ba_node.messages.topics import SIDE_TYPES
@@ -33,8 +31,7 @@ class SideOutputs(Component):
         self._publishers: dict[str, Any] = {}
         for topic, kind in SIDE_TYPES.items():
             profile = qos.latched() if topic == "markers" else qos.reliable(qos.OUTPUT_DEPTH)
-            events = PublisherEventCallbacks(matched=self._ask)
-            self._publishers[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, event_callbacks=events)
+            self._publishers[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, matched=self._ask)
 
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Publish what was asked for when the solve began."""

@@ -78,6 +78,7 @@ class Worker:
         # Arrival time of each keyframe that was not refined yet, by session and id, s.
         self._waiting: dict[tuple[int, int], float] = {}
         self._told: Counter[str] = Counter()
+        self._jumps = 0
         self._settled = True
         self._behind = False
         self._coalesced = 0
@@ -172,6 +173,9 @@ class Worker:
             notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
             self._put(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
         self._told = rejected
+        if self._backend.jumps != self._jumps:
+            self._jumps = self._backend.jumps
+            self._put(Notice("clock_jump", self._backend.jump_note))
 
     def _guard(self, action: Callable[..., None], *arguments: object) -> None:
         """Run one step of the work; a fault in it is reported and costs that step only."""

@@ -322,3 +322,28 @@ def test_rms_counts_every_observation() -> None:
     assert backend.rms_px("input") > 2 * backend.rms_px()
     with pytest.raises(ValueError, match="expected one of input, refined"):
         backend.rms_px("middle")
+
+
+def test_stamps_that_jump_back_begin_a_new_session_with_the_same_result() -> None:
+    once = messages()
+    backend = Backend(Config().with_values({"scene.max_reorder_s": 1.0}))
+    first = replay(backend, once)
+    again = replay(backend, once)
+    assert backend.jumps == 1
+    assert "older than the newest (scene.max_reorder_s = 1): a new session begins" in backend.jump_note
+    assert [session for session, _ in backend.finished] == [backend.scene.session_id], "the front-end's id stays"
+    assert len(backend.scene.keyframes) == SMALL["keyframes"]
+    assert not backend.rejected
+    np.testing.assert_array_equal(again[-1].trajectory.position, first[-1].trajectory.position)
+
+
+@pytest.mark.parametrize("limit_s", [0.0, 100.0])
+def test_stamps_within_the_bound_are_sorted(limit_s: float) -> None:
+    stream = messages()
+    keyframes = [m for m in stream if isinstance(m, Keyframe)]
+    backend = Backend(Config().with_values({"scene.max_reorder_s": limit_s}))
+    replay(backend, [m for m in stream if m is not keyframes[2]] + [keyframes[2]])
+    assert backend.jumps == 0
+    assert backend.notices["reordered"] == 1
+    stamps = backend.scene.keyframes.stamp_ns[backend.scene.order]
+    assert (np.diff(stamps) > 0).all()

@@ -47,9 +47,13 @@ def _other_value(parameter: Any) -> Any:
     if parameter.kind is bool:
         return not parameter.default
     if parameter.kind is str:
-        return next(choice for choice in parameter.choices if choice != parameter.default)
+        return next((choice for choice in parameter.choices if choice != parameter.default), f"my_{parameter.default}")
     value = parameter.kind(parameter.minimum)
     return value if value != parameter.default else parameter.kind(parameter.maximum)
+
+
+# What must be set together with a parameter at its smallest value.
+COMPANIONS = {"scene.max_keyframes": {"window.max_keyframes": 2}}
 
 
 def test_every_parameter_is_declared_with_default_and_descriptor(make_node: MakeNode) -> None:
@@ -75,9 +79,10 @@ def test_each_live_parameter_takes_effect(make_node: MakeNode, name: str) -> Non
     seen: list[Config] = []
     parameters = Parameters(node, seen.append)
     value = _other_value(next(p for p in declarations() if p.name == name))
-    result = _set(node, **{name: value})
+    changes = {name: value, **COMPANIONS.get(name, {})}
+    result = _set(node, **changes)
     assert result.successful, result.reason
-    assert seen == [Config().with_values({name: value})]
+    assert seen == [Config().with_values(changes)]
     assert parameters.config == seen[0]
     assert node.get_parameter(name).value == value
 
@@ -131,6 +136,25 @@ def test_a_rejected_set_changes_nothing(make_node: MakeNode) -> None:
     assert seen == []
     assert parameters.config == Config()
     assert node.get_parameter("window.max_keyframes").value == Config().window.max_keyframes
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"window.max_keyframes": 6000}, "more than are kept (scene.max_keyframes = 5000)"),
+        ({"scene.max_keyframes": 15}, "parameter window.max_keyframes = 20: more than are kept"),
+        ({"solver.method": "irls_tq", "solver.loss": "squared"}, "method 'irls_tq' reweights residuals"),
+    ],
+)
+def test_contradictions_are_refused(make_node: MakeNode, changes: dict[str, Any], words: str) -> None:
+    node = make_node()
+    parameters = Parameters(node, lambda _: None)
+    result = _set(node, **changes)
+    assert not result.successful
+    assert words in result.reason
+    assert parameters.config == Config()
+    with pytest.raises(ConfigError, match=r"lower the first|choose another"):
+        Config().with_values(changes)
 
 
 def test_parameters_of_rclpy_itself_are_left_alone(make_node: MakeNode) -> None:

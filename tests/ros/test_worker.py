@@ -23,6 +23,7 @@ class FakeBackend:
     def __init__(self) -> None:
         self.added: list[Measurement] = []
         self.rejected: Counter[str] = Counter()
+        self.jumps, self.jump_note = 0, ""
         self.rejection_notes: deque[str] = deque(maxlen=5)
         self.unsolved: list[Keyframe] = []
         self.window: list[Keyframe] = []
