@@ -100,7 +100,7 @@ def _diagonal_of_inverse(s: FloatArray, conditions: FloatArray) -> FloatArray:
     roots = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
     blocks = roots.reshape(n // 6, 6, -1)
     # Not by matrix products: they are too small for the threads of BLAS, which would wait for each other.
-    out = np.einsum("kim,kjm->kij", blocks, blocks)
+    out = np.asarray(np.einsum("kim,kjm->kij", blocks, blocks))
     loose = np.sum(vectors[:, ~kept].reshape(n // 6, -1) ** 2, axis=1) > _SHARE**2
     out[loose] = np.nan
     return out
