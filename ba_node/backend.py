@@ -38,13 +38,14 @@ import numpy as np
 
 from ba_node import archive, window
 from ba_node.core import geometry, methods, solver
-from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport
+from ba_node.estimate import Correction, Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.scene import Scene
 from ba_node.window import full, quality
 from ba_node.window.correction import MapCorrection, Transform
 from ba_node.window.covariance import covariances
+from ba_node.window.known import cloud_of, poses_of, taking_part_of
 from ba_node.window.view import view
 
 if TYPE_CHECKING:
@@ -117,6 +118,16 @@ class Backend:
         """Return True if a complete keyframe has not been solved yet."""
         return len(self._due()) > 0
 
+    @property
+    def due(self) -> tuple[int, int] | None:
+        """Return session and id of the newest keyframe that the next solve is for, None if it is for none."""
+        due = self._due()
+        reached = self._reached(due, self._end(due))
+        session = self.scene.session_id
+        if session is None or not len(reached):
+            return None
+        return session, int(self.scene.keyframes.keyframe_id[reached[-1]])
+
     def configure(self, config: Config) -> None:
         """Take new parameters, from the next solve and the next measurement on."""
         self.config = config
@@ -181,14 +192,12 @@ class Backend:
         if isinstance(selection, str):
             self._report = dataclasses.replace(self._base_report(newest), reason=selection)
         else:
-            taking_part = _taking_part(self.scene, selection)
+            taking_part = taking_part_of(self.scene, selection)
             self._report, state = self._solve(newest, selection, on_iteration)
             if state is not None:
                 self._correct(int(taking_part[-1]))
                 extra = self._extras(selection, state, taking_part)
-        reached = np.zeros(len(self.scene.keyframes), bool)
-        reached[self.scene.order[:end]] = True
-        self.scene.keyframes.solved[due[reached[due]]] = True
+        self.scene.keyframes.solved[self._reached(due, end)] = True
         return dataclasses.replace(self._estimate(taking_part), **extra)
 
     def estimate(self) -> Estimate:
@@ -315,15 +324,12 @@ class Backend:
     def _estimate(self, refined: IntArray) -> Estimate:
         scene = self.scene
         scene.settle_poses()
-        points = scene.landmarks
-        rows = scene.landmark_order
-        rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
         return Estimate(
             stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]) if len(scene.order) else 0,
             frame_id=self.config.frames.map_frame,
-            refined=_poses(scene, refined),
-            trajectory=_poses(scene, scene.order),
-            cloud=Cloud(points.track_id[rows], points.position[rows], points.rms_px[rows], points.views[rows]),
+            refined=poses_of(scene, refined),
+            trajectory=poses_of(scene, scene.order),
+            cloud=cloud_of(scene, scene.landmark_order),
             report=self._report,
             correction=self._published(),
         )
@@ -353,6 +359,13 @@ class Backend:
         if not len(waiting) or n - waiting[0] < size or n <= size:
             return n
         return int(waiting[0]) + size // 2
+
+    def _reached(self, due: IntArray, end: int) -> IntArray:
+        """Return which keyframes of those that are due stand among the first ``end``, oldest first."""
+        is_due = np.zeros(len(self.scene.keyframes), bool)
+        is_due[due] = True
+        first = self.scene.order[:end]
+        return first[is_due[first]]
 
     def _complete(self, row: int) -> bool:
         if self._settled:
@@ -406,21 +419,3 @@ class Backend:
         self._delivered.clear()
         self._report = SolveReport(reason=_UNSOLVED)
         self._correction = MapCorrection()
-
-
-def _taking_part(scene: Scene, selection: window.Selection) -> IntArray:
-    """Return the keyframes of the window and of the problem, oldest first."""
-    marked = np.zeros(len(scene.keyframes), bool)
-    marked[selection.window] = True
-    marked[selection.keyframes] = True
-    return scene.order[marked[scene.order]]
-
-
-def _poses(scene: Scene, rows: IntArray) -> Poses:
-    table = scene.keyframes
-    return Poses(
-        table.keyframe_id[rows],
-        table.stamp_ns[rows],
-        table.position[rows],
-        geometry.quaternion_from_matrix(table.rotation[rows]),
-    )

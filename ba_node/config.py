@@ -320,6 +320,14 @@ class NodeConfig:
         minimum=0.0,
         maximum=86_400.0,
     )
+    latency_budget_ms: float = _param(
+        0.0,
+        "Time from arrival of a keyframe to its result that the solver may use up: it ends after an iteration"
+        " when another would take longer, but makes one always. 0: no limit. Without effect offline.",
+        unit="ms",
+        minimum=0.0,
+        maximum=1e6,
+    )
     settle_time_s: float = _param(
         0.5,
         "With no new message for this long, the newest keyframe is solved with what has arrived.",

@@ -165,6 +165,7 @@ class Estimate:
         trajectory: poses of all keyframes that are kept, oldest first, the newest estimate of each.
         cloud: all points that are kept.
         report: how the solve went.
+        arrived_s: when its newest keyframe came in, by the clock of the node; None offline.
         correction: of the front-end's fixed frame; None before the first usable solve of a session.
         covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
             0 for poses that were held. None if it was not asked for, or the solve is not usable.
@@ -177,6 +178,7 @@ class Estimate:
     trajectory: Poses
     cloud: Cloud
     report: SolveReport
+    arrived_s: float | None = None
     correction: Correction | None = None
     covariance: FloatArray | None = None
     view: WindowView | None = None

@@ -55,13 +55,14 @@ def output_messages(
             out.append(("refined_keyframes", _refined(factory, estimate)))
         if "pose" in wanted:
             out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
+    if "report" in wanted:
+        out.append(("report", _report(factory, estimate)))
+    if estimate.report.status.usable:
         if "path" in wanted:
             poses = estimate.trajectory[-config.path_max_poses :]
             out.append(("path", path_message(poses, estimate.stamp_ns, estimate.frame_id)))
         if "points" in wanted:
             out.append(("points", _points(estimate, config.points_max)))
-    if "report" in wanted:
-        out.append(("report", _report(factory, estimate)))
     return [(topic, OUTPUT_TYPES[topic], message) for topic, message in out]
 
 

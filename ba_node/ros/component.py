@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ba_node.config import Config
-    from ba_node.estimate import Estimate
+    from ba_node.estimate import Estimate, SolveReport
     from ba_node.measurements import CameraRig
     from ba_node.ros.inbox import Inbox
     from ba_node.ros.worker import Notice, Worker
@@ -55,6 +55,7 @@ class Host:
         place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
         tf: what becomes of the transform map -> odom, in words.
         at_cleanup: what is undone when the node is cleaned up, last made first.
+        report: of the last solve, with its latency; None before the first.
     """
 
     node: Any
@@ -68,6 +69,7 @@ class Host:
     arrived: Counter[str] = field(default_factory=Counter)
     place_cameras: Callable[[CameraRig], CameraRig | None] = lambda rig: rig
     tf: str = ""
+    report: SolveReport | None = None
     at_cleanup: ExitStack = field(default_factory=ExitStack)
 
 

@@ -21,7 +21,7 @@ from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
 
 if TYPE_CHECKING:
-    from ba_node.estimate import Estimate, SolveReport
+    pass
 
 _PERIOD_S = 1.0
 # Rates are those of so many seconds.
@@ -39,17 +39,12 @@ class Diagnostics(Component):
         """Advertise and start the timer."""
         super().__init__(host)
         self._factory = RclpyFactory()
-        self._report: SolveReport | None = None
         self._keyframes, self._heard_s = 0, time.monotonic()
         self._arrived = deque([(self._heard_s, Counter(host.arrived))])
         self._lost = deque([(self._heard_s, self._all_lost())])
         kind = message_class(SHARED_TYPES["/diagnostics"])
         self._publisher = self.publisher(kind, "/diagnostics", qos.reliable(_DEPTH))
         self.timer(_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def take(self, estimate: Estimate, newest: bool) -> None:  # noqa: ARG002
-        """Keep the newest report, of failed solves too."""
-        self._report = estimate.report
 
     def _tick(self) -> None:
         node = self.host.node
@@ -74,15 +69,14 @@ class Diagnostics(Component):
             inbox_size=host.config.node.inbox_size,
             # Counts of a session begin anew with it: what has become less is nothing that was lost.
             recent={name: count for name, count in (self._all_lost() - lost_before).items() if name not in _NO_FAULT},
-            report=self._report
-            and dataclasses.replace(self._report, rejected={**self._report.rejected, **host.counted}),
+            report=host.report and dataclasses.replace(host.report, rejected={**host.report.rejected, **host.counted}),
             tf=host.tf,
             memory_mb=_resident_mb(),
         )
 
     def _all_lost(self) -> Counter[str]:
         """Return what was dropped, solved with others or turned away, by reason."""
-        report = self._report
+        report = self.host.report
         lost = Counter(self.host.counted)
         if report is not None:
             lost.update(report.rejected)

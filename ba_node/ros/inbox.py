@@ -8,14 +8,16 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
 if TYPE_CHECKING:
     from ba_node.backend import Backend
+    from ba_node.estimate import Estimate
 
-Command = Callable[["Backend"], None]
+# What it returns is published.
+Command = Callable[["Backend"], "Estimate | None"]
 
 # What is given up first when the inbox is full. A keyframe without some of its tracks still moves;
 # tracks without their keyframe, or anything without cameras, are worth nothing.
@@ -28,6 +30,14 @@ class Arrival:
 
     time_s: float
     content: Measurement | Command
+
+
+class KeyframeCounts(NamedTuple):
+    """Keyframes that came in, of these dropped, and of these still in the inbox."""
+
+    received: int
+    dropped: int
+    waiting: int
 
 
 class Inbox:
@@ -44,6 +54,8 @@ class Inbox:
         self._commands: deque[tuple[int, Arrival]] = deque()
         self._sequence = 0
         self._dropped = 0
+        self._keyframes_received = 0
+        self._keyframes_dropped = 0
         self._closed = False
 
     @property
@@ -58,6 +70,12 @@ class Inbox:
             return sum(len(lane) for lane in self._lanes.values())
 
     @property
+    def keyframes(self) -> KeyframeCounts:
+        """Return what became of the keyframes so far."""
+        with self._changed:
+            return KeyframeCounts(self._keyframes_received, self._keyframes_dropped, len(self._lanes[Keyframe]))
+
+    @property
     def closed(self) -> bool:
         """Return True once :meth:`close` was called."""
         return self._closed
@@ -66,9 +84,12 @@ class Inbox:
         """Add a measurement; if that is one too many, drop the oldest of the kind that can best be spared."""
         with self._changed:
             self._lanes[type(measurement)].append(self._numbered(Arrival(time_s, measurement)))
+            self._keyframes_received += isinstance(measurement, Keyframe)
             if sum(len(lane) for lane in self._lanes.values()) > self._size:
-                next(lane for lane in self._lanes.values() if lane).popleft()
+                kind = next(kind for kind, lane in self._lanes.items() if lane)
+                self._lanes[kind].popleft()
                 self._dropped += 1
+                self._keyframes_dropped += kind is Keyframe
             self._changed.notify()
 
     def post(self, command: Command, time_s: float = 0.0) -> None:

@@ -13,12 +13,15 @@ from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
 from ba_node.ros import qos
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.latency import Sliding
 from ba_node.ros.throttle import Throttle
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate
 
 _LOG_PERIOD_S = 5.0
+# Leave first; their age is in the report that follows.
+_POSES = {"refined_keyframes", "pose"}
 
 
 class Publishing(Component):
@@ -33,6 +36,7 @@ class Publishing(Component):
         super().__init__(host)
         self._factory = RclpyFactory()
         self._throttle = Throttle(_LOG_PERIOD_S)
+        self._latency, self._stamp_latency = Sliding(), Sliding()
         # The estimate that latched topics are to show, and those of them that do not show it yet.
         self._latest: Estimate | None = None
         self._behind: set[str] = set()
@@ -50,10 +54,11 @@ class Publishing(Component):
             self._behind = set(qos.LATCHED_OUTPUTS) - wanted
         else:
             wanted.difference_update(qos.LATCHED_OUTPUTS)
-        rejected = {**estimate.report.rejected, **self.host.counted}
-        estimate = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, rejected=rejected))
-        self._publish(estimate, wanted)
-        self._log_report(estimate.report)
+        self._publish(estimate, wanted & _POSES)
+        report = self.host.report = self._timed(estimate)
+        told = dataclasses.replace(report, rejected={**report.rejected, **self.host.counted})
+        self._publish(dataclasses.replace(estimate, report=told), wanted - _POSES)
+        self._log_report(report)
 
     def _heard(self) -> set[str]:
         return {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
@@ -68,6 +73,22 @@ class Publishing(Component):
     def _publish(self, estimate: Estimate, wanted: set[str]) -> None:
         for topic, _, message in output_messages(self._factory, estimate, self.host.config.output, wanted):
             self._outputs[topic].publish(message)
+
+    def _timed(self, estimate: Estimate) -> SolveReport:
+        """Return the report with what only this thread knows: how old the poses are that have just left."""
+        age_ns = self.host.node.get_clock().now().nanoseconds - estimate.stamp_ns
+        now_s = time.monotonic()
+        latency = self._latency.add(now_s - (estimate.arrived_s or now_s))
+        stamp_latency = self._stamp_latency.add(1e-9 * age_ns)
+        return dataclasses.replace(
+            estimate.report,
+            latency_p50_s=latency.p50,
+            latency_p95_s=latency.p95,
+            latency_max_s=latency.largest,
+            stamp_latency_p50_s=stamp_latency.p50,
+            stamp_latency_p95_s=stamp_latency.p95,
+            stamp_latency_max_s=stamp_latency.largest,
+        )
 
     def _log_report(self, report: SolveReport) -> None:
         """Say why a solve gave nothing. That the first keyframes are not enough is nothing to warn about."""

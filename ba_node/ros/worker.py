@@ -17,13 +17,16 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ba_node.estimate import Estimate
+from ba_node.estimate import Estimate, Status
 from ba_node.measurements import Keyframe
+from ba_node.ros.latency import Budget
+from ba_node.ros.ledger import Ledger
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ba_node.backend import Backend
+    from ba_node.core.result import Iteration
     from ba_node.ros.inbox import Arrival, Inbox
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
@@ -75,16 +78,19 @@ class Worker:
         self._notify = notify
         self._clock = clock
         self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
-        # Arrival time of each keyframe that was not refined yet, by session and id, s.
-        self._waiting: dict[tuple[int, int], float] = {}
+        self._budget = Budget(clock)
+        self._ledger = Ledger()
         self._told: Counter[str] = Counter()
         self._jumps = 0
         self._settled = True
         self._behind = False
-        self._coalesced = 0
         self._failures: Counter[str] = Counter()
-        self.refined = 0
         self._thread = threading.Thread(target=self._run, name="solver", daemon=True)
+
+    @property
+    def refined(self) -> int:
+        """Return how many keyframes took part in a usable solve so far."""
+        return self._ledger.refined
 
     def start(self) -> None:
         """Begin."""
@@ -124,13 +130,19 @@ class Worker:
 
     def _take(self, arrival: Arrival) -> None:
         if callable(arrival.content):
-            arrival.content(self._backend)
+            estimate, now_s = arrival.content(self._backend), self._clock()
+            if estimate is not None and not self._inbox.closed:
+                self._put(self._finished(estimate, now_s, now_s))
             return
-        before = self._rejected_keyframes()
-        self._backend.add(arrival.content)
+        content, before = arrival.content, self._rejected_keyframes()
+        self._backend.add(content)
+        if not isinstance(content, Keyframe):
+            return
         # Fewer than before: a new session has begun.
-        if isinstance(arrival.content, Keyframe) and self._rejected_keyframes() <= before:
-            self._waiting[arrival.content.session_id, arrival.content.keyframe_id] = arrival.time_s
+        if self._rejected_keyframes() <= before:
+            self._ledger.take(content.session_id, content.keyframe_id, arrival.time_s)
+        else:
+            self._ledger.rejected += 1
 
     def _rejected_keyframes(self) -> int:
         return sum(self._backend.rejected[reason] for reason in _KEYFRAME_REASONS)
@@ -138,34 +150,46 @@ class Worker:
     def _solve(self) -> None:
         start_s = self._clock()
         before = int(self._backend.scene.keyframes.solved.sum())
-        estimate = self._backend.solve(on_iteration=lambda _: not self._inbox.closed)
+        arrived_s = self._arrival_s(start_s)
+        self._budget.begin(arrived_s, 1e-3 * self._backend.config.node.latency_budget_ms)
+        estimate = self._backend.solve(on_iteration=self._goes_on)
+        self._budget.end()
         n_solved = int(self._backend.scene.keyframes.solved.sum()) - before
-        self._coalesced += max(0, n_solved - 1)
         # More keyframes than a window holds take several solves; without progress the next try waits for new data.
         self._behind = n_solved > 0 and self._backend.ready
         if estimate is not None and not self._inbox.closed:
-            self._put(self._finished(estimate, start_s))
+            self._put(self._finished(estimate, start_s, arrived_s))
 
-    def _finished(self, estimate: Estimate, start_s: float) -> Estimate:
+    def _arrival_s(self, now_s: float) -> float:
+        """Return when the keyframe came in that the next solve is for; now if it was solved before."""
+        newest = self._backend.due
+        arrived_s = None if newest is None else self._ledger.arrival_s(*newest)
+        return now_s if arrived_s is None else arrived_s
+
+    def _goes_on(self, _: Iteration) -> bool:
+        return self._budget.allows_more() and not self._inbox.closed
+
+    def _finished(self, estimate: Estimate, start_s: float, arrived_s: float) -> Estimate:
         """Add to the report what only the worker knows."""
-        report = estimate.report
-        arrived_s = self._waiting.get((report.session_id, report.newest_keyframe_id), start_s)
-        self._count_refined(estimate)
+        report, ledger, keyframes = estimate.report, self._ledger, self._inbox.keyframes
+        refined = set(estimate.refined.keyframe_id.tolist()) if report.status.usable else set()
+        ledger.settle(self._backend.scene, refined)
+        budget_ms = self._backend.config.node.latency_budget_ms
+        spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
         report = dataclasses.replace(
             report,
+            reason=spent if self._budget.spent and report.status is Status.MAX_ITERATIONS else report.reason,
             rejected={**report.rejected, **self._failures},
             queue_wait_s=start_s - arrived_s,
             dropped=self._inbox.dropped,
-            coalesced=self._coalesced,
+            coalesced=ledger.coalesced,
+            received=keyframes.received,
+            solved=ledger.solved,
+            dropped_keyframes=keyframes.dropped + ledger.forgotten,
+            rejected_keyframes=ledger.rejected,
+            waiting=keyframes.waiting + ledger.waiting,
         )
-        return dataclasses.replace(estimate, report=report)
-
-    def _count_refined(self, estimate: Estimate) -> None:
-        refined = set(estimate.refined.keyframe_id.tolist()) if estimate.report.status.usable else set()
-        known = set(estimate.trajectory.keyframe_id.tolist())
-        mine = {key: time_s for key, time_s in self._waiting.items() if key[0] == estimate.report.session_id}
-        self.refined += sum(1 for _, keyframe in mine if keyframe in refined)
-        self._waiting = {key: time_s for key, time_s in mine.items() if key[1] in known and key[1] not in refined}
+        return dataclasses.replace(estimate, report=report, arrived_s=arrived_s)
 
     def _tell_rejections(self) -> None:
         rejected = Counter(self._backend.rejected)

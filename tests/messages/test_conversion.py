@@ -188,7 +188,7 @@ def outputs(estimate: Estimate, config: OutputConfig, **options: Any) -> list[tu
 
 def test_output_topics_types_and_stamps(estimate: Estimate) -> None:
     out = outputs(estimate, OutputConfig())
-    assert [topic for topic, _, _ in out] == ["refined_keyframes", *["pose"] * 5, "path", "points", "report"]
+    assert [topic for topic, _, _ in out] == ["refined_keyframes", *["pose"] * 5, "report", "path", "points"]
     assert all(type_name == OUTPUT_TYPES[topic] for topic, type_name, message in out)
     assert {message.header.frame_id for _, _, message in out} == {"map"}
     stamps = [stamp_ns_from_message(message.header.stamp) for _, _, message in out]

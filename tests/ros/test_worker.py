@@ -10,7 +10,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from ba_node.config import Config
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.ros.inbox import Inbox
@@ -32,7 +34,10 @@ class FakeBackend:
         self.flushed = 0
         self.fail: str = ""
         self.status = Status.CONVERGED
-        self.scene: Any = SimpleNamespace(keyframes=SimpleNamespace(solved=np.zeros(0, bool)))
+        self.config = Config()
+        self.scene: Any = SimpleNamespace(
+            keyframes=SimpleNamespace(solved=np.zeros(0, bool)), session_id=0, find_keyframe=self._row
+        )
         self.while_solving: Callable[[Callable[[Any], bool]], None] = lambda _: None
 
     @property
@@ -58,6 +63,15 @@ class FakeBackend:
         self.scene.keyframes.solved = np.array(
             [all(keyframe is not other for other in self.unsolved) for keyframe in self.window]
         )
+
+    def _row(self, keyframe_id: int) -> int | None:
+        ids = [keyframe.keyframe_id for keyframe in self.window]
+        return ids.index(keyframe_id) if keyframe_id in ids else None
+
+    @property
+    def due(self) -> tuple[int, int] | None:
+        newest = self.unsolved[: self.at_once]
+        return (newest[-1].session_id, newest[-1].keyframe_id) if newest else None
 
     def flush(self) -> None:
         self.complete = True
@@ -277,3 +291,59 @@ def test_outputs_nobody_fetches_are_bounded() -> None:
     kept = reports(rig.worker.outputs())
     assert len(kept) == 20
     assert kept[-1].newest_keyframe_id == 199
+
+
+def test_every_keyframe_is_accounted_for() -> None:
+    rig = Rig(size=4)
+    for number in range(6):
+        rig.keyframe(number)
+    rig.keyframe(5)
+    (report,) = reports(rig.step())
+    # Of seven messages the inbox kept the last four: 3, 4, 5 and 5 again.
+    assert (report.received, report.dropped_keyframes, report.rejected_keyframes) == (7, 3, 1)
+    assert (report.solved, report.coalesced, report.waiting) == (1, 2, 0)
+    rig.backend.at_once = 1
+    rig.keyframe(10)
+    rig.keyframe(11)
+    rig.keyframe(12)
+    (report,) = reports(rig.step())
+    assert (report.received, report.solved, report.coalesced, report.waiting) == (10, 2, 2, 2)
+    rig.backend.window.remove(rig.backend.unsolved.pop())
+    rig.backend._mark()
+    (report,) = reports(rig.step())
+    assert (report.solved, report.coalesced, report.waiting, report.dropped_keyframes) == (3, 2, 0, 4), (
+        "12 is forgotten"
+    )
+
+
+@pytest.mark.parametrize(("budget_ms", "expected"), [(0.0, 20), (1.0, 1), (105.0, 7), (155.0, 12)])
+def test_a_latency_budget_ends_a_solve_in_time(budget_ms: float, expected: int) -> None:
+    """Iterations of 10 ms, 10 ms after the last one, and 20 ms in the inbox."""
+    rig = Rig()
+    rig.backend.config = Config().with_values({"node.latency_budget_ms": budget_ms})
+    rig.backend.status = Status.MAX_ITERATIONS
+    made = 0
+
+    def iterate(on_iteration: Callable[[Any], bool]) -> None:
+        nonlocal made
+        made = 0
+        go_on = on_iteration(None)
+        while go_on and made < 20:
+            rig.now_s += 0.01
+            made += 1
+            go_on = on_iteration(None)
+        rig.now_s += 0.01
+
+    rig.backend.while_solving = iterate
+    for number in range(2):
+        rig.keyframe(number, time_s=rig.now_s)
+        rig.now_s += 0.02
+        begin_s = rig.now_s - 0.02
+        (report,) = reports(rig.step())
+        took_ms = 1e3 * (rig.now_s - begin_s)
+    # From the second solve on it is known what follows the last iteration.
+    assert made == expected
+    assert took_ms <= max(budget_ms, 40.0) + 1e-6 or budget_ms == 0.0
+    assert report.reason == (
+        f"the latency budget of {budget_ms:g} ms was spent after 0 iterations" if budget_ms else ""
+    )

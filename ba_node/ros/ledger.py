@@ -1,0 +1,74 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Account for every keyframe that the worker took: solved, solved with a newer one, turned away, forgotten, waiting."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from ba_node.scene.scene import Scene
+
+Key = tuple[int, int]
+
+
+class Ledger:
+    """What became of the keyframes. Each is in one of the first four counts, or still waits.
+
+    Attributes:
+        solved: were the newest that a solve was made for.
+        coalesced: were solved together with a newer one.
+        rejected: were turned away.
+        forgotten: left the map before they were solved (a new session, a full map, a reset).
+        refined: took part in a usable solve; a matter apart from the other counts.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing."""
+        self.solved = self.coalesced = self.rejected = self.forgotten = self.refined = 0
+        # Arrival of each keyframe by session and id, s.
+        self._unsolved: dict[Key, float] = {}
+        self._unrefined: set[Key] = set()
+
+    @property
+    def waiting(self) -> int:
+        """Return how many were taken and have no solve yet."""
+        return len(self._unsolved)
+
+    def take(self, session_id: int, keyframe_id: int, time_s: float) -> None:
+        """Enter a keyframe that the map has now."""
+        self._unsolved[session_id, keyframe_id] = time_s
+        self._unrefined.add((session_id, keyframe_id))
+
+    def arrival_s(self, session_id: int, keyframe_id: int) -> float | None:
+        """Return when a keyframe came in, None if it was solved before."""
+        return self._unsolved.get((session_id, keyframe_id))
+
+    def settle(self, scene: Scene, refined: Collection[int]) -> None:
+        """Close the accounts of a solve.
+
+        Args:
+            scene: the map after it.
+            refined: ids of those that took part, if it is usable.
+        """
+        n_solved = 0
+        for key in list(self._unsolved):
+            row = scene.find_keyframe(key[1]) if key[0] == scene.session_id else None
+            if row is None:
+                self.forgotten += 1
+            elif scene.keyframes.solved[row]:
+                n_solved += 1
+            else:
+                continue
+            del self._unsolved[key]
+        self.solved += min(n_solved, 1)
+        self.coalesced += max(n_solved - 1, 0)
+        took_part = {key for key in self._unrefined if key[0] == scene.session_id and key[1] in refined}
+        self.refined += len(took_part)
+        self._unrefined = {
+            key
+            for key in self._unrefined - took_part
+            if key[0] == scene.session_id and scene.find_keyframe(key[1]) is not None
+        }

@@ -1,0 +1,98 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Thousands of keyframes: what is kept stays within its bounds."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ba_node.backend import FINISHED_KEPT, Backend
+from ba_node.config import Config
+from ba_node.measurements import FeatureTracks, Keyframe
+from ba_node.scene.tables import Table
+from ba_node.synthetic import SyntheticOptions, generate
+
+ROUNDS, LENGTH = 40, 50
+SESSION_ROUNDS = 4
+LIMITS = {
+    "scene.max_keyframes": 120,
+    "scene.max_landmarks": 2000,
+    "scene.max_pending": 20,
+    "window.max_keyframes": 4,
+    "window.max_fixed_keyframes": 2,
+    "solver.max_iterations": 2,
+}
+
+
+def sizes(backend: Backend) -> dict[str, int]:
+    """Return how much the back-end holds: rows in use, rows of memory, and what waits."""
+    scene = backend.scene
+    tables: dict[str, Table] = {
+        "keyframes": scene.keyframes, "landmarks": scene.landmarks, "sightings": scene.sightings
+    }  # fmt: skip
+    rows = {name: len(table) for name, table in tables.items()}
+    room = {f"room for {name}": max(map(len, table._buffers.values())) for name, table in tables.items()}
+    blocks = sum(len(blocks) for blocks in scene.blocks)
+    others = {"pending": len(scene.pending), "blocks": blocks, "ids": len(scene._landmark_rows)}
+    notes = {"notes": len(backend.rejection_notes), "finished": len(backend.finished)}
+    return {**rows, **room, **others, **notes, "keyframe rows": len(scene._keyframe_rows)}
+
+
+@pytest.mark.slow
+def test_sizes_stay_within_bounds_over_thousands_of_keyframes() -> None:
+    """A drive is repeated with new ids; some tracks name keyframes that never come, and sessions end."""
+    data = generate(SyntheticOptions(seed=1, keyframes=LENGTH, length_m=25.0, tracks=40, track_loss=0.2))
+    backend = Backend(Config().with_values(LIMITS))
+    backend.add(data.rig)
+    largest: list[dict[str, int]] = []
+    rejected = 0
+    for turn in range(ROUNDS):
+        moved = Shift(turn)
+        for keyframe, tracks in zip(data.keyframes, data.tracks, strict=True):
+            backend.add(moved(keyframe))
+            for image in tracks:
+                backend.add(moved(image))
+            lost = dataclasses.replace(moved(tracks[0]), keyframe_id=2**63 + keyframe.keyframe_id)
+            backend.add(lost)
+            estimate = backend.solve()
+            assert estimate is not None
+            assert np.isfinite(estimate.trajectory.position).all()
+        rejected += backend.rejected.total()
+        largest.append(sizes(backend))
+    assert rejected > ROUNDS * LENGTH / 2, f"{rejected} messages turned away: the test is to have many"
+    n_obs = 2 * 40 * LIMITS["scene.max_keyframes"]
+    bounds = {
+        "keyframes": 120, "landmarks": 2000, "sightings": n_obs, "ids": 2000, "keyframe rows": 120, "blocks": 2 * 120,
+        "pending": 20, "notes": 50, "finished": FINISHED_KEPT, "room for keyframes": 4 * 120,
+        "room for landmarks": 4 * 2000, "room for sightings": 4 * n_obs,
+    }  # fmt: skip
+    for name, bound in bounds.items():
+        most = max(size[name] for size in largest)
+        assert most <= bound, f"{name}: {most}, at most {bound}"
+    early, late = largest[: ROUNDS // 2], largest[ROUNDS // 2 :]
+    for name in bounds.keys() - {"finished"}:
+        first, second = (max(size[name] for size in part) for part in (early, late))
+        assert second <= first, f"{name} still grows: {first}, then {second}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Shift:
+    """Give the measurements of a drive new ids, times and, every few drives, a new session."""
+
+    turn: int
+
+    def __call__(self, measurement: Any) -> Any:
+        first = self.turn * LENGTH
+        changes = {
+            "session_id": self.turn // SESSION_ROUNDS,
+            "keyframe_id": first + measurement.keyframe_id,
+        }
+        if isinstance(measurement, Keyframe):
+            return dataclasses.replace(measurement, stamp_ns=measurement.stamp_ns + first * 10**9, **changes)
+        assert isinstance(measurement, FeatureTracks)
+        ids = measurement.track_id + np.uint64(self.turn * 10**6)
+        return dataclasses.replace(measurement, track_id=ids, **changes)
