@@ -74,7 +74,9 @@ def find(build: Path, python: str) -> tuple[list[Solver], list[str]]:
         module = peer.command[-1]
         missing = _missing_modules(python, _IMPORTS[module])
         if missing:
-            absent.append(f"{peer.name}: no module {', '.join(missing)} in {Path(python).name} (extra: bench)")
+            absent.append(
+                f"{peer.name}: no module {', '.join(missing)}: {python} -m pip install -r requirements/bench.txt"
+            )
         else:
             ours.append(dataclasses.replace(peer, command=(python, "-m", f"benchmarks.peers.{module}")))
     return ours, absent

@@ -59,11 +59,20 @@ def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Sol
 
 @dataclass(frozen=True)
 class PcgLimits:
-    """When conjugate gradients stop: |r| <= min(t_eps, |b|) |b|, a cap on steps, the radius of the region."""
+    """When conjugate gradients stop.
+
+    Attributes:
+        t_eps: |r| <= min(t_eps, |b|) |b|.
+        max_iterations: cap on steps.
+        radius: of the region.
+        q_eps: step i added less than q_eps / i of what the model b'x - x'A x / 2 has gained (Nash and Sofer 1990):
+            further steps would not lower the objective by what they cost. 0 for never.
+    """
 
     t_eps: float = 0.1
     max_iterations: int = 500
     radius: float = np.inf
+    q_eps: float = 0.0
 
 
 def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limits: PcgLimits) -> Solution:
@@ -91,6 +100,7 @@ def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limit
     z = precondition(r)
     d = z.copy()
     rz = float(r @ z)
+    gained = 0.0
     for j in range(limits.max_iterations):
         ad = product(d)
         curvature = float(d @ ad)
@@ -104,7 +114,8 @@ def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limit
             return Solution(_to_boundary(x, d, limits.radius), j + 1, True)
         x = x_next
         r = r - alpha * ad
-        if float(np.linalg.norm(r)) <= target:
+        before, gained = gained, 0.5 * float(x @ (rhs + r))
+        if float(np.linalg.norm(r)) <= target or (j + 1) * (gained - before) < limits.q_eps * gained:
             return Solution(x, j + 1)
         z = precondition(r)
         rz_next = float(r @ z)

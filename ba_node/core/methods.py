@@ -62,7 +62,7 @@ _DECLARED: dict[str, Method] = {
     "auto": Method(
         "the node's default: Marquardt steps by the cheapest linear solver, and points that follow each",
         "",
-        SolverOptions(),
+        SolverOptions(q_eps=0.1),
     ),
     "lma_cd": Method("Levenberg-Marquardt with Cholesky decomposition, a baseline", "3.2.2, 3.2.3", _LMA_CD),
     "bal": Method("Levenberg-Marquardt with PCG and M = B, a baseline (Agarwal et al. 2010)", "3.2.3", _BAL),

@@ -32,6 +32,7 @@ class SolverOptions:
         polish_steps: Newton steps of every point alone after each step of the keyframes; 0 for none.
         backend: which kernels work.
         t_eps: PCG stops at |r| <= min(t_eps, |b|) |b|.
+        q_eps: PCG also stops where step i adds less than q_eps / i of what the model has gained; 0 for never.
         max_linear_iterations: cap on PCG steps in one outer iteration.
         max_iterations: cap on outer iterations, rejected ones included.
         function_tolerance: stop when an accepted step lowers the objective by less than this share.
@@ -53,6 +54,7 @@ class SolverOptions:
     polish_steps: int = 3
     backend: str = "auto"
     t_eps: float = 0.1
+    q_eps: float = 0.0
     max_linear_iterations: int = 500
     max_iterations: int = 50
     function_tolerance: float = 1e-6

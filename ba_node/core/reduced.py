@@ -54,7 +54,8 @@ class ReducedSolver:
             return linear.Solution(x if x is not None and np.isfinite(x).all() else None)
         options = self._options
         scale = 1.0 / system.gather(*scaling.scaled_space(options.demands.space, hessian))
-        limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius * system.radius_factor)
+        radius *= system.radius_factor
+        limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius, options.q_eps)
         precondition = preconditioner(options.preconditioner, system, scale)
         found = linear.pcg_steihaug(_scaled_product(system, scale), scale * system.rhs, precondition, limits)
         x = None if found.x is None else scale * found.x

@@ -20,6 +20,7 @@ from ba_node.core.options import SolverOptions
 # Numbers that may be zero; the others must be above it.
 _MAY_BE_ZERO = (
     "t_eps",
+    "q_eps",
     "function_tolerance",
     "gradient_tolerance",
     "objective_tolerance",

@@ -88,3 +88,17 @@ def test_zero_right_hand_side_gives_zero() -> None:
 def test_cholesky_refuses_an_indefinite_matrix() -> None:
     assert linear.cholesky(np.diag([1.0, -1.0]), np.ones(2)).x is None
     assert linear.cholesky(np.zeros((2, 2)), np.ones(2)).x is None
+
+
+@given(st.integers(0, 10_000))
+def test_stops_where_further_steps_add_little(seed: int) -> None:
+    """With an ill-conditioned matrix the rule of Nash and Sofer saves most steps and little of the gain."""
+    rng = np.random.default_rng(seed)
+    basis, _ = np.linalg.qr(rng.normal(size=(40, 40)))
+    a = (basis * np.logspace(-4, 2, 40)) @ basis.T
+    b = a @ rng.normal(size=40)
+    whole, early = run(a, b, t_eps=1e-10), run(a, b, t_eps=1e-10, q_eps=0.1)
+    assert whole.x is not None and early.x is not None
+    gains = [float(b @ x - 0.5 * x @ a @ x) for x in (whole.x, early.x)]
+    assert early.iterations < whole.iterations
+    assert 0.5 * gains[0] <= gains[1] <= gains[0] * (1.0 + 1e-9), f"{gains[1]:.6g} of {gains[0]:.6g}"

@@ -62,7 +62,7 @@ class Layout {
   // The caller's number of each point of ours; the last is repeated to fill the last batch.
   std::vector<std::int32_t> point;
   // Slots of batch b: slot_begin[b] to slot_begin[b + 1]. By slot and lane: image, edge that ends here (or -1), whether
-  // the edge is that of the slot before, what was measured. inverse_sigma is 0 where there is nothing.
+  // the edge is that of the slot before (if that happens or depth is measured), what was measured. inverse_sigma is 0 where there is nothing.
   std::vector<std::int64_t> slot_begin;
   std::vector<std::int32_t> slot_image, slot_edge;
   Buffer<double> same_edge, u, v, inverse_sigma, depth, inverse_depth_sigma;
@@ -221,7 +221,7 @@ class Layout {
 
   void find_edges(const ProblemView& p, const std::vector<std::int64_t>& order, const std::vector<std::int64_t>& first) {
     slot_edge.assign(slot_image.size(), -1);
-    same_edge.assign(slot_image.size(), 0.0);
+    if (has_depth) same_edge.assign(slot_image.size(), 0.0);
     point_edge.assign(point.size() + 1, 0);
     edge_column.reserve(n_obs);
     for (std::int64_t i = 0; i < n_points; ++i) {
@@ -233,6 +233,7 @@ class Layout {
         if (column < 0) continue;
         if (column == last) {
           has_rigs = true;
+          same_edge.resize(slot_image.size(), 0.0);
           same_edge[at] = 1.0;
           slot_edge[at - kLanes] = -1;
         } else {
