@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ba_node.cli.console import facts, progress_bar
+from ba_node.cli.console import facts, progress_bar, require_folder
 
 SUMMARY = "run the back-end on a recording, without a middleware"
 EXAMPLE = "ba replay bags/stereo_loop.mcap --out out/replay --set window.max_keyframes=30"
@@ -39,17 +39,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
     )
+    parser.add_argument(
+        "--load-map", type=Path, metavar="FILE", help="begin with a map; the recording goes on in its session"
+    )
+    parser.add_argument(
+        "--final-optimize", action="store_true", help="refine all keyframes and points of the newest session at the end"
+    )
+    parser.add_argument(
+        "--save-map", type=Path, metavar="FILE", help="write the map at the end, as in docs/map_format.md"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay."""
     from ba_node.config import parse_assignment  # noqa: PLC0415
     from ba_node.io.parameters import configure  # noqa: PLC0415
-    from ba_node.offline.replay import Watch, replay  # noqa: PLC0415
+    from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
 
+    require_folder(args.save_map)
     config = configure(args.params, dict(parse_assignment(text) for text in args.set))
     with progress_bar("replay", "messages") as progress:
-        report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress))
+        options = MapOptions(args.load_map, args.final_optimize, args.save_map)
+        report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
     print(facts(_rows(report)))
     _tell(report)
     print(f"written to {args.out}")

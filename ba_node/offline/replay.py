@@ -16,11 +16,13 @@ from typing import Any
 
 from ba_node.backend import Backend
 from ba_node.config import Config
+from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.files import whole_file
 from ba_node.io.json_file import write_json
+from ba_node.io.map_file import load_map, write_map
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
@@ -30,6 +32,7 @@ from ba_node.messages.conversion import output_messages
 from ba_node.offline.recording import read_truth
 from ba_node.offline.session_record import SessionRecord
 from ba_node.scene.scene import Scene
+from ba_node.window import full
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
 # leave a file that grows with the square of its length.
@@ -62,7 +65,24 @@ class Watch:
     progress: Callable[[int, int], None] = _nothing
 
 
-def replay(bag: Path, out: Path, config: Config, watch: Watch = Watch()) -> dict[str, Any]:
+@dataclass(frozen=True)
+class MapOptions:
+    """What is done before and after the recording.
+
+    Attributes:
+        load: map to begin with; the recording must go on in its session.
+        optimize: refine everything of the newest session at the end.
+        save: file for the map of the newest session.
+    """
+
+    load: Path | None = None
+    optimize: bool = False
+    save: Path | None = None
+
+
+def replay(
+    bag: Path, out: Path, config: Config, watch: Watch = Watch(), options: MapOptions = MapOptions()
+) -> dict[str, Any]:
     """Replay a recording and write the results; return the content of report.json.
 
     The newest session's files go to ``out``, those of older sessions to ``out/session_<id>``. report.json is written
@@ -70,6 +90,7 @@ def replay(bag: Path, out: Path, config: Config, watch: Watch = Watch()) -> dict
 
     Raises:
         BagError: the recording cannot be read.
+        MapFileError: the map cannot be loaded.
         ReplayError: it holds no keyframe that can be used.
         OSError: a file cannot be written.
     """
@@ -79,13 +100,18 @@ def replay(bag: Path, out: Path, config: Config, watch: Watch = Watch()) -> dict
         (out / "report.json").unlink(missing_ok=True)
         with BagWriter(out / "refined.mcap") as writer:
             run = _Run(config, writer, watch)
+            if options.load is not None:
+                run.load(options.load)
             run.read((measurement for _, _, measurement in measurements), reader.message_count)
+            run.end(options.optimize)
             if not run.sessions:
                 raise ReplayError(f"{bag}: no keyframe in it can be used{_why(reader, run)}")
         truth = read_truth(reader)
         report = {"bag": bag.name, **_write(out, run.sessions, truth)}
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
+    if options.save is not None:
+        write_map(options.save, run.backend.snapshot())
     with whole_file(out / "effective.yaml") as stream:
         stream.write(parameters_yaml(config, comments=False).encode())
     write_json(out / "report.json", report)
@@ -104,6 +130,15 @@ class _Run:
         self._inputs: dict[int, Keyframe] = {}
         self._written = 0
 
+    def load(self, path: Path) -> None:
+        """Begin with a map."""
+        self.backend.take_over(load_map(path, self._config.scene))
+        scene, table = self.backend.scene, self.backend.scene.keyframes
+        orientation = geometry.quaternion_from_matrix(table.input_rotation)
+        rows = zip(table.keyframe_id.tolist(), table.stamp_ns.tolist(), table.input_position, orientation, strict=True)
+        for key, stamp_ns, position, quaternion in rows:
+            self._inputs[key] = Keyframe(scene.session_id or 0, key, stamp_ns, scene.frame_id, position, quaternion)
+
     def read(self, measurements: Iterable[Measurement], total: int) -> None:
         for done, measurement in enumerate(measurements, start=1):
             if self.backend.completes(measurement):
@@ -113,6 +148,14 @@ class _Run:
         self.backend.flush(final=True)
         while self.backend.ready:
             self._solve()
+
+    def end(self, optimize: bool) -> None:
+        """End the newest session, after a solve of everything if that is wanted."""
+        if optimize:
+            taken = full.copy(self.backend.scene, self._config)
+            if isinstance(taken, full.Copy):
+                merged = self.backend.merge(taken, taken.solve(full.options(self._config.solver)))
+                self._record(merged[0] if merged else None)
         self._close(self.backend.scene)
 
     def _add(self, measurement: Measurement) -> None:
@@ -124,7 +167,9 @@ class _Run:
             self._inputs.setdefault(measurement.keyframe_id, measurement)
 
     def _solve(self) -> None:
-        estimate = self.backend.solve()
+        self._record(self.backend.solve())
+
+    def _record(self, estimate: Estimate | None) -> None:
         if estimate is None:
             return
         session = estimate.report.session_id

@@ -1,0 +1,89 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps on the command line: saved by a replay, looked into, exported, gone on from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ba_node.cli.main import main
+from ba_node.io.ply import read_ply
+from ba_node.io.trajectory import read_tum
+
+
+def replay(bag: Path, out: Path, *options: str) -> int:
+    return main(["replay", str(bag), "--out", str(out), *options])
+
+
+@pytest.fixture(scope="module")
+def saved(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("saved")
+    assert replay(bag, folder / "out", "--save-map", str(folder / "site.npz")) == 0
+    return folder / "site.npz"
+
+
+def test_info(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "info", str(saved)]) == 0
+    told = dict(line.split("  ", 1) for line in capsys.readouterr().out.splitlines())
+    assert told["session"].strip() == "0"
+    assert told["cameras"].strip() == "2"
+    assert told["keyframes"].strip().startswith("8, 8 refined, 1.8 s, ")
+
+
+def test_export_gives_what_the_replay_gave(saved: Path, tmp_path: Path) -> None:
+    tum, ply = tmp_path / "a.tum", tmp_path / "a.ply"
+    assert main(["map", "export", str(saved), "--tum", str(tum), "--ply", str(ply)]) == 0
+    assert tum.read_bytes() == (saved.parent / "out" / "trajectory.tum").read_bytes()
+    assert ply.read_bytes() == (saved.parent / "out" / "points.ply").read_bytes()
+    assert len(read_tum(tum)) == 8
+    assert len(read_ply(ply)[0]) > 50
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["info", "none.npz"], "ba: error: none.npz: cannot be read: No such file or directory"),
+        (["info", "{saved}", "--tum", "a"], "info writes nothing"),
+        (["export", "{saved}"], "export writes what --tum and --ply name"),
+        (["export", "{saved}", "--tum", "none/a.tum"], "there is no folder none"),
+        (["info", __file__], "not a map: expected an .npz file of ba_node"),
+    ],
+)
+def test_errors_are_one_line(
+    saved: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", *(word.format(saved=saved) for word in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_replay_goes_on_from_a_map(saved: Path, bag: Path, tmp_path: Path) -> None:
+    """The same recording again brings nothing new, and changes nothing."""
+    again = tmp_path / "again.npz"
+    assert replay(bag, tmp_path / "out", "--load-map", str(saved), "--save-map", str(again)) == 2
+    assert not again.exists()
+
+
+def test_the_final_solve_is_the_same_each_time(bag: Path, tmp_path: Path, saved: Path) -> None:
+    for name in ("a", "b"):
+        assert replay(bag, tmp_path / name, "--final-optimize", "--save-map", str(tmp_path / f"{name}.npz")) == 0
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes() != saved.read_bytes()
+    assert (tmp_path / "a" / "trajectory.tum").read_bytes() == (tmp_path / "b" / "trajectory.tum").read_bytes()
+    once, all_of_it = (
+        json.loads((folder / "report.json").read_text()) for folder in (saved.parent / "out", tmp_path / "a")
+    )
+    assert all_of_it["solves"] == once["solves"] + 1
+    assert all_of_it["rms_px_without_outliers"]["refined"] <= once["rms_px_without_outliers"]["refined"] * 1.01
+
+
+def test_a_map_that_cannot_be_loaded_ends_the_replay(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert replay(bag, tmp_path / "out", "--load-map", str(tmp_path / "none.npz")) == 2
+    assert "none.npz: cannot be read" in capsys.readouterr().err
+    assert replay(bag, tmp_path / "out", "--save-map", str(tmp_path / "none" / "a.npz")) == 2
+    assert "there is no folder" in capsys.readouterr().err
