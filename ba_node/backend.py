@@ -208,8 +208,7 @@ class Backend:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
 
         Returns:
-            What is known now, and how many later keyframes followed; None if the result was of no use or its map is
-            no longer the current one: nothing has changed then.
+            What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
         """
         result = solved.result
         followed = None

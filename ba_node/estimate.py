@@ -182,3 +182,8 @@ class Estimate:
     correction: Correction | None = None
     covariance: FloatArray | None = None
     view: WindowView | None = None
+
+    @property
+    def replaces_map(self) -> bool:
+        """Return True if the map is another than before: after a usable solve, and when all was forgotten."""
+        return self.report.status.usable or len(self.trajectory) == 0

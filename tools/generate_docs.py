@@ -57,7 +57,7 @@ SHARED_OUTPUTS = {
 }
 SERVICES = {
     "reset": "Forget the map and begin anew; the cameras stay.",
-    "pause": "`data: true`: take in no more messages, count them as dropped; `data: false`: go on.",
+    "pause": "`data: true`: ignore keyframes, tracks and guesses, and count them; `data: false`: go on.",
     "save_map": "Write all that is known to a file, see docs/map_format.md.",
     "load_map": "Put what a file holds in the place of all that is known.",
 }

@@ -37,7 +37,7 @@ class _Everything(Container[str]):
 def output_messages(
     factory: MessageFactory, estimate: Estimate, config: OutputConfig, wanted: Container[str] = _Everything()
 ) -> list[tuple[str, str, Any]]:
-    """Return what a node publishes after a solve; of a failed or skipped one the report only.
+    """Return what a node publishes after a solve; of a failed or skipped one the report only, unless the map is empty.
 
     Args:
         factory: makes the messages.
@@ -57,7 +57,7 @@ def output_messages(
             out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
     if "report" in wanted:
         out.append(("report", _report(factory, estimate)))
-    if estimate.report.status.usable:
+    if estimate.replaces_map:
         if "path" in wanted:
             poses = estimate.trajectory[-config.path_max_poses :]
             out.append(("path", path_message(poses, estimate.stamp_ns, estimate.frame_id)))

@@ -94,7 +94,8 @@ class Component:
 
         Args:
             estimate: of every solve, failed and skipped ones too (``estimate.report.status.usable``).
-            newest: the last usable one of those that came together: what replaces the ones before needs only this.
+            newest: the last one of those that came together that replaces the map (``estimate.replaces_map``): what
+                replaces the ones before needs only this.
         """
 
     def publisher(self, kind: Any, topic: str, profile: Any, **options: Any) -> Any:

@@ -27,8 +27,10 @@ from ba_node.ros.inbox import Inbox
 from ba_node.ros.inputs import Inputs
 from ba_node.ros.lifecycle import ManagedNode
 from ba_node.ros.map_transform import MapTransform
+from ba_node.ros.optimize import Optimize
 from ba_node.ros.parameters import Parameters
 from ba_node.ros.publishing import Publishing
+from ba_node.ros.services import Services
 from ba_node.ros.side_outputs import SideOutputs
 from ba_node.ros.silence import Silence
 from ba_node.ros.static_frames import StaticFrames
@@ -47,6 +49,8 @@ COMPONENTS: tuple[type[Component], ...] = (
     Diagnostics,
     Silence,
     StaticFrames,
+    Services,
+    Optimize,
     Inputs,
 )
 _LOG_PERIOD_S = 5.0
@@ -150,7 +154,7 @@ class BaNode(ManagedNode):
             return
         outputs = host.worker.outputs()
         estimates = [output for output in outputs if isinstance(output, Estimate)]
-        newest = next((e for e in reversed(estimates) if e.report.status.usable), None)
+        newest = next((e for e in reversed(estimates) if e.replaces_map), None)
         for output in outputs:
             if isinstance(output, Notice):
                 self._log(output)

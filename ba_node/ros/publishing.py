@@ -92,7 +92,11 @@ class Publishing(Component):
 
     def _log_report(self, report: SolveReport) -> None:
         """Say why a solve gave nothing. That the first keyframes are not enough is nothing to warn about."""
-        if not report.status.usable and self._throttle.passes(report.status.name, time.monotonic()):
+        if (
+            report.solve_count
+            and not report.status.usable
+            and self._throttle.passes(report.status.name, time.monotonic())
+        ):
             log = self.host.node.get_logger()
             text = f"keyframe {report.newest_keyframe_id} was not refined: {report.reason}"
             (log.info if report.status is Status.SKIPPED else log.warning)(text)

@@ -35,6 +35,8 @@ class SideOutputs(Component):
 
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Publish what was asked for when the solve began."""
+        if len(estimate.trajectory) == 0:
+            self._drawn_session = None
         if estimate.covariance is not None and self._wanted("pose_with_covariance"):
             for message in covariance_messages(self._factory, estimate):
                 self._publishers["pose_with_covariance"].publish(message)

@@ -12,6 +12,9 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
+from ba_node.measurements import Keyframe
+from ba_node.offline.recording import record
+from ba_node.synthetic import SyntheticOptions, generate
 
 
 def replay(bag: Path, out: Path, *options: str) -> int:
@@ -66,6 +69,22 @@ def test_a_replay_goes_on_from_a_map(saved: Path, bag: Path, tmp_path: Path) -> 
     again = tmp_path / "again.npz"
     assert replay(bag, tmp_path / "out", "--load-map", str(saved), "--save-map", str(again)) == 2
     assert not again.exists()
+
+
+def test_two_halves_with_a_map_between_give_the_whole(tmp_path: Path) -> None:
+    options = SyntheticOptions(seed=5, keyframes=8, landmarks=600, tracks=60, path="line", length_m=10.0)
+    data = generate(options)
+    first, second = list(data.timeline()), list(data.timeline())
+    cut = next(i for i, (_, _, m) in enumerate(first) if isinstance(m, Keyframe) and m.keyframe_id == 4)
+    record(tmp_path / "whole.mcap", data.timeline(), data.truth)
+    record(tmp_path / "a.mcap", first[:cut], data.truth)
+    record(tmp_path / "b.mcap", second[:1] + second[cut:], data.truth)
+    middle = str(tmp_path / "middle.npz")
+    assert replay(tmp_path / "whole.mcap", tmp_path / "whole") == 0
+    assert replay(tmp_path / "a.mcap", tmp_path / "a", "--save-map", middle) == 0
+    assert replay(tmp_path / "b.mcap", tmp_path / "b", "--load-map", middle) == 0
+    for name in ("trajectory.tum", "points.ply"):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
 
 
 def test_the_final_solve_is_the_same_each_time(bag: Path, tmp_path: Path, saved: Path) -> None:

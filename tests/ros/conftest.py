@@ -208,6 +208,10 @@ class Peer:
         request = SetParameters.Request(parameters=[parameter])
         return self.call(SetParameters, "ba_node/set_parameters", request).results[0]
 
+    def offers(self, service: str) -> bool:
+        """Return True if the node has a service that was called before."""
+        return service in self._clients and bool(self._clients[service].service_is_ready())
+
     def close(self) -> None:
         self.executor.shutdown()
         self.node.destroy_node()
@@ -246,3 +250,53 @@ def make_peer(domain: int) -> Iterator[Callable[..., Peer]]:  # noqa: ARG001
 def slow_solve() -> str:
     """Return a program: the node with a solve that goes on until it is stopped, and says when it has begun."""
     return _SLOW_SOLVE
+
+
+class Gates:
+    """Holds the solvers of a node after each iteration, as long as their gates are shut."""
+
+    # Threads are known by their names: "solver" solves windows, "optimize" everything.
+    SCRIPT = """
+import pathlib, sys, threading, time
+from ba_node.core import solver
+from ba_node.ros.main import main
+
+folder, solve = pathlib.Path({folder!r}), solver.solve
+
+def gated(problem, options, *, on_iteration=None, **others):
+    name = threading.current_thread().name
+    def watch(row):
+        while (folder / name).exists():
+            (folder / (name + ".waits")).touch()
+            time.sleep(0.005)
+        return on_iteration is None or on_iteration(row)
+    return solve(problem, options, on_iteration=watch, **others)
+
+solver.solve = gated
+sys.exit(main(sys.argv))
+"""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @property
+    def script(self) -> str:
+        return self.SCRIPT.format(folder=str(self.folder))
+
+    def shut(self, thread: str) -> None:
+        (self.folder / thread).touch()
+
+    def open(self, thread: str) -> None:
+        (self.folder / thread).unlink()
+        (self.folder / f"{thread}.waits").unlink(missing_ok=True)
+
+    def waits(self, thread: str) -> bool:
+        """Return True if a solver stands at its gate."""
+        return (self.folder / f"{thread}.waits").exists()
+
+
+@pytest.fixture
+def gates(tmp_path: Path) -> Gates:
+    folder = tmp_path / "gates"
+    folder.mkdir()
+    return Gates(folder)

@@ -1,0 +1,268 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The services of the node, over a real middleware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ba_msgs.srv import LoadMap, SaveMap
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import GetParameters
+from std_srvs.srv import SetBool, Trigger
+
+from ba_node.estimate import Status
+from ba_node.messages.commands import SERVICE_TYPES
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+
+pytestmark = pytest.mark.dds
+
+StartNode = Callable[..., Any]
+MakePeer = Callable[..., Any]
+KEYFRAMES = 8
+INACTIVE = ("--ros-args", "-p", "node.autostart:=false")
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticData:
+    return generate(SyntheticOptions(seed=3, keyframes=KEYFRAMES, length_m=12.0, path="line", outlier_share=0.0))
+
+
+@pytest.fixture
+def peer(make_peer: MakePeer) -> Any:
+    made = make_peer()
+    made.advertise()
+    made.listen()
+    return made
+
+
+def _send(peer: Any, scene: SyntheticData, *keyframes: int) -> None:
+    """Publish the rig and some keyframes."""
+    peer.publish(scene.rig)
+    for i in keyframes:
+        peer.publish(scene.keyframes[i])
+        for image in scene.tracks[i]:
+            peer.publish(image, scene.keyframes[i].stamp_ns)
+
+
+def _play(peer: Any, scene: SyntheticData, *keyframes: int) -> None:
+    """Publish some keyframes, and wait until the last of them was solved."""
+    for i in keyframes:
+        _send(peer, scene, i)
+        key = scene.keyframes[i].keyframe_id
+        peer.until(
+            lambda key=key: any(r.newest_keyframe_id == key for r in peer.received["report"]), f"report on {key}"
+        )
+
+
+def _forget(peer: Any) -> None:
+    for messages in peer.received.values():
+        messages.clear()
+
+
+def _reset(peer: Any) -> Any:
+    return peer.call(Trigger, "ba_node/reset", Trigger.Request())
+
+
+def _pause(peer: Any, data: bool) -> Any:
+    return peer.call(SetBool, "ba_node/pause", SetBool.Request(data=data))
+
+
+def _save(peer: Any, path: Path | str) -> Any:
+    return peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(path)))
+
+
+def _load(peer: Any, path: Path | str) -> Any:
+    return peer.call(LoadMap, "ba_node/load_map", LoadMap.Request(path=str(path)))
+
+
+def _change(peer: Any, number: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=number))
+    return bool(peer.call(ChangeState, "ba_node/change_state", request).success)
+
+
+def test_reset_forgets_the_map_and_says_so(start_node: StartNode, peer: Any, scene: SyntheticData) -> None:
+    node = start_node()
+    peer.connect()
+    _play(peer, scene, *range(4))
+    peer.until(lambda: peer.received["path"] and len(peer.received["path"][-1].poses) == 4, "a path of 4")
+    answer = _reset(peer)
+    assert (answer.success, answer.message) == (True, "forgot 4 keyframes; the next keyframe begins a new map")
+    peer.until(lambda: len(peer.received["path"][-1].poses) == 0, "an empty path")
+    peer.until(lambda: peer.received["points"][-1].width == 0, "an empty cloud")
+    peer.until(lambda: peer.received["report"][-1].reason == "reset: the map is empty", "a report on it")
+    assert peer.received["report"][-1].status == Status.SKIPPED
+    _forget(peer)
+    # The same keyframes of the same session are news again.
+    _play(peer, scene, *range(3))
+    peer.until(lambda: peer.received["path"] and len(peer.received["path"][-1].poses) == 3, "a path of 3")
+    assert node.stop() == 0
+
+
+def test_data_is_ignored_and_counted_while_paused(start_node: StartNode, peer: Any, scene: SyntheticData) -> None:
+    start_node()
+    peer.connect()
+    _play(peer, scene, *range(3))
+    assert _pause(peer, True).message == "paused: keyframes and tracks are ignored and counted"
+    assert _pause(peer, True).message.endswith("(as before)")
+    _send(peer, scene, 3, 4)
+    # What is asked for after data on another connection may overtake it: keyframes 5 and on end the pause.
+    assert _pause(peer, False).message == "running"
+    _play(peer, scene, *range(5, KEYFRAMES))
+    last = peer.received["report"][-1]
+    rejected = dict(zip(last.rejected_reason, last.rejected_count, strict=True))
+    assert rejected.get("paused", 0) > 0, rejected
+    ids = [int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id]
+    assert {5, 6, 7} <= set(ids)
+
+
+def test_a_saved_map_goes_on_in_another_node(
+    start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path
+) -> None:
+    first = start_node()
+    peer.connect()
+    _play(peer, scene, *range(5))
+    path = tmp_path / "site.npz"
+    saved = _save(peer, path)
+    assert saved.success, saved.message
+    assert saved.message == f"{path}: 5 keyframes, {saved.landmarks} landmarks, {saved.observations} observations"
+    with np.load(path) as arrays:
+        assert len(arrays["keyframes/position"]) == saved.keyframes == 5
+        assert len(arrays["sightings/uv"]) == saved.observations > 500
+        positions = arrays["keyframes/position"]
+    assert first.stop() == 0
+
+    _forget(peer)
+    second = start_node()
+    loaded = _load(peer, path)
+    assert (loaded.success, loaded.keyframes, loaded.landmarks) == (True, 5, saved.landmarks), loaded.message
+    assert loaded.session_id == 0
+    peer.connect()
+    peer.until(lambda: peer.received["path"] and len(peer.received["path"][-1].poses) == 5, "the path of the map")
+    shown = [(p.pose.position.x, p.pose.position.y, p.pose.position.z) for p in peer.received["path"][-1].poses]
+    np.testing.assert_array_equal(shown, positions)
+    _play(peer, scene, *range(5, KEYFRAMES))
+    assert Status(peer.received["report"][-1].status).usable
+    assert len(peer.received["path"][-1].poses) == KEYFRAMES
+    assert second.stop() == 0
+
+
+def test_what_cannot_be_saved_or_loaded_is_told(
+    start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path
+) -> None:
+    start_node()
+    peer.connect()
+    _play(peer, scene, *range(3))
+    (tmp_path / "text").write_text("hello")
+    for path, reason in (
+        (tmp_path / "none" / "a.npz", "cannot write .*: No such file or directory; nothing was saved"),
+        (tmp_path / "text" / "a.npz", "cannot write .*: Not a directory; nothing was saved"),
+        (tmp_path, "cannot write .*: Is a directory; nothing was saved"),
+        ("", "path = '': expected the name of a file"),
+    ):
+        answer = _save(peer, path)
+        assert (answer.success, answer.keyframes) == (False, 0)
+        assert _matches(reason, answer.message)
+
+    good = tmp_path / "good.npz"
+    assert _save(peer, good).success
+    newer = good.read_bytes().replace(b'"version": 1', b'"version": 2')
+    (tmp_path / "newer.npz").write_bytes(newer)
+    (tmp_path / "cut.npz").write_bytes(good.read_bytes()[:-1000])
+    np.savez(tmp_path / "foreign.npz", a=np.zeros(3))
+    for path, reason in (
+        (tmp_path / "none.npz", "cannot be read: No such file or directory; the map is as before"),
+        (tmp_path, "cannot be read: Is a directory"),
+        (tmp_path / "text", "not a map: expected an .npz file"),
+        (tmp_path / "foreign.npz", "not a map: it has no map.json"),
+        (tmp_path / "cut.npz", "cut off or damaged"),
+        (tmp_path / "newer.npz", "damaged: Bad CRC-32|format version 2"),
+        ("", "expected the name of a file"),
+    ):
+        answer = _load(peer, path)
+        assert (answer.success, answer.keyframes) == (False, 0)
+        assert _matches(reason, answer.message)
+    # The map is as it was.
+    _play(peer, scene, 3)
+    peer.until(lambda: len(peer.received["path"][-1].poses) == 4, "the path of the map and one more")
+
+
+def _matches(pattern: str, text: str) -> bool:
+    with pytest.raises(ValueError, match=pattern):
+        raise ValueError(text)
+    return True
+
+
+def test_an_answer_does_not_wait_for_a_solve(
+    start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
+) -> None:
+    node = start_node(python=gates.script)
+    peer.connect()
+    _play(peer, scene, *range(3))
+    gates.shut("solver")
+    _send(peer, scene, 3)
+    peer.until(lambda: gates.waits("solver"), "a solve")
+    n_reports = len(peer.received["report"])
+    saving = peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
+    second = _save(peer, tmp_path / "b.npz")
+    assert second.message == "another map is being saved or loaded: try again when that is done"
+    got = peer.call(GetParameters, "ba_node/get_parameters", GetParameters.Request(names=["window.max_keyframes"]))
+    assert got.values[0].integer_value == 20
+    assert _pause(peer, True).success
+    assert _pause(peer, False).success
+    assert gates.waits("solver"), "all that was answered during the solve"
+    assert not saving.done()
+    assert len(peer.received["report"]) == n_reports
+    gates.open("solver")
+    peer.until(saving.done, "the map to be saved between two solves")
+    assert saving.result().keyframes == 4
+    assert _save(peer, tmp_path / "b.npz").success
+    assert node.stop() == 0
+
+
+def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path) -> None:
+    start_node(*INACTIVE)
+    names = {f"/ba_node/{name}" for name in SERVICE_TYPES}
+
+    def offered() -> set[str]:
+        return names & {name for name, _ in peer.node.get_service_names_and_types()}
+
+    assert _change(peer, Transition.TRANSITION_CONFIGURE)
+    peer.until(lambda: offered() == names, "services of a configured node")
+    assert _save(peer, tmp_path / "empty.npz").message.endswith("0 keyframes, 0 landmarks, 0 observations")
+    assert _load(peer, tmp_path / "empty.npz").success
+    assert _reset(peer).message.startswith("forgot 0 keyframes")
+    assert _change(peer, Transition.TRANSITION_ACTIVATE)
+    peer.connect()
+    _play(peer, scene, *range(3))
+    assert _change(peer, Transition.TRANSITION_DEACTIVATE)
+    assert _save(peer, tmp_path / "three.npz").keyframes == 3
+    assert _change(peer, Transition.TRANSITION_CLEANUP)
+    # The clients of the peer count as such in the graph, so they are asked instead.
+    peer.until(lambda: not any(peer.offers(f"ba_node/{name}") for name in SERVICE_TYPES), "services to go")
+    assert peer.offers("ba_node/change_state")
+
+
+def test_who_waits_at_cleanup_is_answered(
+    start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
+) -> None:
+    node = start_node(python=gates.script)
+    peer.connect()
+    _play(peer, scene, *range(3))
+    gates.shut("solver")
+    _send(peer, scene, 3)
+    peer.until(lambda: gates.waits("solver"), "a solve")
+    saving = peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
+    assert _pause(peer, False).success, "and so the node has the request before this one"
+    assert _change(peer, Transition.TRANSITION_DEACTIVATE)
+    assert _change(peer, Transition.TRANSITION_CLEANUP)
+    peer.until(saving.done, "an answer")
+    assert saving.result().message == "the node was cleaned up meanwhile"
+    gates.open("solver")
+    assert node.stop() == 0
+    assert not (tmp_path / "a.npz").exists()
