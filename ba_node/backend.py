@@ -42,11 +42,9 @@ from ba_node.estimate import Correction, Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.scene import Scene
-from ba_node.window import full, quality
+from ba_node.window import extras, full, quality
 from ba_node.window.correction import MapCorrection, Transform
-from ba_node.window.covariance import covariances
 from ba_node.window.known import cloud_of, poses_of, taking_part_of
-from ba_node.window.view import view
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -196,7 +194,7 @@ class Backend:
             self._report, state = self._solve(newest, selection, on_iteration)
             if state is not None:
                 self._correct(int(taking_part[-1]))
-                extra = self._extras(selection, state, taking_part)
+                extra = extras.work_out(self.extras, self.scene, self.config, selection, state, taking_part)
         self.scene.keyframes.solved[self._reached(due, end)] = True
         return dataclasses.replace(self._estimate(taking_part), **extra)
 
@@ -294,22 +292,6 @@ class Backend:
         self._report = dataclasses.replace(
             self._report, correction_m=move.distance_m, correction_rad=move.angle_rad, correction_held=move.held
         )
-
-    def _extras(self, selection: window.Selection, state: State, refined: IntArray) -> dict[str, Any]:
-        """Return what was asked for beside the estimate, with rows as in ``refined``."""
-        places = self.scene.places()
-        place = np.searchsorted(places[refined], places[selection.keyframes])
-        found: dict[str, Any] = {}
-        if self.extras.covariance:
-            measured = self.scene.keyframes.input_position[selection.keyframes]
-            found["covariance"] = np.full((len(refined), 6, 6), np.nan)
-            found["covariance"][place] = covariances(
-                selection, state, measured, methods.from_config(self.config.solver)
-            )
-        if self.extras.view:
-            good = ~self.scene.sightings.outlier[selection.rows[selection.believed]]
-            found["view"] = view(selection.problem, state, good, place, len(refined))
-        return found
 
     def _base_report(self, newest: int) -> SolveReport:
         return SolveReport(

@@ -315,7 +315,8 @@ class NodeConfig:
     queue_depth: int = _param(100, "QoS depth of the input subscriptions.", minimum=1, maximum=100_000, live=False)
     silence_s: float = _param(
         10.0,
-        "With no keyframes or tracks for this long, a warning names the topics and who publishes there; 0: never.",
+        "With no keyframes or tracks for this long, log and /diagnostics name the topics and who publishes there;"
+        " 0: never.",
         unit="s",
         minimum=0.0,
         maximum=86_400.0,
@@ -342,9 +343,6 @@ class NodeConfig:
 class DiagnosticsConfig:
     """When /diagnostics warns. See docs/diagnostics.md."""
 
-    silence_s: float = _param(
-        5.0, "Without a keyframe for this long the inputs are stale.", unit="s", minimum=0.1, maximum=86400.0
-    )
     recent_s: float = _param(
         10.0, "What was dropped or turned away counts for this long.", unit="s", minimum=1.0, maximum=3600.0
     )

@@ -18,7 +18,7 @@ from ba_node.messages.factory import MessageFactory, header_message
 from ba_node.messages.topics import SHARED_TYPES
 
 if TYPE_CHECKING:
-    from ba_node.config import DiagnosticsConfig
+    from ba_node.config import Config, DiagnosticsConfig
 
 
 class Level(enum.IntEnum):
@@ -79,10 +79,11 @@ class Finding:
             self.find(Level.ERROR if value > error else Level.WARN, words)
 
 
-def diagnose(health: Health, limits: DiagnosticsConfig) -> list[Finding]:
+def diagnose(health: Health, config: Config) -> list[Finding]:
     """Return the findings on every subject."""
+    limits = config.diagnostics
     return [
-        _inputs(health, limits),
+        _inputs(health, limits, config.node.silence_s),
         _queue(health, limits),
         _solver(health, limits),
         _latency(health, limits),
@@ -110,7 +111,7 @@ def diagnostics_message(factory: MessageFactory, findings: list[Finding], node: 
     return factory.make(SHARED_TYPES["/diagnostics"], header=header_message(factory, stamp_ns, ""), status=statuses)
 
 
-def _inputs(health: Health, limits: DiagnosticsConfig) -> Finding:
+def _inputs(health: Health, limits: DiagnosticsConfig, silence_s: float) -> Finding:
     rejected = dict(health.report.rejected) if health.report else {}
     found = Finding(
         "inputs",
@@ -121,7 +122,7 @@ def _inputs(health: Health, limits: DiagnosticsConfig) -> Finding:
     )
     if health.ignoring:
         found.find(Level.OK, f"data is ignored: {health.ignoring}")
-    elif health.silence_s > limits.silence_s:
+    elif 0.0 < silence_s < health.silence_s:
         missing = [name for name, count in health.publishers.items() if not count]
         words = f"no keyframe for {health.silence_s:.0f} s"
         found.find(Level.STALE, f"{words}; nobody publishes {', '.join(missing)}" if missing else words)

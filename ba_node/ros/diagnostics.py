@@ -48,7 +48,7 @@ class Diagnostics(Component):
 
     def _tick(self) -> None:
         node = self.host.node
-        findings = diagnose(self._health(time.monotonic()), self.host.config.diagnostics)
+        findings = diagnose(self._health(time.monotonic()), self.host.config)
         stamp_ns = int(node.get_clock().now().nanoseconds)
         name = node.get_fully_qualified_name()
         self._publisher.publish(diagnostics_message(self._factory, findings, name, stamp_ns))

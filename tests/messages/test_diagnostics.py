@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ba_node.config import DiagnosticsConfig
+from ba_node.config import Config, DiagnosticsConfig
 from ba_node.estimate import SolveReport, Status
 from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.messages.diagnostics import Finding, Health, Level, diagnose, diagnostics_message
@@ -38,7 +38,7 @@ def findings(**changes: Any) -> dict[str, Finding]:
     health = dataclasses.replace(HEALTHY, **changes)
     if report:
         health = dataclasses.replace(health, report=dataclasses.replace(GOOD, **report))
-    return {finding.subject: finding for finding in diagnose(health, DiagnosticsConfig())}
+    return {finding.subject: finding for finding in diagnose(health, Config())}
 
 
 def test_all_is_well() -> None:
@@ -55,14 +55,14 @@ def test_all_is_well() -> None:
 @pytest.mark.parametrize(
     ("changes", "subject", "level", "words"),
     [
-        ({"silence_s": 7.0}, "inputs", Level.STALE, "no keyframe for 7 s"),
+        ({"silence_s": 17.0}, "inputs", Level.STALE, "no keyframe for 17 s"),
         (
-            {"silence_s": 7.0, "publishers": {"/car/keyframes": 0, "/car/feature_tracks": 2}},
+            {"silence_s": 17.0, "publishers": {"/car/keyframes": 0, "/car/feature_tracks": 2}},
             "inputs",
             Level.STALE,
             "nobody publishes /car/keyframes",
         ),
-        ({"silence_s": 7.0, "ignoring": "inactive"}, "inputs", Level.OK, "data is ignored: inactive"),
+        ({"silence_s": 17.0, "ignoring": "inactive"}, "inputs", Level.OK, "data is ignored: inactive"),
         ({"recent": {"bad_pose": 2}}, "inputs", Level.WARN, "turned away in the last 10 s: bad_pose 2"),
         ({"recent": {"dropped": 4}}, "queue", Level.ERROR, "4 messages dropped in the last 10 s"),
         ({"recent": {"coalesced": 4}}, "queue", Level.WARN, "4 keyframes solved with a newer one"),
@@ -87,14 +87,20 @@ def test_levels(changes: dict[str, Any], subject: str, level: Level, words: str)
     assert {name for name, finding in found.items() if finding.level is not Level.OK} <= {subject}
 
 
+def test_no_limit_on_silence_is_never_stale() -> None:
+    config = Config().with_values({"node.silence_s": 0})
+    found = diagnose(dataclasses.replace(HEALTHY, silence_s=1e6), config)
+    assert {finding.level for finding in found} == {Level.OK}
+
+
 def test_an_error_threshold_below_the_warning_is_obeyed() -> None:
-    limits = DiagnosticsConfig(memory_warn_mb=1000.0, memory_error_mb=100.0)
-    memory = {finding.subject: finding for finding in diagnose(HEALTHY, limits)}["memory"]
+    config = Config(diagnostics=DiagnosticsConfig(memory_warn_mb=1000.0, memory_error_mb=100.0))
+    memory = {finding.subject: finding for finding in diagnose(HEALTHY, config)}["memory"]
     assert memory.level is Level.ERROR
 
 
 def test_every_status_carries_the_full_name_of_the_node() -> None:
-    message = diagnostics_message(ROSBAGS_FACTORY, diagnose(HEALTHY, DiagnosticsConfig()), "/car/ba_node", 5)
+    message = diagnostics_message(ROSBAGS_FACTORY, diagnose(HEALTHY, Config()), "/car/ba_node", 5)
     assert [status.name for status in message.status][:2] == ["/car/ba_node: inputs", "/car/ba_node: queue"]
     assert {status.hardware_id for status in message.status} == {"/car/ba_node"}
     assert {(status.level, status.message) for status in message.status} == {(b"\x00", "ok")}

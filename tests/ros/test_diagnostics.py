@@ -52,7 +52,7 @@ def values(found: Any) -> dict[str, str]:
 def test_silence_is_stale_and_names_who_is_missing(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
-    node = start_node("--ros-args", "-r", "__ns:=/car", "-p", "diagnostics.silence_s:=1.5")
+    node = start_node("--ros-args", "-r", "__ns:=/car", "-p", "node.silence_s:=1.5")
     peer = listening(make_peer, namespace="car")
     peer.until(lambda: level(peer, "inputs") == DiagnosticStatus.STALE, "stale inputs")
     found = status(peer, "inputs")

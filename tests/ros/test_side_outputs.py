@@ -22,18 +22,18 @@ MakePeer = Callable[..., Any]
 
 TELLING = """
 import sys
-from ba_node import backend
+from ba_node.window import extras
 from ba_node.ros import publishing
 
 def telling(name):
-    work = getattr(backend, name)
+    work = getattr(extras, name)
     def tell(*arguments):
         print("works out", name, flush=True)
         return work(*arguments)
     return tell
 
 for name in ("covariances", "view"):
-    setattr(backend, name, telling(name))
+    setattr(extras, name, telling(name))
 build = publishing.output_messages
 def tell_topics(*arguments):
     built = build(*arguments)
