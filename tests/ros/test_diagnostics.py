@@ -74,6 +74,8 @@ def test_silence_is_stale_and_names_who_is_missing(
     assert float(inputs["keyframes [Hz]"]) > 0.0
     assert inputs["publishers of /car/keyframes"] == "1"
     assert float(values(status(peer, "memory"))["resident [MB]"]) > 20.0
+    assert float(values(status(peer, "latency"))["latency_max [ms]"]) > 0.0
+    assert values(status(peer, "queue"))["received"] == str(len(data.keyframes))
     assert len(peer.received["/diagnostics"][-1].status) == 6
     assert node.stop() == 0
 
