@@ -108,7 +108,9 @@ def to_problem(bal: BalProblem) -> Problem:
     The one camera of the rig has unit focal length, as the focal lengths are in ``State.intrinsics``.
     """
     n = len(bal.observations)
-    order = np.argsort(bal.point_index, kind="stable")
+    # What is sorted already is not copied: it may be most of the memory of a large problem.
+    is_sorted = bool(np.all(bal.point_index[1:] >= bal.point_index[:-1]))
+    order = slice(None) if is_sorted else np.argsort(bal.point_index, kind="stable")
     params = np.zeros((1, 12))
     params[0, :2] = 1.0
     return Problem(
