@@ -115,6 +115,14 @@ _PARTS = (
         ),
     ),
     Part(
+        "gain_model",
+        "The reduction that the gain ratio rho expects of a step p.",
+        (
+            Choice("undamped", "-g'p - 1/2 p'H p, as Nielsen writes the policy"),
+            Choice("damped", "-g'p - 1/2 p'(H + mu D)p, that of the equations which p solves", "3.102, 3.104, 3.105"),
+        ),
+    ),
+    Part(
         "trust_region",
         "D of the region (no further than the radius in D p), and of the scaled space in which PCG works.",
         (

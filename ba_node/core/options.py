@@ -24,6 +24,7 @@ class SolverOptions:
         damping: D of the damping.
         damping_policy: how mu follows the gain ratio.
         initial_damping: first mu.
+        gain_model: which reduction the gain ratio expects.
         trust_region: D of the region.
         initial_radius: first radius, in units of the scaled step.
         schur: which unknowns are eliminated.
@@ -46,6 +47,7 @@ class SolverOptions:
     damping: str = "diag"
     damping_policy: str = "fast"
     initial_damping: float = 1e-4
+    gain_model: str = "undamped"
     trust_region: str = "none"
     initial_radius: float = 1e4
     schur: str = "points"

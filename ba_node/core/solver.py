@@ -5,10 +5,13 @@
 Each outer iteration linearises, damps (``H + mu D``), eliminates the points (or the keyframes, or nothing), solves
 what is left by Cholesky or by PCG inside ``|D x| <= radius``, substitutes back, and judges the step by the gain ratio
 
-    rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2)          (3.90, 3.104)
+    rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2)                   gain_model = undamped
+    rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2 - mu/2 p'D p)      gain_model = damped    (3.90, 3.102, 3.104)
 
-in which F is the true robust objective and the denominator is the undamped model at the step that was really taken,
-so that it holds for inexact steps too (for an exact step of the points it equals (3.102)). rho > 0: the step is taken.
+in which F is the true robust objective and the denominator is the model at the step that was really taken, so that it
+holds for inexact steps too. rho > 0: the step is taken. The two differ where damping is all that holds a step back, as
+that of points far away: there p = -g / mu, the objective falls by |g|^2 / mu, and rho is 1 or 2. Nielsen's policy then
+lets mu fall by its most, a third, with the damped model alone.
 Radius (Algorithm 2): rho < 1/4: radius / 4; rho > 3/4 on the boundary: radius * 2.
 Damping: ``nielsen`` (Algorithm 6): rho > 0: mu *= max(1/3, 1 - (2 rho - 1)^3), nu = 2, else mu *= nu, nu *= 2;
 ``fast``: the same, but mu / 5 where rho > 1/2.
@@ -173,6 +176,8 @@ class _Run:
         if solution.x is None:
             return self._judge(-1.0, solution), solution
         step_c, step_p, predicted = system.back_substitute(solution.x)
+        if self.options.gain_model == "damped":
+            predicted -= 0.5 * self.mu * float(np.sum(d_c * step_c**2) + np.sum(d_p * step_p**2))
         candidate = self._retract(step_c, step_p)
         if not candidate.is_finite():
             return self._judge(-1.0, solution), solution

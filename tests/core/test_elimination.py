@@ -106,6 +106,25 @@ def test_reduction_of_the_reduced_model_is_that_of_the_full_one(shape: dict[str,
         assert reduction == pytest.approx(full, rel=1e-8)
 
 
+@pytest.mark.parametrize("mu", [1e-6, 1e-2, 1e3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_reduction_of_the_damped_model(mu: float, shape: dict[str, object], make_problem: Make) -> None:
+    """(3.102) of H + mu D: what Algorithm 4 hands on to the gain ratio is the undamped reduction less mu/2 p'D p."""
+    problem, _ = make_problem(**shape)
+    system, h, g = damped(problem, "points", mu, Rules())
+    n_c = len(system.rhs)
+    g_p = g[n_c:]
+    for seed in range(3):
+        x = np.random.default_rng(seed).normal(size=n_c) * 1e-3
+        step_c, step_p, undamped = system.back_substitute(x)
+        step = np.concatenate([step_c.ravel(), step_p.ravel()])
+        plain, _ = dense_equations(problem, Rules())
+        held = 0.5 * step @ (h - plain) @ step
+        constant = 0.5 * g_p @ np.linalg.solve(h[n_c:, n_c:], g_p)
+        own = system.rhs @ x - 0.5 * x @ system.dense() @ x
+        assert own + constant == pytest.approx(undamped - held, rel=1e-7, abs=1e-9 * abs(undamped))
+
+
 @pytest.mark.parametrize("preconditioner", PRECONDITIONERS)
 @pytest.mark.parametrize("side", ["points", "cameras", "none"])
 @pytest.mark.parametrize("space", ["identity", "diag", "inc"])
