@@ -35,6 +35,25 @@ class Demands:
     space: str = "none"
 
 
+@dataclass(frozen=True)
+class Moved:
+    """What a step did.
+
+    Attributes:
+        state: after the step and the polishing of points.
+        predicted: by what the undamped model said the objective would fall, ``-g'p - 1/2 |J p|^2``.
+        damping: ``1/2 mu p'D p``, which the damped model adds.
+        unpolished: objective after the step alone; NaN if the state is not finite.
+        objective: objective of ``state``; NaN if that is not finite.
+    """
+
+    state: State
+    predicted: float
+    damping: float
+    unpolished: float
+    objective: float
+
+
 class System(Protocol):
     """A damped system ``S x = rhs`` after elimination of the points, of the keyframes, or of nothing.
 
@@ -50,6 +69,9 @@ class System(Protocol):
 
     def dense(self) -> FloatArray:
         """Return S, (n, n)."""
+
+    def solve_dense(self) -> FloatArray | None:
+        """Return the solution by dense Cholesky; None if S is not positive definite."""
 
     def sparse(self) -> scipy.sparse.spmatrix:
         """Return S, sparse."""
@@ -97,6 +119,15 @@ class Kernels(Protocol):
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
         """Add damping to the diagonals and eliminate."""
+
+    def damp(self, kind: str, mu: float) -> System:
+        """Add mu D, with D a choice of damping, to the diagonals and eliminate."""
+
+    def move(self, state: State, system: System, x: FloatArray, polish_steps: int) -> Moved:
+        """Take the step whose part in ``system`` is x, and polish the points after it.
+
+        The kernels may write over what this returned two calls before.
+        """
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ba_node import native
-from ba_node.core.kernels import Demands, Kernels, System
+from ba_node.core import scaling
+from ba_node.core.kernels import Demands, Kernels, Moved, System
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Rules, reprojection_errors
@@ -106,8 +106,9 @@ class NativeKernels:
         )
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
-        # S is written to the same memory in every iteration.
-        self._dense = np.empty((0, 0))
+        self._system = _NativeSystem(self._kernel, self.size)
+        # Where steps lead, in turn: the state that a step starts from is one of them.
+        self._states = [_like(problem.start), _like(problem.start)]
 
     def graduate(self, graduation: float) -> None:
         """Do nothing: these kernels have no truncated quadratic."""
@@ -126,13 +127,21 @@ class NativeKernels:
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
         """Add damping to the diagonals and eliminate the points."""
         self._kernel.factor(damping_c, damping_p)
-        return _NativeSystem(self._kernel, self.size, self._matrix)
+        return self._system.renew()
 
-    def _matrix(self) -> FloatArray:
-        n = self.n_free * self.size
-        if len(self._dense) != n:
-            self._dense = np.empty((n, n))
-        return self._dense
+    def damp(self, kind: str, mu: float) -> System:
+        """Add mu D, with D a choice of damping, to the diagonals and eliminate the points."""
+        if kind == "inc":
+            d_c, d_p = scaling.diagonals(kind, self.diagonals())
+            return self.reduce(mu * d_c, mu * d_p)
+        self._kernel.damp(kind == "diag", 0.0 if kind == "none" else mu)
+        return self._system.renew()
+
+    def move(self, state: State, _system: System, x: FloatArray, polish_steps: int) -> Moved:
+        """Take the step whose part in the system is x, and polish the points after it; see Kernels."""
+        target = self._states[self._states[0] is state]
+        predicted, damping, value, polished = self._kernel.move(_arrays(state), x, polish_steps, _arrays(target))
+        return Moved(target, predicted, damping, value, polished)
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
@@ -149,22 +158,41 @@ def _arrays(state: State) -> tuple[FloatArray, ...]:
     return state.rotation, state.translation, state.points, state.intrinsics
 
 
+def _like(state: State) -> State:
+    """Return room for a state of the same size."""
+    return State(*(np.empty(array.shape) for array in _arrays(state)))
+
+
 class _NativeSystem:
     """The kernel's current reduced system; valid until the next linearisation or reduction."""
 
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, kernel: Any, size: int, memory: Callable[[], FloatArray]) -> None:
-        self._kernel, self._size, self._memory = kernel, size, memory
-        self.rhs: FloatArray = kernel.rhs()
+    def __init__(self, kernel: Any, size: int) -> None:
+        self._kernel, self._size = kernel, size
+        n = kernel.n_free * size
+        self.rhs: FloatArray = np.empty(n)
         self.product = kernel.product
+        # These are written in every iteration; S only where it is asked for.
+        self._x, self._dense = np.empty(n), np.empty((0, 0))
+
+    def renew(self) -> System:
+        """Return the system after another reduction."""
+        self._kernel.rhs(self.rhs)
+        return self
 
     def dense(self) -> FloatArray:
         """Return S, (n, n); the next call writes over it."""
-        matrix = self._memory()
-        self._kernel.dense(matrix)
-        return matrix
+        n = len(self.rhs)
+        if len(self._dense) != n:
+            self._dense = np.empty((n, n))
+        self._kernel.dense(self._dense)
+        return self._dense
+
+    def solve_dense(self) -> FloatArray | None:
+        """Return the solution by dense Cholesky, None if S is not positive definite; the next call writes over it."""
+        return self._x if self._kernel.solve(self._x) else None
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S, block-sparse."""

@@ -8,9 +8,9 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from ba_node.core import linear, polish
+from ba_node.core import linear, parameterisation, polish, scaling
 from ba_node.core.blocks import condition
-from ba_node.core.kernels import DENSE_LIMIT, Demands, System
+from ba_node.core.kernels import DENSE_LIMIT, Demands, Moved, System
 from ba_node.core.linear_costs import MAX_BYTES, Factor
 from ba_node.core.objective import Linearisation, Objective, Rules
 from ba_node.core.problem import Problem, State
@@ -38,10 +38,12 @@ class NumpyKernels:
         self._structure = Structure(problem)
         self._objective = Objective(problem, rules)
         self._demands = demands
+        self._free = np.flatnonzero(~problem.fixed)
         self.n_free, self.size = self._structure.n_free, self._structure.size
         self.gradient_norm = np.inf
         self._linearisation: Linearisation
         self._equations: NormalEquations
+        self._damping: tuple[FloatArray, FloatArray]
 
     def graduate(self, graduation: float) -> None:
         """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself."""
@@ -67,6 +69,38 @@ class NumpyKernels:
         system = _NumpySystem(reduction, self._structure, self._equations, self._linearisation)
         system.radius_factor = factor
         return system
+
+    def damp(self, kind: str, mu: float) -> System:
+        """Add mu D, with D a choice of damping, to the diagonals and eliminate."""
+        d_c, d_p = scaling.diagonals(kind, self.diagonals())
+        self._damping = mu * d_c, mu * d_p
+        return self.reduce(*self._damping)
+
+    def move(self, state: State, system: System, x: FloatArray, polish_steps: int) -> Moved:
+        """Take the step whose part in ``system`` is x, and polish the points after it."""
+        step_c, step_p, predicted = system.back_substitute(x)
+        d_c, d_p = self._damping
+        damping = 0.5 * float(np.sum(d_c * step_c**2) + np.sum(d_p * step_p**2))
+        moved = self._retract(state, step_c, step_p)
+        if not moved.is_finite():
+            return Moved(moved, predicted, damping, np.nan, np.nan)
+        value = polished = self.objective(moved)
+        if polish_steps:
+            polished, moved = self.polish_points(moved, polish_steps)
+        return Moved(moved, predicted, damping, value, polished)
+
+    def _retract(self, state: State, step_c: FloatArray, step_p: FloatArray) -> State:
+        """Return the state after a step (n_free, d) and (n_points, 3)."""
+        free = self._free
+        rotation, translation = state.rotation.copy(), state.translation.copy()
+        rotation[free], translation[free] = parameterisation.retract(
+            self._objective.rules.parameterisation, rotation[free], translation[free], step_c[:, :6]
+        )
+        intrinsics = state.intrinsics
+        if len(intrinsics):
+            intrinsics = intrinsics.copy()
+            intrinsics[free] += step_c[:, 6:]
+        return State(rotation, translation, state.points + step_p, intrinsics)
 
     def _adapt(self, damping_c: FloatArray, damping_p: FloatArray) -> tuple[str, float]:
         """Return the side to eliminate and what the radius becomes there (Algorithm 10).
@@ -110,6 +144,10 @@ class _NumpySystem:
         self._matrix: scipy.sparse.bsr_matrix | None = None
         if self.side == "points" and structure.form_schur and len(self.rhs) > DENSE_LIMIT:
             self._matrix = reduction.sparse()
+
+    def solve_dense(self) -> FloatArray | None:
+        """Return the solution by dense Cholesky; None if S is not positive definite."""
+        return linear.cholesky(self.dense(), self.rhs).x
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""

@@ -11,6 +11,7 @@ region D is that of the damping (Algorithm 7).
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from ba_node.core.kernels import DENSE_LIMIT, System
 from ba_node.core.options import SolverOptions
 
 FloatArray = NDArray[np.float64]
+Hessian = Callable[[], tuple[FloatArray, FloatArray]]
 
 
 class ReducedSolver:
@@ -35,12 +37,12 @@ class ReducedSolver:
         self._options = options
         self.kind, self.text = "", ""
 
-    def solve(self, system: System, hessian: tuple[FloatArray, FloatArray], radius: float) -> linear.Solution:
+    def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
 
         Args:
             system: damped.
-            hessian: diag(B) and diag(C), not damped.
+            hessian: returns diag(B) and diag(C), not damped.
             radius: of the region, in the scaled space; infinite for none.
         """
         if len(system.rhs) == 0:
@@ -48,12 +50,12 @@ class ReducedSolver:
         if not self.kind:
             self._choose(system)
         if self.kind == "dense":
-            return linear.cholesky(system.dense(), system.rhs)
+            return linear.Solution(system.solve_dense())
         if self.kind == "sparse":
             x = system.solve_sparse()
             return linear.Solution(x if x is not None and np.isfinite(x).all() else None)
         options = self._options
-        scale = 1.0 / system.gather(*scaling.scaled_space(options.demands.space, hessian))
+        scale = 1.0 / system.gather(*scaling.scaled_space(options.demands.space, hessian()))
         radius *= system.radius_factor
         limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius, options.q_eps)
         precondition = preconditioner(options.preconditioner, system, scale)

@@ -27,16 +27,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ba_node.core import linear, native_kernels, parameterisation, scaling
+from ba_node.core import linear, native_kernels
 from ba_node.core.annealing import Annealing
 from ba_node.core.options import SolverOptions
-from ba_node.core.problem import Problem, State
+from ba_node.core.problem import Problem
 from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Iteration, Result, Status
-
-FloatArray = NDArray[np.float64]
 
 # The gain ratio of a step that only the polished points made good: taken, but not much trusted.
 _SAVED_RHO = 0.3
@@ -98,7 +95,6 @@ class _Run:
         with np.errstate(all="ignore"):
             self.kernels = native_kernels.make(problem, options.rules, options.backend, options.demands)
         self.reduced = ReducedSolver(options)
-        self.free = np.flatnonzero(~problem.fixed)
         self.state = problem.start
         self.value = np.inf
         self.mu, self.nu = options.initial_damping, 2.0
@@ -168,43 +164,22 @@ class _Run:
 
     def _step(self) -> tuple[bool, linear.Solution]:
         """Try one step; update state, damping and radius. Return whether it was taken."""
-        hessian = self.kernels.diagonals()
-        d_c, d_p = scaling.diagonals(self.options.damping, hessian)
-        system = self.kernels.reduce(self.mu * d_c, self.mu * d_p)
+        system = self.kernels.damp(self.options.damping, self.mu)
         self.side = system.side
-        solution = self.reduced.solve(system, hessian, self.radius)
+        solution = self.reduced.solve(system, self.kernels.diagonals, self.radius)
         if solution.x is None:
             return self._judge(-1.0, solution), solution
-        step_c, step_p, predicted = system.back_substitute(solution.x)
-        if self.options.gain_model == "damped":
-            predicted -= 0.5 * self.mu * float(np.sum(d_c * step_c**2) + np.sum(d_p * step_p**2))
-        candidate = self._retract(step_c, step_p)
-        if not candidate.is_finite():
-            return self._judge(-1.0, solution), solution
-        value = self.kernels.objective(candidate)
-        rho = (self.value - value) / predicted if np.isfinite(value) and predicted > 0 else -1.0
-        if self.options.polish_steps:
-            polished, moved = self.kernels.polish_points(candidate, self.options.polish_steps)
-            if np.isfinite(polished) and polished < min(value, self.value) and moved.is_finite():
-                rho = max(rho, (self.value - polished) / predicted) if rho > 0 else _SAVED_RHO
-                candidate, value = moved, polished
+        moved = self.kernels.move(self.state, system, solution.x, self.options.polish_steps)
+        rho = -1.0
+        predicted = moved.predicted - (moved.damping if self.options.gain_model == "damped" else 0.0)
+        if np.isfinite(moved.unpolished) and predicted > 0:
+            rho = (self.value - moved.unpolished) / predicted
+        if moved.objective < min(moved.unpolished, self.value):
+            rho = max(rho, (self.value - moved.objective) / predicted) if rho > 0 else _SAVED_RHO
         accepted = self._judge(rho, solution)
         if accepted:
-            self.state, self.value = candidate, value
+            self.state, self.value = moved.state, moved.objective
         return accepted, solution
-
-    def _retract(self, step_c: FloatArray, step_p: FloatArray) -> State:
-        """Return the state after a step (n_free, d) and (n_points, 3)."""
-        state, free = self.state, self.free
-        rotation, translation = state.rotation.copy(), state.translation.copy()
-        rotation[free], translation[free] = parameterisation.retract(
-            self.options.rules.parameterisation, rotation[free], translation[free], step_c[:, :6]
-        )
-        intrinsics = state.intrinsics
-        if len(intrinsics):
-            intrinsics = intrinsics.copy()
-            intrinsics[free] += step_c[:, 6:]
-        return State(rotation, translation, state.points + step_p, intrinsics)
 
     def _judge(self, rho: float, solution: linear.Solution) -> bool:
         """Update damping and radius from the gain ratio; return whether the step is taken."""

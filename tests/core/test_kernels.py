@@ -16,7 +16,7 @@ from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Objective, Rules
 from ba_node.core.options import SolverOptions
-from ba_node.core.problem import Problem, State
+from ba_node.core.problem import Observations, Problem, State
 from ba_node.core.result import Status
 
 Make = Callable[..., tuple[Problem, State]]
@@ -93,6 +93,70 @@ def test_native_polishes_as_numpy_does(shape: dict[str, object], rules: Rules, m
     (value_a, state_a), (value_b, state_b) = (k.polish_points(problem.start, 3) for k in (oracle, kernels))
     assert value_b == pytest.approx(value_a, rel=1e-9)
     near(state_a.points, state_b.points, 1e-7)
+
+
+@built
+@pytest.mark.parametrize("damping", ["none", "identity", "diag", "inc"])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make_problem: Make) -> None:
+    """Damping, dense Cholesky, and the state after the step with and without polishing; fixed keyframes stay."""
+    problem, _ = make_problem(start_error=0.02, **shape)
+    both = pair(problem, Rules(loss="huber"))
+    for polish_steps in (0, 3):
+        systems = [kernels.damp(damping, 1e-2) for kernels in both]
+        near(systems[0].dense(), systems[1].dense())
+        near(systems[0].rhs, systems[1].rhs)
+        steps = [system.solve_dense() for system in systems]
+        if steps[0] is None or steps[1] is None:
+            assert damping == "none", "a damped system is positive definite"
+            continue
+        near(steps[0], steps[1], 1e-6)
+        a, b = (
+            kernels.move(problem.start, system, steps[0], polish_steps)
+            for kernels, system in zip(both, systems, strict=True)
+        )
+        assert b.predicted == pytest.approx(a.predicted, rel=1e-6)
+        assert b.damping == pytest.approx(a.damping, rel=1e-6, abs=1e-300)
+        assert b.unpolished == pytest.approx(a.unpolished, rel=1e-6)
+        assert b.objective == pytest.approx(a.objective, rel=1e-6)
+        assert (b.objective == b.unpolished) == (polish_steps == 0)
+        for field in dataclasses.fields(State):
+            near(getattr(a.state, field.name), getattr(b.state, field.name), 1e-6)
+        np.testing.assert_array_equal(b.state.rotation[problem.fixed], problem.start.rotation[problem.fixed])
+
+
+@built
+def test_a_step_that_is_not_finite_has_no_objective(make_problem: Make) -> None:
+    problem, _ = make_problem()
+    for kernels in pair(problem, Rules()):
+        system = kernels.damp("diag", 1e-3)
+        moved = kernels.move(problem.start, system, np.full(len(system.rhs), np.nan), 3)
+        assert np.isnan(moved.unpolished) and np.isnan(moved.objective)
+
+
+@built
+@pytest.mark.parametrize("n", [1, 7, 8, 9, 25, 65, 130])
+def test_dense_cholesky_of_any_size(n: int, make_problem: Make) -> None:
+    """Sizes around those of registers and blocks: n free keyframes, 6 n unknowns."""
+    small, _ = make_problem()
+    times = -(-n // small.n_keyframes)
+    start, obs = small.start, small.observations
+    count = small.n_keyframes * times
+    state = State(
+        np.tile(start.rotation, (times, 1, 1)),
+        np.tile(start.translation, (times, 1)),
+        np.tile(start.points, (times, 1)),
+        start.intrinsics,
+    )
+    names = ("camera", "uv", "sigma_px", "depth_m", "depth_sigma_m")
+    copies = {name: np.concatenate([getattr(obs, name)] * times) for name in names}
+    copies["keyframe"] = np.concatenate([obs.keyframe + i * small.n_keyframes for i in range(times)])
+    copies["point"] = np.concatenate([obs.point + i * small.n_points for i in range(times)])
+    problem = Problem(state, np.arange(count) >= n, small.cameras, Observations(**copies))
+    system = pair(problem, Rules())[1].damp("diag", 1e-3)
+    x = system.solve_dense()
+    assert x is not None and len(x) == 6 * n
+    near(system.dense() @ x, system.rhs, 1e-9)
 
 
 @built

@@ -13,21 +13,30 @@
 #include <vector>
 
 #include "blocks.hpp"
+#include "cholesky.hpp"
 #include "equations.hpp"
 #include "layout.hpp"
 #include "polish.hpp"
 #include "pool.hpp"
+#include "retract.hpp"
 #include "rows.hpp"
 #include "sparse_schur.hpp"
 
 namespace ba {
+
+// What a step did: by what the model said the objective would fall, and the objective before and after the polishing.
+struct Moved {
+  double predicted = 0;
+  double damping = 0;  // 1/2 p' D p
+  Polished objective{std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::quiet_NaN()};
+};
 
 template <int D>
 class Kernel {
  public:
   Kernel(const ProblemView& problem, const Rules& rules, const StateView& start, int threads)
       : l_(problem, D == 9), rows_(l_, rules, start), pool_(threads), equations_(l_) {
-    row_.resize(pool_.threads() * l_.n_free);
+    column_.resize(pool_.threads() * l_.n_free);
     rhs_.resize(l_.n_free);
     step_.resize(l_.n_free);
     sums_.resize(l_.n_chunks() * l_.n_free);
@@ -103,26 +112,19 @@ class Kernel {
   // Add damping to the diagonals and factor C; everything below is of this damped system.
   void factor(const double* damping_c, const double* damping_p) {
     std::copy_n(damping_c, l_.n_free * D, damping_c_.data());
-    edges_kept_ = false;
-    const bool depth = l_.has_depth;
-    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-      clear(&sums_[chunk * l_.n_free], l_.n_free);
-      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 damping[3];
-        rows_.load_points(i, damping_p, damping);
-        if (depth || l_.has_rigs) {
-          factor_batch<true>(i, damping, &sums_[chunk * l_.n_free]);
-        } else {
-          factor_batch<false>(i, damping, &sums_[chunk * l_.n_free]);
-        }
-      }
+    factor_points([&](std::int64_t i, V8(&damping)[3]) { rows_.load_points(i, damping_p, damping); });
+  }
+
+  // The same with mu times the diagonal itself, or the identity.
+  void damp(bool diagonal, double mu) {
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      for (int i = 0; i < D; ++i)
+        damping_c_[k * D + i] = mu * (diagonal ? std::max(entry(equations_.b[k], i, i), kMinDiagonal) : 1.0);
+    factor_points([&](std::int64_t i, V8(&damping)[3]) {
+      const V8* c = &equations_.c[6 * i];
+      const V8 d[3] = {c[0], c[2], c[5]};
+      for (int j = 0; j < 3; ++j) damping[j] = mu * (diagonal ? maximum(d[j], splat(kMinDiagonal)) : splat(1.0));
     });
-    // -gc + Z L^-1 gp.
-    for (std::int64_t k = 0; k < l_.n_free; ++k) {
-      rhs_[k].a = -equations_.gradient_c[k].a;
-      if constexpr (D == 9) rhs_[k].b = -equations_.gradient_c[k].b;
-    }
-    add_sums(rhs_.data());
   }
 
   void rhs(double* out) const {
@@ -133,19 +135,27 @@ class Kernel {
   // S, symmetric, (n x n), n = n_free D.
   void dense(double* out) {
     const std::int64_t n = l_.n_free * D;
-    keep_edges();
-    pool_.each(l_.n_free, [&](std::int64_t i, int thread) {
-      Block<D>* row = &row_[thread * l_.n_free];
-      clear(row + i, l_.n_free - i);
-      add_row(i, [row](std::int32_t j) -> Block<D>& { return row[j]; });
-      for (std::int64_t j = i; j < l_.n_free; ++j) {
-        double* block = out + i * D * n + j * D;
-        write_block(row[j], block, n);
-        if (j == i) add_diagonal(i, block, n);
-        for (int r = 0; r < D; ++r)
-          for (int c = 0; c < D; ++c) out[(j * D + c) * n + i * D + r] = block[r * n + c];
-      }
+    each_block([&](std::int64_t j, std::int64_t i, const double* block) {
+      for (int r = 0; r < D; ++r)
+        for (int c = 0; c < D; ++c)
+          out[(j * D + r) * n + i * D + c] = out[(i * D + c) * n + j * D + r] = block[r * D + c];
     });
+  }
+
+  // Solve S x = rhs by dense Cholesky; false if S is not positive definite.
+  bool solve(double* x) {
+    const std::int64_t n = l_.n_free * D;
+    cholesky_.resize(n);
+    each_block([&](std::int64_t j, std::int64_t i, const double* block) {
+      for (int c = 0; c < D; ++c)
+        for (int r = (j == i ? c : 0); r < D; ++r) cholesky_.at(j * D + r, i * D + c) = block[r * D + c];
+    });
+    if (!cholesky_.factor(pool_)) return false;
+    rhs(x);
+    cholesky_.solve(x);
+    for (std::int64_t i = 0; i < n; ++i)
+      if (!std::isfinite(x[i])) return false;
+    return true;
   }
 
   // S by blocks, and its factor if it meets the limits; found once.
@@ -227,7 +237,7 @@ class Kernel {
     cut_rows();
     pool_.each(pool_.threads(), [&](std::int64_t part, int thread) {
       const std::int64_t begin = rows_cut_[part], end = rows_cut_[part + 1];
-      Block<D>* own = &row_[thread * l_.n_free];
+      Block<D>* own = &column_[thread * l_.n_free];
       clear(own + begin, end - begin);
       with_edges(begin, end, thread, [&](std::int64_t p, const Edge<D>* z) {
         for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e, ++z) {
@@ -242,37 +252,83 @@ class Kernel {
     });
   }
 
-  // Step of the points for a step of the free keyframes (n_free x D); returns the reduction of the undamped model.
+  // Step of the points for a step of the free keyframes (n_free x D), added to `base` unless that is null; returns the
+  // reduction of the undamped model.
   //
   // With y = L^-1 gp, v = Z' step_c and w = -(y + v) the points' step is p = L^-T w, and as C + D = L L' the model's
   // curvature is step_c' B step_c + 2 w'v + |w|^2 - p' D p: E is not needed.
-  double back_substitute(const double* step_c, double* step_p) {
+  double back_substitute(const double* step_c, const double* base, double* out) {
     load_step(step_c);
     pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-      V8 slope{}, curvature{};
+      V8 slope{}, curvature{}, damping{};
       for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 v[3], w[3], x[3];
+        V8 v[3], w[3], p[3], x[3] = {};
         project_step(i, v);
         const V8 *y = &scaled_gradient_[3 * i], *g = &equations_.gradient_p[3 * i], *d = &damping_p_[3 * i];
         for (int c = 0; c < 3; ++c) w[c] = -(y[c] + v[c]);
-        upper_times(*reinterpret_cast<const Packed*>(&inverse_l_[6 * i]), w, x);
-        rows_.store_points(i, x, step_p);
+        upper_times(*reinterpret_cast<const Packed*>(&inverse_l_[6 * i]), w, p);
         for (int c = 0; c < 3; ++c) {
-          slope += g[c] * x[c];
-          curvature += w[c] * (2 * v[c] + w[c]) - d[c] * x[c] * x[c];
+          slope += g[c] * p[c];
+          curvature += w[c] * (2 * v[c] + w[c]) - d[c] * p[c] * p[c];
+          damping += d[c] * p[c] * p[c];
         }
+        if (base != nullptr) rows_.load_points(i, base, x);
+        for (int c = 0; c < 3; ++c) x[c] += p[c];
+        rows_.store_points(i, x, out);
       }
-      part_[chunk].after = -sum(slope) - 0.5 * sum(curvature);
+      part_[chunk] = {0.5 * sum(damping), -sum(slope) - 0.5 * sum(curvature)};
     });
     double reduction = total().after;
+    damping_cost_ = total().before;
+    for (std::int64_t i = 0; i < l_.n_free * D; ++i) damping_cost_ += 0.5 * damping_c_[i] * step_c[i] * step_c[i];
     for (std::int64_t k = 0; k < l_.n_free; ++k)
       reduction -= dot(equations_.gradient_c[k], step_[k]) + 0.5 * dot(multiply(equations_.b[k], step_[k]), step_[k]);
     return reduction;
   }
 
+  // Take a step of the free keyframes (n_free x D) and those of the points that go with it from `from` to `to`, and
+  // polish the points after it. Objectives are not numbers where the state after the step is not finite.
+  Moved move(const StateView& from, const double* step_c, int steps, const StateSpan& to) {
+    Moved out;
+    out.predicted = back_substitute(step_c, from.points, to.points);
+    out.damping = damping_cost_;
+    retract_keyframes(l_, from, step_c, D, to);
+    const bool finite = all_finite(to.points, 3 * l_.n_points) && all_finite(to.rotation, 9 * l_.n_keyframes) &&
+                        all_finite(to.translation, 3 * l_.n_keyframes) &&
+                        (!l_.own_intrinsics || all_finite(to.intrinsics, 3 * l_.n_keyframes));
+    if (!finite) return out;
+    const StateView s{to.rotation, to.translation, to.points, to.intrinsics};
+    if (steps > 0) {
+      out.objective = polish_points(s, to.points, steps);
+    } else {
+      out.objective.before = out.objective.after = objective(s);
+    }
+    return out;
+  }
+
  private:
+  // damping(batch, out): of the points of a batch.
+  template <class Damping>
+  void factor_points(Damping damping) {
+    edges_kept_ = false;
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+      Column<D>* sums = &sums_[chunk * l_.n_free];
+      clear(sums, l_.n_free);
+      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+        V8 d[3];
+        damping(i, d);
+        factor_batch(i, d, sums);
+      }
+    });
+    // -gc + Z L^-1 gp.
+    for (std::int64_t k = 0; k < l_.n_free; ++k) {
+      rhs_[k].a = -equations_.gradient_c[k].a;
+      if constexpr (D == 9) rhs_[k].b = -equations_.gradient_c[k].b;
+    }
+    add_sums(rhs_.data());
+  }
+
   // L^-1 and y = L^-1 gp of a batch; adds Z y to `sums`.
-  template <bool kGeneral>
   void factor_batch(std::int64_t batch, const V8 (&damping)[3], Column<D>* sums) {
     Packed& li = *reinterpret_cast<Packed*>(&inverse_l_[6 * batch]);
     V8 g[3], y[3], p[3];
@@ -480,13 +536,41 @@ class Kernel {
     lower_times(*reinterpret_cast<const Packed*>(&inverse_l_[6 * batch]), z, out);
   }
 
-  // Row i of -Z Z' from the diagonal on; `block` finds the block of a column.
+  // Call take(j, i, block) for all blocks of S with j >= i, D x D row by row; columns i at the same time.
+  template <class Take>
+  void each_block(Take take) {
+    keep_edges();
+    pool_.each(l_.n_free, [&](std::int64_t i, int thread) {
+      Block<D>* column = &column_[thread * l_.n_free];
+      clear(column + i, l_.n_free - i);
+      add_column(i, [column](std::int32_t j) -> Block<D>& { return column[j]; });
+      double block[D * D];
+      for (std::int64_t j = i; j < l_.n_free; ++j) {
+        write_block(column[j], block, D);
+        if (j == i) add_diagonal(i, block, D);
+        take(j, i, block);
+      }
+    });
+  }
+
+  // Column i of -Z Z' from the diagonal on: `block` finds that of a row.
   template <class Find>
-  void add_row(std::int64_t i, Find block) const {
+  void add_column(std::int64_t i, Find block) const {
     for (std::int64_t k = l_.keyframe_edge[i]; k < l_.keyframe_edge[i + 1]; ++k) {
       const std::int32_t e = l_.edges_of_keyframe[k], end = l_.edge_end[e];
-      for (std::int32_t f = e; f < end; ++f) subtract_product(block(l_.edge_column[f]), z_[e], z_[f]);
+      prefetch(k + kAhead);
+      const std::int32_t* column = &l_.edge_column[e];
+      subtract_products(z_[e], &z_[e], end - e, [&](int f) -> Block<D>& { return block(column[f]); });
     }
+  }
+
+  // Ask for the edges that row i needs soon: they lie scattered, and there is little to do meanwhile.
+  void prefetch(std::int64_t k) const {
+    if (k >= l_.n_edges()) return;
+    const std::int32_t e = l_.edges_of_keyframe[k];
+    const char* first = reinterpret_cast<const char*>(&z_[e]);
+    const char* end = reinterpret_cast<const char*>(&z_[e] + std::min(l_.edge_end[e] - e, kMaxFetched));
+    for (const char* line = first; line < end; line += 64) __builtin_prefetch(line);
   }
 
   // Rows of S for each thread, about as many pairs of edges for each. What a row sums does not depend on it.
@@ -560,17 +644,22 @@ class Kernel {
     }
   }
 
+  double damping_cost_ = 0;
+  static constexpr std::int64_t kAhead = 4;
+  static constexpr std::int32_t kMaxFetched = 8;
+
   Layout l_;
   Rows rows_;
   Pool pool_;
   Equations<D> equations_;
+  DenseCholesky cholesky_;
   Buffer<Edge<D>> z_;
   std::vector<Buffer<Edge<D>>> scratch_;  // of each thread: Z of a batch
   std::int64_t most_edges_ = 0;
   bool edges_kept_ = false;
   std::vector<std::int64_t> rows_cut_;
   std::vector<std::int32_t> image_column_, first_column_, last_column_;
-  Buffer<Block<D>> row_;
+  Buffer<Block<D>> column_;
   Buffer<Column<D>> rhs_, step_, sums_;  // sums_: of each chunk
   Buffer<V8> inverse_l_, scaled_gradient_, damping_p_;
   std::vector<double> damping_c_;

@@ -74,6 +74,8 @@ class Layout {
   // Observations (8 slot + lane) by free keyframe, and their points (of ours), filled up to whole registers by -1.
   std::vector<std::int64_t> keyframe_seen;
   std::vector<std::int32_t> seen, seen_point;
+  // The caller's number of each free keyframe.
+  std::vector<std::int64_t> free_keyframe;
   // Images: distinct keyframe * n_cameras + camera.
   std::vector<std::int64_t> images;
   // Parts of the batches, about equal, that can be worked on at the same time; the problem alone decides them.
@@ -115,8 +117,11 @@ class Layout {
 
   void number_keyframes(const ProblemView& p) {
     column_.assign(n_keyframes, -1);
-    for (std::int64_t k = 0; k < n_keyframes; ++k)
-      if (!p.fixed[k]) column_[k] = static_cast<std::int32_t>(n_free++);
+    for (std::int64_t k = 0; k < n_keyframes; ++k) {
+      if (p.fixed[k]) continue;
+      column_[k] = static_cast<std::int32_t>(n_free++);
+      free_keyframe.push_back(k);
+    }
   }
 
   // Order of the observations by (point, keyframe); empty if that is theirs already, as in the back-end's windows.

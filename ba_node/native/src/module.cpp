@@ -147,17 +147,36 @@ void bind(py::module_& m, const char* name) {
              py::gil_scoped_release release;
              k.factor(c, p);
            })
-      .def("rhs",
-           [](const K& k) {
-             Doubles out = empty({k.n_free() * D});
-             k.rhs(out.mutable_data());
-             return out;
+      .def("damp",
+           [](K& k, bool diagonal, double mu) {
+             py::gil_scoped_release release;
+             k.damp(diagonal, mu);
            })
+      .def("move",
+           [](K& k, const StateArrays& from, const Doubles& step_c, int steps, StateArrays to) {
+             const ba::StateSpan span{std::get<0>(to).mutable_data(), std::get<1>(to).mutable_data(),
+                                      std::get<2>(to).mutable_data(), std::get<3>(to).mutable_data()};
+             const double* step = step_c.data();
+             ba::Moved moved;
+             {
+               py::gil_scoped_release release;
+               moved = k.move(view(from), step, steps, span);
+             }
+             return py::make_tuple(moved.predicted, moved.damping, moved.objective.before, moved.objective.after);
+           })
+      .def("rhs",
+           [](const K& k, py::array_t<double, py::array::c_style> out) { k.rhs(out.mutable_data()); })
       .def("dense",
            [](K& k, py::array_t<double, py::array::c_style> out) {
              double* s = out.mutable_data();
              py::gil_scoped_release release;
              k.dense(s);
+           })
+      .def("solve",
+           [](K& k, py::array_t<double, py::array::c_style> out) {
+             double* x = out.mutable_data();
+             py::gil_scoped_release release;
+             return k.solve(x);
            })
       .def("sparse", &sparse<D>)
       .def("analyse",
@@ -210,7 +229,7 @@ void bind(py::module_& m, const char* name) {
         double reduction = 0;
         {
           py::gil_scoped_release release;
-          reduction = k.back_substitute(in, out);
+          reduction = k.back_substitute(in, nullptr, out);
         }
         return py::make_tuple(step_p, reduction);
       });

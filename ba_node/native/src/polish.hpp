@@ -12,7 +12,7 @@
 
 namespace ba {
 
-constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4, kMinPromise = 1e-6;
+constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4, kMinPromise = 1e-8;
 
 // Objectives at the start and at the end.
 struct Polished {
