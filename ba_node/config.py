@@ -190,6 +190,13 @@ class SolverConfig:
         "Kernels: native (C++), numpy, or auto, which takes native where it is built.",
         choices=BACKENDS,
     )
+    threads: int = _param(
+        1,
+        "Threads of the C++ kernels, 0 for one a core. Results are the same, bit for bit, for any number;"
+        " one leaves the other cores to the front-end.",
+        minimum=0,
+        maximum=256,
+    )
     loss: str = _param("huber", "Robust loss on each residual.", choices=LOSSES)
     loss_scale_px: float = _param(
         1.0,

@@ -103,7 +103,8 @@ def _ba_node() -> tuple[list[Solver], list[str]]:
     reason = native.missing("local", "huber")
     if reason:
         return [Solver("ba_node numpy", command, "numpy")], [f"ba_node native: {reason}"]
-    return [Solver("ba_node", command, "native"), numpy], []
+    two = Solver("ba_node 2 threads", command, "native", threads=2, quick=False)
+    return [Solver("ba_node", command, "native"), two, numpy], []
 
 
 def _missing_modules(python: str, names: tuple[str, ...]) -> list[str]:

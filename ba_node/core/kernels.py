@@ -28,11 +28,13 @@ class Demands:
         schur: which unknowns are eliminated.
         preconditioner: M of PCG.
         space: D of the scaled space, as of scaling.scaled_space.
+        threads: of the C++ kernels; 0 for one a core. Results do not depend on it.
     """
 
     schur: str = "points"
     preconditioner: str = "none"
     space: str = "none"
+    threads: int = 1
 
 
 @dataclass(frozen=True)

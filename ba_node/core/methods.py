@@ -110,6 +110,7 @@ def from_config(config: SolverConfig) -> SolverOptions:
         annealing=chosen.annealing if keeps_loss else "none",
         backend=config.backend,
         linear_solver=linear_solver,
+        threads=config.threads,
         max_iterations=config.max_iterations,
         max_linear_iterations=config.max_linear_iterations,
         function_tolerance=config.function_tolerance,

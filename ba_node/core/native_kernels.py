@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def make(problem: Problem, rules: Rules, backend: str = "auto", demands: Demands
         raise KernelsError(f"backend native: {reason}; take numpy or auto")
     if backend == "numpy" or reason:
         return NumpyKernels(problem, rules, demands)
-    return NativeKernels(problem, rules)
+    return NativeKernels(problem, rules, demands.threads)
 
 
 def missing(rules: Rules, demands: Demands) -> str:
@@ -80,8 +81,8 @@ def residual_norms(problem: Problem, state: State, backend: str = "auto") -> Flo
 class NativeKernels:
     """The kernels in C++."""
 
-    def __init__(self, problem: Problem, rules: Rules) -> None:
-        """Hand the problem over; it is copied and sorted once."""
+    def __init__(self, problem: Problem, rules: Rules, threads: int = 1) -> None:
+        """Hand the problem over; it is copied and sorted once. threads: 0 for one a core."""
         obs, cams = problem.observations, problem.cameras
         self.size = 9 if problem.free_intrinsics else 6
         make_kernel = native.kernels.Kernel9 if problem.free_intrinsics else native.kernels.Kernel6
@@ -101,7 +102,7 @@ class NativeKernels:
             loss=_LOSSES.index(rules.loss),
             loss_scale=rules.loss_scale,
             cheirality=_CHEIRALITY.index(rules.cheirality),
-            threads=1,
+            threads=threads or len(os.sched_getaffinity(0)),
             start=_arrays(problem.start),
         )
         self.n_free: int = self._kernel.n_free

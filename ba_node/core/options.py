@@ -32,6 +32,7 @@ class SolverOptions:
         preconditioner: M of pcg.
         polish_steps: Newton steps of every point alone after each step of the keyframes; 0 for none.
         backend: which kernels work.
+        threads: of the C++ kernels; 0 for one a core. Results do not depend on it.
         t_eps: PCG stops at |r| <= min(t_eps, |b|) |b|.
         q_eps: PCG also stops where step i adds less than q_eps / i of what the model has gained; 0 for never.
         max_linear_iterations: cap on PCG steps in one outer iteration.
@@ -55,6 +56,7 @@ class SolverOptions:
     preconditioner: str = "schur_block"
     polish_steps: int = 3
     backend: str = "auto"
+    threads: int = 1
     t_eps: float = 0.1
     q_eps: float = 0.0
     max_linear_iterations: int = 500
@@ -67,7 +69,7 @@ class SolverOptions:
     def demands(self) -> Demands:
         """Return what the method asks of the kernels; without a region the scaled space is that of the damping."""
         space = self.damping if self.trust_region == "none" else self.trust_region
-        return Demands(self.schur, self.preconditioner, space)
+        return Demands(self.schur, self.preconditioner, space, self.threads)
 
     def check(self) -> None:
         """Raise ChoiceError if a choice does not exist or contradicts another; say which, and what to do."""

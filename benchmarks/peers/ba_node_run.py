@@ -25,6 +25,7 @@ def main() -> None:
         METHODS["auto"],
         rules=Rules(loss=args.loss, loss_scale=args.scale, cheirality="keep"),
         backend=args.config or "native",
+        threads=args.threads,
         max_iterations=args.iterations,
         function_tolerance=args.tolerance,
     )

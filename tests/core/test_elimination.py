@@ -142,7 +142,7 @@ def test_pcg_leaves_on_the_boundary(side: str, space: str, preconditioner: str, 
     options = SolverOptions(
         trust_region=space, linear_solver="pcg", preconditioner=preconditioner, t_eps=1e-9, max_linear_iterations=5000
     )
-    found = reduced.ReducedSolver(options).solve(system, hessian, radius)
+    found = reduced.ReducedSolver(options).solve(system, kernels.diagonals, radius)
     assert found.x is not None and found.on_boundary
     assert np.linalg.norm(scale * found.x) == pytest.approx(radius, rel=1e-12)
 
@@ -157,7 +157,7 @@ def test_tight_pcg_without_a_region_gives_the_cholesky_step(side: str, precondit
     options = SolverOptions(
         linear_solver="pcg", preconditioner=preconditioner, t_eps=1e-12, max_linear_iterations=20_000
     )
-    found = reduced.ReducedSolver(options).solve(system, kernels.diagonals(), np.inf)
+    found = reduced.ReducedSolver(options).solve(system, kernels.diagonals, np.inf)
     assert found.x is not None
     step_c, step_p, _ = system.back_substitute(found.x)
     expected = np.linalg.solve(h, -g)

@@ -62,6 +62,7 @@ class Kernel {
     return total;
   }
   std::int64_t n_points() const { return l_.n_points; }
+  std::int64_t n_chunks() const { return l_.n_chunks(); }
   double gradient_norm() const { return equations_.gradient_norm; }
 
   double objective(const StateView& s) {

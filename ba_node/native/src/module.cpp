@@ -112,6 +112,7 @@ void bind(py::module_& m, const char* name) {
            py::arg("camera_translation"), py::arg("camera_model"), py::arg("camera_params"), py::arg("fixed"),
            py::arg("loss"), py::arg("loss_scale"), py::arg("cheirality"), py::arg("threads"), py::arg("start"))
       .def_property_readonly("n_free", &K::n_free)
+      .def_property_readonly("n_chunks", &K::n_chunks)
       .def_property_readonly("gradient_norm", &K::gradient_norm)
       .def("linearise",
            [](K& k, const StateArrays& s) {
@@ -241,6 +242,7 @@ PYBIND11_MODULE(_kernels, m) {
   m.doc() = "Kernels of bundle adjustment in C++; see ba_node/core/kernels.py.";
   bind<6>(m, "Kernel6");
   bind<9>(m, "Kernel9");
+  m.def("allocations", [] { return ba::allocations.load(); });
   m.def("residual_norms", &residual_norms, py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"),
         py::arg("uv"), py::arg("sigma_px"), py::arg("camera_rotation"), py::arg("camera_translation"),
         py::arg("camera_model"), py::arg("camera_params"), py::arg("state"));

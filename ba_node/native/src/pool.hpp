@@ -56,8 +56,8 @@ class Pool {
   }
 
  private:
-  // Some microseconds: loops follow one another closely, and to wake a thread takes longer than a short loop.
-  static constexpr int kSpins = 4000;
+  // Some ten microseconds: loops follow one another closely, and to wake a thread takes longer than a short loop.
+  static constexpr int kSpins = 10000;
 
   void take(int thread) {
     for (std::int64_t i = next_.fetch_add(1); i < count_; i = next_.fetch_add(1)) call_(function_, i, thread);

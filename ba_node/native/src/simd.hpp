@@ -4,6 +4,7 @@
 // Eight doubles at once, by the compiler's vector extensions: one register with AVX-512, two with AVX2, four with NEON.
 #pragma once
 
+#include <atomic>
 #include <cmath>
 #include <cstddef>
 #include <cstdlib>
@@ -81,6 +82,9 @@ using Mask = long long __attribute__((vector_size(64)));  // a lane is 0 or -1
   return ((r[0] + r[1]) + (r[2] + r[3])) + ((r[4] + r[5]) + (r[6] + r[7]));
 }
 
+// How often the kernels have asked for memory, for the test that an iteration does not.
+inline std::atomic<long long> allocations{0};
+
 template <class T>
 struct Aligned {
   using value_type = T;
@@ -88,6 +92,7 @@ struct Aligned {
   template <class U>
   Aligned(const Aligned<U>&) {}
   T* allocate(std::size_t n) {
+    allocations.fetch_add(1, std::memory_order_relaxed);
     void* p = std::aligned_alloc(64, (n * sizeof(T) + 63) / 64 * 64);
     if (p == nullptr) throw std::bad_alloc();
     return static_cast<T*>(p);
