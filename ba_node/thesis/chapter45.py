@@ -61,7 +61,7 @@ _MORE_STEPS = {"100-4000": 30, "500-5000": 5}
 _NATIVE = (
     ("local DINM", "local_dinm", ()),
     ("IRLS", "irls_huber", (_GAMMA,)),
-    ("auto, Huber", "auto", ("loss=huber", _GAMMA, "function_tolerance=0")),
+    ("auto, Huber", "auto", ("loss=huber", _GAMMA, "function_tolerance=0", "q_eps=0")),
 )
 _PCG_CAPS = {"10-289": 1000, "50-1000": 2000, "100-4000": 3000, "500-5000": 5000}
 _FIGURES = {
