@@ -123,6 +123,9 @@ def copy(scene: Scene, config: Config) -> Copy | str:
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
     if isinstance(selection, str):
         return selection
+    problem = selection.problem
+    held = _held(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
+    selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=held))
     return Copy(
         scene,
         selection,
@@ -131,6 +134,21 @@ def copy(scene: Scene, config: Config) -> Copy | str:
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
     )
+
+
+def _held(fixed: BoolArray, unscaled: IntArray, position: FloatArray) -> BoolArray:
+    """Return the keyframes to hold: where scale floats, one more, the first that is a usual step from the held one.
+
+    In many iterations with little damping a floating scale shrinks a map until nothing is left of it.
+    """
+    held = fixed.copy()
+    for anchor in np.unique(unscaled[unscaled >= 0]):
+        members = np.flatnonzero(unscaled == anchor)
+        step = np.median(np.linalg.norm(np.diff(position[members], axis=0), axis=1)) if len(members) > 1 else 0.0
+        away = np.linalg.norm(position[members] - position[anchor], axis=1)
+        if len(members) > 2 and step > 0.0:
+            held[members[np.argmax(away >= min(step, away.max()))]] = True
+    return held
 
 
 def put(scene: Scene, config: Config, taken: Copy, state: State) -> int | None:
