@@ -21,6 +21,8 @@ from ba_node.thesis.problems import Library
 # Rises when records hold something else than before.
 _FORMAT = 1
 _QUICK = 3
+# Options that change no digit of a result.
+_WITHOUT_EFFECT = ("threads",)
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Run:
 
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""
-        options: dict[str, Value] = describe(self.options())
+        options: dict[str, Value] = {k: v for k, v in describe(self.options()).items() if k not in _WITHOUT_EFFECT}
         return {"run": options, "inc": INC_STEPS, "iterations": self.iterations, "images": self.images}
 
     @property
