@@ -9,7 +9,7 @@ ARGS ?=
 RUN := .venv/bin/python
 CHECKED := ba_node benchmarks tests tools setup.py $(wildcard launch/*.py)
 
-.PHONY: help setup demo test bench lint format clean
+.PHONY: help setup demo test sanitize bench lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
@@ -22,6 +22,9 @@ demo: setup ## play a recording into the node over DDS, compare with ground trut
 
 test: setup ## run the tests
 	@$(RUN) -m pytest $(ARGS)
+
+sanitize: setup ## run the tests of the C++ kernels under AddressSanitizer and UndefinedBehaviourSanitizer
+	@sh tools/sanitize.sh $(ARGS)
 
 bench: setup ## compare with the solvers that are installed, see docs/performance.md (ARGS="--quick": two windows)
 	@$(RUN) -m benchmarks $(ARGS)

@@ -1,0 +1,22 @@
+#!/bin/sh
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+#
+# Build the kernels with AddressSanitizer and UndefinedBehaviourSanitizer into out/sanitize/, and run their tests there.
+# usage: tools/sanitize.sh [arguments of pytest]
+set -eu
+cd "$(dirname "$0")/.."
+python=$(pwd)/${PYTHON:-.venv/bin/python}
+case ${PYTHON:-} in /*) python=$PYTHON ;; esac
+rm -rf out/sanitize
+mkdir -p out/sanitize
+cp -r ba_node tests setup.py setup.cfg package.xml pyproject.toml resource launch config bags out/sanitize/
+cd out/sanitize
+rm -f ba_node/native/*.so
+CFLAGS="-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g" \
+  LDFLAGS="-fsanitize=address,undefined" "$python" setup.py -q build_ext --inplace
+ls ba_node/native/*.so >/dev/null
+[ $# -gt 0 ] || set -- tests/core/test_kernels.py tests/core/test_threads.py tests/core/test_linear_solvers.py
+# Python itself leaks on purpose, and loads the sanitizers' library only if told to.
+LD_PRELOAD="$(g++ -print-file-name=libasan.so) $(g++ -print-file-name=libstdc++.so.6)" \
+  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 "$python" -m pytest -q -p no:cacheprovider "$@"
