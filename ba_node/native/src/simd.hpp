@@ -1,7 +1,7 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Eight doubles at once, by the compiler's vector extensions: one register with AVX-512, two with AVX2, four with NEON.
+// Eight doubles at once: one register with AVX-512, two with AVX, four with SSE2 or NEON.
 #pragma once
 
 #include <atomic>
@@ -17,69 +17,181 @@ namespace ba {
 
 constexpr int kLanes = 8;
 
-using V8 = double __attribute__((vector_size(64)));
-using Mask = long long __attribute__((vector_size(64)));  // a lane is 0 or -1
+using Native2 = double __attribute__((vector_size(16)));
+using Native4 = double __attribute__((vector_size(32)));
+using Native8 = double __attribute__((vector_size(64)));
+using Native2Mask = long long __attribute__((vector_size(16)));  // a lane is 0 or -1
+using Native4Mask = long long __attribute__((vector_size(32)));
+using Native8Mask = long long __attribute__((vector_size(64)));
 
-[[gnu::always_inline]] inline V8 load(const double* p) {
+#define BA_INLINE [[gnu::always_inline]] inline
+
+// Lanes of two registers by number, those of b after those of a.
+#if defined(__clang__)
+#define BA_SHUFFLE(mask, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define BA_SHUFFLE(mask, a, b, ...) __builtin_shuffle(a, b, mask{__VA_ARGS__})
+#endif
+
+// Two masks as one of twice the lanes.
+template <class H>
+struct TwiceMask {
+  H lo, hi;
+
+  BA_INLINE friend TwiceMask operator&(TwiceMask a, TwiceMask b) { return {a.lo & b.lo, a.hi & b.hi}; }
+  BA_INLINE friend TwiceMask operator|(TwiceMask a, TwiceMask b) { return {a.lo | b.lo, a.hi | b.hi}; }
+  BA_INLINE friend TwiceMask operator~(TwiceMask a) { return {~a.lo, ~a.hi}; }
+  BA_INLINE TwiceMask& operator&=(TwiceMask b) { return *this = *this & b; }
+};
+
+// Two registers as one of twice the lanes. Compilers split wider vectors than the machine has into single numbers
+// where lanes are compared, chosen or exchanged; this does not.
+template <class H, class M>
+struct Twice {
+  using Lines = TwiceMask<M>;
+  H lo, hi;
+
+  BA_INLINE double& operator[](int lane) { return reinterpret_cast<double*>(this)[lane]; }
+  BA_INLINE double operator[](int lane) const { return reinterpret_cast<const double*>(this)[lane]; }
+
+  BA_INLINE friend Twice operator-(const Twice& a) { return {-a.lo, -a.hi}; }
+#define BA_ARITHMETIC(op)                                                                                     \
+  BA_INLINE friend Twice operator op(const Twice& a, const Twice& b) { return {a.lo op b.lo, a.hi op b.hi}; } \
+  BA_INLINE friend Twice operator op(double a, const Twice& b) { return {a op b.lo, a op b.hi}; }             \
+  BA_INLINE friend Twice operator op(const Twice& a, double b) { return {a.lo op b, a.hi op b}; }             \
+  BA_INLINE Twice& operator op##=(const Twice& b) { return *this = *this op b; }                              \
+  BA_INLINE Twice& operator op##=(double b) { return *this = *this op b; }
+  BA_ARITHMETIC(+)
+  BA_ARITHMETIC(-)
+  BA_ARITHMETIC(*)
+  BA_ARITHMETIC(/)
+#undef BA_ARITHMETIC
+#define BA_COMPARISON(op)                                                                                     \
+  BA_INLINE friend Lines operator op(const Twice& a, const Twice& b) { return {a.lo op b.lo, a.hi op b.hi}; } \
+  BA_INLINE friend Lines operator op(const Twice& a, double b) { return {a.lo op b, a.hi op b}; }
+  BA_COMPARISON(<)
+  BA_COMPARISON(<=)
+  BA_COMPARISON(>)
+  BA_COMPARISON(==)
+  BA_COMPARISON(!=)
+#undef BA_COMPARISON
+};
+
+#if defined(__AVX512F__)
+using V8 = Native8;
+using Mask = Native8Mask;
+#elif defined(__AVX__)
+using V8 = Twice<Native4, Native4Mask>;
+using Mask = TwiceMask<Native4Mask>;
+#else
+using V8 = Twice<Twice<Native2, Native2Mask>, TwiceMask<Native2Mask>>;
+using Mask = TwiceMask<TwiceMask<Native2Mask>>;
+#endif
+
+BA_INLINE V8 load(const double* p) {
   V8 out;
   std::memcpy(&out, p, sizeof(out));
   return out;
 }
 
-[[gnu::always_inline]] inline V8 splat(double x) { return V8{x, x, x, x, x, x, x, x}; }
-[[gnu::always_inline]] inline V8 select(Mask m, V8 a, V8 b) { return m ? a : b; }
-[[gnu::always_inline]] inline V8 maximum(V8 a, V8 b) { return a > b ? a : b; }
+BA_INLINE V8 splat(double x) { return V8{} + x; }
 
-[[gnu::always_inline]] inline V8 root(V8 v) {
-  V8 out{};
-  for (int l = 0; l < kLanes; ++l) out[l] = std::sqrt(v[l]);
-  return out;
+// What stands for each lane: of a where m is set, else of b. m ? a : b, which has no overload for Twice.
+BA_INLINE Native2 select(Native2Mask m, Native2 a, Native2 b) { return m ? a : b; }
+BA_INLINE Native4 select(Native4Mask m, Native4 a, Native4 b) { return m ? a : b; }
+BA_INLINE Native8 select(Native8Mask m, Native8 a, Native8 b) { return m ? a : b; }
+template <class H, class M>
+BA_INLINE Twice<H, M> select(const TwiceMask<M>& m, const Twice<H, M>& a, const Twice<H, M>& b) {
+  return {select(m.lo, a.lo, b.lo), select(m.hi, a.hi, b.hi)};
 }
 
-[[gnu::always_inline]] inline V8 magnitude(V8 v) {
-  V8 out{};
-  for (int l = 0; l < kLanes; ++l) out[l] = std::abs(v[l]);
+BA_INLINE V8 maximum(const V8& a, const V8& b) { return select(a > b, a, b); }
+BA_INLINE V8 magnitude(const V8& v) { return select(v < 0.0, -v, v); }
+
+template <class V>
+BA_INLINE V root_of(V v) {
+  V out{};
+  for (int l = 0; l < static_cast<int>(sizeof(V) / sizeof(double)); ++l) out[l] = std::sqrt(v[l]);
   return out;
 }
+BA_INLINE Native2 root(Native2 v) { return root_of(v); }
+BA_INLINE Native4 root(Native4 v) { return root_of(v); }
+BA_INLINE Native8 root(Native8 v) { return root_of(v); }
+template <class H, class M>
+BA_INLINE Twice<H, M> root(const Twice<H, M>& v) {
+  return {root(v.lo), root(v.hi)};
+}
 
-[[gnu::always_inline]] inline bool any(Mask m) {
+BA_INLINE bool any(Native2Mask m) { return (m[0] | m[1]) != 0; }
+BA_INLINE bool any(Native4Mask m) { return ((m[0] | m[1]) | (m[2] | m[3])) != 0; }
+BA_INLINE bool any(Native8Mask m) {
   long long bits = 0;
-  for (int l = 0; l < kLanes; ++l) bits |= m[l];
+  for (int l = 0; l < 8; ++l) bits |= m[l];
   return bits != 0;
 }
+template <class H>
+BA_INLINE bool any(const TwiceMask<H>& m) {
+  return any(m.lo | m.hi);
+}
 
-[[gnu::always_inline]] inline double sum(V8 v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])); }
-
-// Lanes of two registers by number, 0 to 7 of a, 8 to 15 of b.
-#if defined(__clang__)
-#define BA_SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#else
-#define BA_SHUFFLE(a, b, ...) __builtin_shuffle(a, b, ba::Mask{__VA_ARGS__})
-#endif
+BA_INLINE double sum(const V8& v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])); }
 
 // Rows become columns.
-[[gnu::always_inline]] inline void transpose(V8 (&r)[8]) {
-  V8 t[8], q[8];
+BA_INLINE void transpose(Native2 (&r)[2]) {
+  const Native2 first = BA_SHUFFLE(Native2Mask, r[0], r[1], 0, 2);
+  r[1] = BA_SHUFFLE(Native2Mask, r[0], r[1], 1, 3);
+  r[0] = first;
+}
+
+BA_INLINE void transpose(Native4 (&r)[4]) {
+  Native4 t[4];
+  for (int i = 0; i < 4; i += 2) {
+    t[i] = BA_SHUFFLE(Native4Mask, r[i], r[i + 1], 0, 4, 2, 6);
+    t[i + 1] = BA_SHUFFLE(Native4Mask, r[i], r[i + 1], 1, 5, 3, 7);
+  }
+  for (int i = 0; i < 2; ++i) {
+    r[i] = BA_SHUFFLE(Native4Mask, t[i], t[i + 2], 0, 1, 4, 5);
+    r[i + 2] = BA_SHUFFLE(Native4Mask, t[i], t[i + 2], 2, 3, 6, 7);
+  }
+}
+
+BA_INLINE void transpose(Native8 (&r)[8]) {
+  Native8 t[8], q[8];
   for (int i = 0; i < 8; i += 2) {
-    t[i] = BA_SHUFFLE(r[i], r[i + 1], 0, 8, 2, 10, 4, 12, 6, 14);
-    t[i + 1] = BA_SHUFFLE(r[i], r[i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
+    t[i] = BA_SHUFFLE(Native8Mask, r[i], r[i + 1], 0, 8, 2, 10, 4, 12, 6, 14);
+    t[i + 1] = BA_SHUFFLE(Native8Mask, r[i], r[i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
   }
   for (int i = 0; i < 8; i += 4) {
     for (int j = 0; j < 2; ++j) {
-      q[i + j] = BA_SHUFFLE(t[i + j], t[i + j + 2], 0, 1, 8, 9, 4, 5, 12, 13);
-      q[i + j + 2] = BA_SHUFFLE(t[i + j], t[i + j + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+      q[i + j] = BA_SHUFFLE(Native8Mask, t[i + j], t[i + j + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+      q[i + j + 2] = BA_SHUFFLE(Native8Mask, t[i + j], t[i + j + 2], 2, 3, 10, 11, 6, 7, 14, 15);
     }
   }
   for (int i = 0; i < 4; ++i) {
-    r[i] = BA_SHUFFLE(q[i], q[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
-    r[i + 4] = BA_SHUFFLE(q[i], q[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+    r[i] = BA_SHUFFLE(Native8Mask, q[i], q[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+    r[i + 4] = BA_SHUFFLE(Native8Mask, q[i], q[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
   }
 }
 
-// Lane l becomes the sum of register l.
-[[gnu::always_inline]] inline V8 sums(V8 (&r)[8]) {
-  transpose(r);
-  return ((r[0] + r[1]) + (r[2] + r[3])) + ((r[4] + r[5]) + (r[6] + r[7]));
+// By quarters: those off the diagonal change places.
+template <class H, class M, int N>
+BA_INLINE void transpose(Twice<H, M> (&r)[N]) {
+  constexpr int kHalf = N / 2;
+  H quarter[2][2][kHalf];
+#pragma GCC unroll 2
+  for (int i = 0; i < 2; ++i) {
+#pragma GCC unroll 4
+    for (int j = 0; j < kHalf; ++j) {
+      quarter[i][0][j] = r[i * kHalf + j].lo;
+      quarter[i][1][j] = r[i * kHalf + j].hi;
+    }
+    transpose(quarter[i][0]);
+    transpose(quarter[i][1]);
+  }
+#pragma GCC unroll 2
+  for (int i = 0; i < 2; ++i)
+#pragma GCC unroll 4
+    for (int j = 0; j < kHalf; ++j) r[i * kHalf + j] = {quarter[0][i][j], quarter[1][i][j]};
 }
 
 // How often the kernels have asked for memory, for the test that an iteration does not.
