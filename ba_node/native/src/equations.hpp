@@ -175,6 +175,7 @@ class Equations {
     V8 x[3], t[8];
     alignas(64) double columns[3][kLanes];
     const auto read = [&](int line) {
+#pragma GCC unroll 8
       for (int l = 0; l < kLanes; ++l) {
         const std::int32_t o = l_.seen[first + l];
         t[l] = o < 0 ? V8{} : record[o * static_cast<std::int64_t>(lines) + line];

@@ -465,6 +465,7 @@ class Kernel {
   // Line `line` of the records of a slot, each number by lane.
   [[gnu::always_inline]] void read_lanes(std::int64_t slot, int line, V8 (&t)[8]) const {
     const V8* record = &equations_.record[kLanes * slot * equations_.lines + line];
+#pragma GCC unroll 8
     for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.lines];
     transpose(t);
   }

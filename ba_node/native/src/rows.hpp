@@ -230,6 +230,7 @@ class Rows {
   }
 
   [[gnu::always_inline]] void columns(const std::int32_t* image, int offset, V8 (&r)[8]) const {
+#pragma GCC unroll 8
     for (int l = 0; l < kLanes; ++l) r[l] = load(&image_[stride_ * image[l] + offset]);
     transpose(r);
   }

@@ -4,6 +4,10 @@
 // Eight doubles at once: one register with AVX-512, two with AVX, four with SSE2 or NEON.
 #pragma once
 
+#if defined(__AVX__)
+#include <immintrin.h>
+#endif
+
 #include <atomic>
 #include <cmath>
 #include <cstddef>
@@ -88,11 +92,22 @@ using V8 = Twice<Twice<Native2, Native2Mask>, TwiceMask<Native2Mask>>;
 using Mask = TwiceMask<TwiceMask<Native2Mask>>;
 #endif
 
-BA_INLINE V8 load(const double* p) {
-  V8 out;
-  std::memcpy(&out, p, sizeof(out));
-  return out;
-}
+// Register by register: a copy of the whole goes through memory.
+template <class V>
+struct Loaded {
+  BA_INLINE static V from(const double* p) {
+    V out;
+    std::memcpy(&out, p, sizeof(out));
+    return out;
+  }
+};
+template <class H, class M>
+struct Loaded<Twice<H, M>> {
+  BA_INLINE static Twice<H, M> from(const double* p) {
+    return {Loaded<H>::from(p), Loaded<H>::from(p + sizeof(H) / sizeof(double))};
+  }
+};
+BA_INLINE V8 load(const double* p) { return Loaded<V8>::from(p); }
 
 BA_INLINE V8 splat(double x) { return V8{} + x; }
 
@@ -123,12 +138,14 @@ BA_INLINE Twice<H, M> root(const Twice<H, M>& v) {
 }
 
 BA_INLINE bool any(Native2Mask m) { return (m[0] | m[1]) != 0; }
-BA_INLINE bool any(Native4Mask m) { return ((m[0] | m[1]) | (m[2] | m[3])) != 0; }
+#if defined(__AVX__)
+BA_INLINE bool any(Native4Mask m) { return _mm256_movemask_pd(reinterpret_cast<__m256d>(m)) != 0; }
+#endif
+#if defined(__AVX512F__)
 BA_INLINE bool any(Native8Mask m) {
-  long long bits = 0;
-  for (int l = 0; l < 8; ++l) bits |= m[l];
-  return bits != 0;
+  return _mm512_test_epi64_mask(reinterpret_cast<__m512i>(m), reinterpret_cast<__m512i>(m)) != 0;
 }
+#endif
 template <class H>
 BA_INLINE bool any(const TwiceMask<H>& m) {
   return any(m.lo | m.hi);
