@@ -197,7 +197,6 @@ class _NativeSystem:
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S, block-sparse."""
-        self.factor_size(2**62, np.inf)
         blocks, columns, starts = self._kernel.sparse()
         n, d = len(self.rhs), self._size
         upper = scipy.sparse.bsr_matrix((blocks, columns, starts), shape=(n, n))

@@ -99,22 +99,13 @@ def test_sparse_solution_for_any_pattern(seed: int, keyframes: int, share: float
 
 @built
 @pytest.mark.parametrize("shape", [{}, {"stereo": True, "depth": True}, {"free_intrinsics": True}])
-def test_points_one_by_one_sum_to_the_same_system(shape: dict[str, object], make_problem: Make) -> None:
-    """Without memory for Z of all edges, as on a large map."""
+def test_diagonal_blocks_are_those_of_the_system(shape: dict[str, object], make_problem: Make) -> None:
     problem, _ = make_problem(keyframes=12, points=300, **shape)
     system, _ = systems(ring(problem, 5), 1e-3)
-    system.factor_size(2**40, np.inf)
-    kernel = system._kernel  # type: ignore[attr-defined]
-    kept, x = system.sparse().toarray(), system.solve_sparse()
-    kernel.kept_bytes = 0
-    np.testing.assert_array_equal(system.sparse().toarray() != 0.0, kept != 0.0)
-    np.testing.assert_allclose(system.sparse().toarray(), kept, rtol=0, atol=1e-13 * np.abs(kept).max())
-    again = system.solve_sparse()
-    assert x is not None and again is not None
-    np.testing.assert_allclose(again, x, rtol=1e-7)
+    whole = system.sparse().toarray()
     d = 9 if "free_intrinsics" in shape else 6
-    own = np.stack([kept[i : i + d, i : i + d] for i in range(0, len(kept), d)])
-    np.testing.assert_allclose(system.diagonal_blocks()[0], own, rtol=0, atol=1e-13 * np.abs(kept).max())
+    own = np.stack([whole[i : i + d, i : i + d] for i in range(0, len(whole), d)])
+    np.testing.assert_allclose(system.diagonal_blocks()[0], own, rtol=0, atol=1e-13 * np.abs(whole).max())
 
 
 @built

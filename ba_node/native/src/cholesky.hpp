@@ -12,6 +12,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "memory.hpp"
 #include "pool.hpp"
 #include "simd.hpp"
 
@@ -19,17 +20,17 @@ namespace ba {
 
 class DenseCholesky {
  public:
-  // Room for n unknowns.
+  // Room for n unknowns, all entries zero.
   void resize(std::int64_t n) {
     n_ = n;
     panels_ = (n + kLanes - 1) / kLanes;
-    tiles_.resize(kLanes * panels_ * (panels_ + 1) / 2);
+    tiles_.assign(kLanes * panels_ * (panels_ + 1) / 2, V8{});
     inverse_.resize(kLanes * panels_);
     y_.resize(kLanes * panels_);
     w_.resize(kLanes * panels_);
   }
 
-  // Entry of the lower triangle, row >= column; all of them are to be set before factor.
+  // Entry of the lower triangle, row >= column.
   double& at(std::int64_t row, std::int64_t column) {
     return reinterpret_cast<double*>(panel(row / kLanes) + column)[row % kLanes];
   }

@@ -13,8 +13,8 @@
 #include <cmath>
 #include <cstdint>
 #include <numeric>
-#include <vector>
 
+#include "memory.hpp"
 #include "project.hpp"
 #include "simd.hpp"
 
@@ -44,7 +44,7 @@ class Layout {
     has_depth = p.depth != nullptr;
     copy_cameras(p);
     number_keyframes(p);
-    const std::vector<std::int64_t> order = sorted(p), first = number_points(p);
+    const Buffer<std::int64_t> order = sorted(p), first = number_points(p);
     number_images(p);
     fill_slots(p, order, first);
     find_edges(p, order, first);
@@ -60,28 +60,28 @@ class Layout {
   Lens lens = Lens::kPinhole;
   std::int64_t n_keyframes = 0, n_points = 0, n_obs = 0, n_cameras = 0, n_free = 0, n_batches = 0;
   // The caller's number of each point of ours; the last is repeated to fill the last batch.
-  std::vector<std::int32_t> point;
+  Buffer<std::int32_t> point;
   // Slots of batch b: slot_begin[b] to slot_begin[b + 1]. By slot and lane: image, edge that ends here (or -1), whether
   // the edge is that of the slot before (if that happens or depth is measured), what was measured. inverse_sigma is 0 where there is nothing.
-  std::vector<std::int64_t> slot_begin;
-  std::vector<std::int32_t> slot_image, slot_edge;
+  Buffer<std::int64_t> slot_begin;
+  Buffer<std::int32_t> slot_image, slot_edge;
   Buffer<double> same_edge, u, v, inverse_sigma, depth, inverse_depth_sigma;
   // Edges: distinct (point, free keyframe), sorted; those of our point p are point_edge[p] to point_edge[p + 1].
-  std::vector<std::int32_t> edge_column, point_edge, edge_end;  // edge_end: of the edges of the same point
+  Buffer<std::int32_t> edge_column, point_edge, edge_end;  // edge_end: of the edges of the same point
   // The same by keyframe: edges_of_keyframe[keyframe_edge[k]] to [keyframe_edge[k + 1]].
-  std::vector<std::int64_t> keyframe_edge;
-  std::vector<std::int32_t> edges_of_keyframe;
+  Buffer<std::int64_t> keyframe_edge;
+  Buffer<std::int32_t> edges_of_keyframe;
   // Observations (8 slot + lane) by free keyframe, and their points (of ours), filled up to whole registers by -1.
-  std::vector<std::int64_t> keyframe_seen;
-  std::vector<std::int32_t> seen, seen_point;
+  Buffer<std::int64_t> keyframe_seen;
+  Buffer<std::int32_t> seen, seen_point;
   // The caller's number of each free keyframe.
-  std::vector<std::int64_t> free_keyframe;
+  Buffer<std::int64_t> free_keyframe;
   // Images: distinct keyframe * n_cameras + camera.
-  std::vector<std::int64_t> images;
+  Buffer<std::int64_t> images;
   // Parts of the batches, about equal, that can be worked on at the same time; the problem alone decides them.
-  std::vector<std::int64_t> chunks;
-  std::vector<double> camera_rotation, camera_translation, params;
-  std::vector<std::uint8_t> model;
+  Buffer<std::int64_t> chunks;
+  Buffer<double> camera_rotation, camera_translation, params;
+  Buffer<std::uint8_t> model;
 
   std::int64_t n_slots() const { return slot_begin.back(); }
   std::int64_t n_edges() const { return static_cast<std::int64_t>(edge_column.size()); }
@@ -96,8 +96,8 @@ class Layout {
   static constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
   static constexpr std::int64_t kMaxChunks = 32, kMinChunkSlots = 64;
 
-  std::vector<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
-  std::vector<std::int32_t> table_;   // image of each (keyframe, camera), if there are few
+  Buffer<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
+  Buffer<std::int32_t> table_;   // image of each (keyframe, camera), if there are few
 
   void copy_cameras(const ProblemView& p) {
     camera_rotation.assign(p.camera_rotation, p.camera_rotation + 9 * n_cameras);
@@ -125,41 +125,41 @@ class Layout {
   }
 
   // Order of the observations by (point, keyframe); empty if that is theirs already, as in the back-end's windows.
-  std::vector<std::int64_t> sorted(const ProblemView& p) const {
+  Buffer<std::int64_t> sorted(const ProblemView& p) const {
     const auto before = [&p](std::int64_t a, std::int64_t b) {
       return p.point[a] != p.point[b] ? p.point[a] < p.point[b] : p.keyframe[a] < p.keyframe[b];
     };
     std::int64_t i = 1;
     while (i < n_obs && !before(i, i - 1)) ++i;
     if (i >= n_obs) return {};
-    std::vector<std::int64_t> order(n_obs);
+    Buffer<std::int64_t> order(n_obs);
     std::iota(order.begin(), order.end(), std::int64_t{0});
     std::stable_sort(order.begin(), order.end(), before);
     return order;
   }
 
   // Points by the first keyframe that sees them: neighbours in memory then meet the same keyframes.
-  std::vector<std::int32_t> points_by_keyframe(const ProblemView& p) const {
-    std::vector<std::int32_t> lowest(n_points, static_cast<std::int32_t>(n_keyframes));
+  Buffer<std::int32_t> points_by_keyframe(const ProblemView& p) const {
+    Buffer<std::int32_t> lowest(n_points, static_cast<std::int32_t>(n_keyframes));
     for (std::int64_t o = 0; o < n_obs; ++o)
       lowest[p.point[o]] = std::min(lowest[p.point[o]], static_cast<std::int32_t>(p.keyframe[o]));
-    std::vector<std::int64_t> place(n_keyframes + 2, 0);
+    Buffer<std::int64_t> place(n_keyframes + 2, 0);
     for (std::int32_t k : lowest) ++place[k + 1];
     std::partial_sum(place.begin(), place.end(), place.begin());
-    std::vector<std::int32_t> out(n_points);
+    Buffer<std::int32_t> out(n_points);
     for (std::int64_t i = 0; i < n_points; ++i) out[place[lowest[i]]++] = static_cast<std::int32_t>(i);
     return out;
   }
 
   // Number points and give batches their slots; returns where each of our points' observations begin, and how many.
-  std::vector<std::int64_t> number_points(const ProblemView& p) {
-    std::vector<std::int64_t> begin(n_points + 1, 0);
+  Buffer<std::int64_t> number_points(const ProblemView& p) {
+    Buffer<std::int64_t> begin(n_points + 1, 0);
     for (std::int64_t o = 0; o < n_obs; ++o) ++begin[p.point[o] + 1];
     const std::int64_t most = *std::max_element(begin.begin(), begin.end());
     n_batches = (n_points + kLanes - 1) / kLanes;
     point.resize(kLanes * n_batches);
-    const std::vector<std::int32_t> by_keyframe = points_by_keyframe(p);
-    std::vector<std::int64_t> place(most + 2, 0);  // of the points with so many observations, most first
+    const Buffer<std::int32_t> by_keyframe = points_by_keyframe(p);
+    Buffer<std::int64_t> place(most + 2, 0);  // of the points with so many observations, most first
     for (std::int64_t i = 0; i < n_points; ++i) ++place[most - begin[i + 1] + 1];
     std::partial_sum(place.begin(), place.end(), place.begin());
     for (std::int32_t i : by_keyframe) point[place[most - begin[i + 1]]++] = i;
@@ -167,7 +167,7 @@ class Layout {
     slot_begin.assign(n_batches + 1, 0);
     for (std::int64_t b = 0; b < n_batches; ++b) slot_begin[b + 1] = slot_begin[b] + begin[point[kLanes * b] + 1];
     std::partial_sum(begin.begin(), begin.end(), begin.begin());
-    std::vector<std::int64_t> first(2 * point.size(), 0);
+    Buffer<std::int64_t> first(2 * point.size(), 0);
     for (std::int64_t i = 0; i < n_points; ++i) {
       first[2 * i] = begin[point[i]];
       first[2 * i + 1] = begin[point[i] + 1] - begin[point[i]];
@@ -200,7 +200,7 @@ class Layout {
     return static_cast<std::int32_t>(std::lower_bound(images.begin(), images.end(), key) - images.begin());
   }
 
-  void fill_slots(const ProblemView& p, const std::vector<std::int64_t>& order, const std::vector<std::int64_t>& first) {
+  void fill_slots(const ProblemView& p, const Buffer<std::int64_t>& order, const Buffer<std::int64_t>& first) {
     const std::int64_t size = kLanes * n_slots();
     slot_image.assign(size, 0);
     u.assign(size, 0.0);
@@ -224,7 +224,7 @@ class Layout {
     }
   }
 
-  void find_edges(const ProblemView& p, const std::vector<std::int64_t>& order, const std::vector<std::int64_t>& first) {
+  void find_edges(const ProblemView& p, const Buffer<std::int64_t>& order, const Buffer<std::int64_t>& first) {
     slot_edge.assign(slot_image.size(), -1);
     if (has_depth) same_edge.assign(slot_image.size(), 0.0);
     point_edge.assign(point.size() + 1, 0);
@@ -258,7 +258,7 @@ class Layout {
     std::partial_sum(keyframe_edge.begin(), keyframe_edge.end(), keyframe_edge.begin());
     edges_of_keyframe.resize(edge_column.size());
     edge_end.resize(edge_column.size());
-    std::vector<std::int64_t> next(keyframe_edge.begin(), keyframe_edge.end() - 1);
+    Buffer<std::int64_t> next(keyframe_edge.begin(), keyframe_edge.end() - 1);
     for (std::int64_t p = 0; p < n_points; ++p) {
       for (std::int32_t e = point_edge[p]; e < point_edge[p + 1]; ++e) {
         edges_of_keyframe[next[edge_column[e]]++] = e;
@@ -282,7 +282,7 @@ class Layout {
       keyframe_seen[k + 1] = keyframe_seen[k] + (keyframe_seen[k + 1] + kLanes - 1) / kLanes * kLanes;
     seen.assign(keyframe_seen[n_free], -1);
     seen_point.assign(seen.size(), 0);
-    std::vector<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
+    Buffer<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
     each([this, &next](std::int32_t k, std::int64_t at, std::int64_t p) {
       if (k < 0) return;
       seen[next[k]] = static_cast<std::int32_t>(at);

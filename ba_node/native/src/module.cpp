@@ -94,7 +94,7 @@ py::tuple sparse(ba::Kernel<D>& kernel) {
   const ba::SparseSchur<D>* schur = nullptr;
   {
     py::gil_scoped_release release;
-    schur = &kernel.assemble_sparse();
+    schur = &kernel.assemble();
   }
   const ba::Rows32& pattern = schur->pattern();
   const auto n = static_cast<py::ssize_t>(pattern.index.size());
@@ -185,11 +185,10 @@ void bind(py::module_& m, const char* name) {
              const ba::Fill* fill = nullptr;
              {
                py::gil_scoped_release release;
-               fill = &k.analyse({max_blocks, max_products}).fill();
+               fill = &k.analyse({max_blocks, max_products});
              }
              return py::make_tuple(fill->complete, fill->blocks, fill->products);
            })
-      .def_readwrite("kept_bytes", &K::kept_bytes)
       .def("pairs", [](const K& k) { return py::make_tuple(k.n_edges(), k.n_pairs()); })
       .def("solve_sparse",
            [](K& k) -> py::object {

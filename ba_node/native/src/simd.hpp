@@ -8,14 +8,8 @@
 #include <immintrin.h>
 #endif
 
-#include <atomic>
 #include <cmath>
-#include <cstddef>
-#include <cstdlib>
 #include <cstring>
-#include <limits>
-#include <new>
-#include <vector>
 
 namespace ba {
 
@@ -210,30 +204,5 @@ BA_INLINE void transpose(Twice<H, M> (&r)[N]) {
 #pragma GCC unroll 4
     for (int j = 0; j < kHalf; ++j) r[i * kHalf + j] = {quarter[0][i][j], quarter[1][i][j]};
 }
-
-// How often the kernels have asked for memory, for the test that an iteration does not.
-inline std::atomic<long long> allocations{0};
-
-template <class T>
-struct Aligned {
-  using value_type = T;
-  Aligned() = default;
-  template <class U>
-  Aligned(const Aligned<U>&) {}
-  T* allocate(std::size_t n) {
-    allocations.fetch_add(1, std::memory_order_relaxed);
-    void* p = std::aligned_alloc(64, (n * sizeof(T) + 63) / 64 * 64);
-    if (p == nullptr) throw std::bad_alloc();
-    return static_cast<T*>(p);
-  }
-  void deallocate(T* p, std::size_t) { std::free(p); }
-  template <class U>
-  bool operator==(const Aligned<U>&) const { return true; }
-  template <class U>
-  bool operator!=(const Aligned<U>&) const { return false; }
-};
-
-template <class T>
-using Buffer = std::vector<T, Aligned<T>>;
 
 }  // namespace ba

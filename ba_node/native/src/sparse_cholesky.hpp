@@ -56,18 +56,6 @@ inline void subtract_transposed(Block<D>& c, const Block<D>& a, const Block<D>& 
   for (int j = 0; j < kRows; ++j) c.col[j] = acc[j];
 }
 
-template <int D>
-inline void set_entry(Block<D>& s, int r, int c, double value) {
-  if constexpr (D == 9) {
-    if (r == 8) {
-      if (c == 8) s.corner = value;
-      else s.row[c] = value;
-      return;
-    }
-  }
-  s.col[c][r] = value;
-}
-
 // y -= b x, or b' x.
 template <int D>
 inline void subtract_multiplied(const Block<D>& b, const double* x, double* y) {

@@ -1,16 +1,18 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// S by blocks where keyframes share points, and its factor. Structure and memory are made once, then only numbers change.
+// S by blocks where keyframes share points. Structure and memory are made once, then only numbers change.
 #pragma once
 
 #include <algorithm>
 #include <cstdint>
 #include <vector>
 
+#include "block_fill.hpp"
 #include "blocks.hpp"
+#include "coupling.hpp"
 #include "layout.hpp"
-#include "sparse_cholesky.hpp"
+#include "pool.hpp"
 
 namespace ba {
 
@@ -40,63 +42,82 @@ inline Rows32 shared_points(const Layout& l) {
 template <int D>
 class SparseSchur {
  public:
-  SparseSchur(const Layout& l, const FillLimits& limits) : pattern_(shared_points(l)), factor_(pattern_, limits) {
-    blocks_.resize(factor_.fill().complete ? pattern_.index.size() : 0);
+  SparseSchur(const Layout& l, int threads) : l_(l), pattern_(shared_points(l)) {
+    blocks_.resize(pattern_.index.size());
+    cut_rows(threads);
   }
 
   const Rows32& pattern() const { return pattern_; }
-  const Fill& fill() const { return factor_.fill(); }
   const Buffer<Block<D>>& blocks() const { return blocks_; }
 
-  // Blocks (i, j) of a row for rising j.
-  class Row {
-   public:
-    Row(const std::int32_t* begin, const std::int32_t* end, Block<D>* blocks)
-        : begin_(begin), at_(begin), end_(end), blocks_(blocks) {}
-    void rewind() { at_ = begin_; }
-    Block<D>& operator()(std::int32_t j) {
-      // No further than this, and just there if the columns between are all in the row.
-      const std::int32_t* most = at_ + std::min<std::ptrdiff_t>(j - *at_, end_ - at_ - 1);
-      at_ = *most == j ? most : std::lower_bound(at_, most, j);
-      return blocks_[at_ - begin_];
-    }
-
-   private:
-    const std::int32_t *begin_, *at_, *end_;
-    Block<D>* blocks_;
-  };
-
-  Row row(std::int64_t i) {
-    const std::int32_t* index = pattern_.index.data();
-    return Row(index + pattern_.start[i], index + pattern_.start[i + 1], &blocks_[pattern_.start[i]]);
-  }
-
-  void clear_rows(std::int64_t begin, std::int64_t end) {
-    clear(blocks_.data() + pattern_.start[begin], pattern_.start[end] - pattern_.start[begin]);
-  }
-
-  // add(i, out): add to the D x D numbers of the diagonal block of row i.
+  // S = B + damping - Z Z', summed point by point. add_diagonal(k, block): add B and damping of keyframe k.
   template <class Add>
-  void add_diagonal(std::int64_t i, Add add) {
-    double own[D * D];
-    Block<D>& block = blocks_[pattern_.start[i]];
-    write_block(block, own, D);
-    add(i, own);
-    for (int r = 0; r < D; ++r)
-      for (int c = 0; c < D; ++c) set_entry(block, r, c, own[r * D + c]);
+  void assemble(Pool& pool, Coupling<D>& coupling, Add add_diagonal) {
+    clear(blocks_.data(), static_cast<std::int64_t>(blocks_.size()));
+    coupling.with_edges(pool, [&](std::int64_t part, std::int64_t first, std::int64_t end, const Edge<D>* z) {
+      const std::int64_t last = std::min(kLanes * end, l_.n_points);
+      const std::int32_t offset = l_.point_edge[kLanes * first];
+      for (std::int64_t p = kLanes * first; p < last; ++p) sum_point(p, rows_cut_[part], rows_cut_[part + 1], z - offset);
+    });
+    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
   }
 
-  // x: right-hand side in, solution out. False if S is not positive definite.
-  bool solve(double* x) {
-    if (!factor_.factor(blocks_)) return false;
-    factor_.solve(x);
-    return true;
+  // The diagonal blocks alone, n_free.
+  template <class Add>
+  void diagonal(Pool& pool, Coupling<D>& coupling, Add add_diagonal, Block<D>* out) const {
+    clear(out, l_.n_free);
+    coupling.with_edges(pool, [&](std::int64_t part, std::int64_t first, std::int64_t end, const Edge<D>* z) {
+      const std::int32_t begin = l_.point_edge[kLanes * first], stop = l_.point_edge[kLanes * end];
+      for (std::int32_t e = begin; e < stop; ++e) {
+        const std::int32_t k = l_.edge_column[e];
+        if (k >= rows_cut_[part] && k < rows_cut_[part + 1]) subtract_product(out[k], z[e - begin], z[e - begin]);
+      }
+    });
+    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, out[k]);
   }
 
  private:
+  // What a point adds to rows [begin, end). z: by edge.
+  void sum_point(std::int64_t p, std::int64_t begin, std::int64_t end, const Edge<D>* z) {
+    const std::int32_t last = l_.point_edge[p + 1];
+    for (std::int32_t e = l_.point_edge[p]; e < last; ++e) {
+      const std::int32_t i = l_.edge_column[e];
+      if (i < begin) continue;
+      if (i >= end) return;
+      const std::int32_t *index = &pattern_.index[pattern_.start[i]], *stop = &pattern_.index[pattern_.start[i + 1]];
+      Block<D>* row = &blocks_[pattern_.start[i]];
+      const std::int32_t* at = index;
+      for (std::int32_t f = e; f < last; ++f) {
+        // Columns rise. No further on than this, and just there if all columns between are in the row.
+        const std::int32_t j = l_.edge_column[f];
+        const std::int32_t* most = at + std::min<std::ptrdiff_t>(j - *at, stop - at - 1);
+        at = *most == j ? most : std::lower_bound(at, most, j);
+        subtract_product(row[at - index], z[e], z[f]);
+      }
+    }
+  }
+
+  // Rows of S for each thread, about as many pairs of edges for each. What a row sums does not depend on it.
+  void cut_rows(int threads) {
+    std::vector<double> pairs(l_.n_free, 0.0);
+    double all = 0, done = 0;
+    for (std::int64_t e = 0; e < l_.n_edges(); ++e) {
+      pairs[l_.edge_column[e]] += l_.edge_end[e] - e;
+      all += l_.edge_end[e] - e;
+    }
+    rows_cut_.push_back(0);
+    for (std::int64_t i = 0; i < l_.n_free; ++i) {
+      done += pairs[i];
+      while (static_cast<int>(rows_cut_.size()) < threads && done >= all * static_cast<double>(rows_cut_.size()) / threads)
+        rows_cut_.push_back(i + 1);
+    }
+    rows_cut_.resize(threads + 1, l_.n_free);
+  }
+
+  const Layout& l_;
   Rows32 pattern_;
-  SparseCholesky<D> factor_;
   Buffer<Block<D>> blocks_;
+  std::vector<std::int64_t> rows_cut_;
 };
 
 }  // namespace ba
