@@ -192,24 +192,31 @@ class Coupling {
                                           const V8* f, Edge<D>* z) const {
     const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
     V8 columns[3][8], ninth[8] = {};
+#pragma GCC unroll 3
     for (int i = 0; i < 3; ++i) {
       V8 w[3];
       const V8* a = full[i];
       w[0] = a[0] * li[0];
       w[1] = a[0] * li[1] + a[1] * li[2];
       w[2] = a[0] * li[3] + a[1] * li[4] + a[2] * li[5];
+#pragma GCC unroll 3
       for (int col = 0; col < 3; ++col) columns[col][3 + i] = w[col];
       if constexpr (D == 9) {
         const V8* b = f + 3 * i;
         w[0] = b[0] * li[0];
         w[1] = b[0] * li[1] + b[1] * li[2];
         w[2] = b[0] * li[3] + b[1] * li[4] + b[2] * li[5];
+#pragma GCC unroll 3
         for (int col = 0; col < 3; ++col) (i < 2 ? columns[col][6 + i] : ninth[col]) = w[col];
       }
     }
+#pragma GCC unroll 3
     for (int col = 0; col < 3; ++col) {
       pose_row(x, columns[col] + 3, columns[col]);
-      if constexpr (D == 6) columns[col][6] = columns[col][7] = V8{};
+      if constexpr (D == 6) {
+        columns[col][6] = columns[col][0];
+        columns[col][7] = columns[col][1];
+      }
       transpose(columns[col]);
     }
     if constexpr (D == 9) transpose(ninth);

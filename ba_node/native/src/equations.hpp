@@ -165,7 +165,11 @@ class Equations {
     int t = 0;
     for (int m = 0; m < D; ++m) {
       set(gradient_c[k], m, sum(g[m]));
-      for (int n = 0; n <= m; ++n, ++t) set(block, m, n, sum(h[t]));
+      for (int n = 0; n <= m; ++n, ++t) {
+        const double value = sum(h[t]);
+        set_entry(block, m, n, value);
+        set_entry(block, n, m, value);
+      }
     }
   }
 
@@ -216,20 +220,6 @@ class Equations {
     }
     x.a[i] = value;
   }
-  static void set(Block<D>& s, int r, int c, double value) {
-    if constexpr (D == 9) {
-      if (r == 8) {
-        if (c == 8) {
-          s.corner = value;
-        } else {
-          s.row[c] = s.col[8][c] = value;
-        }
-        return;
-      }
-    }
-    s.col[c][r] = s.col[r][c] = value;
-  }
-
   const Layout& l_;
   std::vector<double> part_;
 };

@@ -36,6 +36,14 @@ template <class H>
 struct TwiceMask {
   H lo, hi;
 
+  TwiceMask() = default;
+  BA_INLINE TwiceMask(const H& l, const H& h) : lo(l), hi(h) {}
+  BA_INLINE TwiceMask(const TwiceMask& m) : lo(m.lo), hi(m.hi) {}
+  BA_INLINE TwiceMask& operator=(const TwiceMask& m) {
+    lo = m.lo;
+    hi = m.hi;
+    return *this;
+  }
   BA_INLINE friend TwiceMask operator&(TwiceMask a, TwiceMask b) { return {a.lo & b.lo, a.hi & b.hi}; }
   BA_INLINE friend TwiceMask operator|(TwiceMask a, TwiceMask b) { return {a.lo | b.lo, a.hi | b.hi}; }
   BA_INLINE friend TwiceMask operator~(TwiceMask a) { return {~a.lo, ~a.hi}; }
@@ -43,12 +51,21 @@ struct TwiceMask {
 };
 
 // Two registers as one of twice the lanes. Compilers split wider vectors than the machine has into single numbers
-// where lanes are compared, chosen or exchanged; this does not.
+// where lanes are compared, chosen or exchanged; this does not. Copies are spelt out, as those of a plain struct go by
+// pieces of 16 bytes, and a register that is then read from them waits until they have left the store buffer.
 template <class H, class M>
 struct Twice {
   using Lines = TwiceMask<M>;
   H lo, hi;
 
+  Twice() = default;
+  BA_INLINE Twice(const H& l, const H& h) : lo(l), hi(h) {}
+  BA_INLINE Twice(const Twice& v) : lo(v.lo), hi(v.hi) {}
+  BA_INLINE Twice& operator=(const Twice& v) {
+    lo = v.lo;
+    hi = v.hi;
+    return *this;
+  }
   BA_INLINE double& operator[](int lane) { return reinterpret_cast<double*>(this)[lane]; }
   BA_INLINE double operator[](int lane) const { return reinterpret_cast<const double*>(this)[lane]; }
 
@@ -103,7 +120,26 @@ struct Loaded<Twice<H, M>> {
 };
 BA_INLINE V8 load(const double* p) { return Loaded<V8>::from(p); }
 
-BA_INLINE V8 splat(double x) { return V8{} + x; }
+// The same number in all lanes.
+template <class V>
+struct Splat;
+template <>
+struct Splat<Native2> {
+  BA_INLINE static Native2 of(double x) { return Native2{x, x}; }
+};
+template <>
+struct Splat<Native4> {
+  BA_INLINE static Native4 of(double x) { return Native4{x, x, x, x}; }
+};
+template <>
+struct Splat<Native8> {
+  BA_INLINE static Native8 of(double x) { return Native8{x, x, x, x, x, x, x, x}; }
+};
+template <class H, class M>
+struct Splat<Twice<H, M>> {
+  BA_INLINE static Twice<H, M> of(double x) { return {Splat<H>::of(x), Splat<H>::of(x)}; }
+};
+BA_INLINE V8 splat(double x) { return Splat<V8>::of(x); }
 
 // What stands for each lane: of a where m is set, else of b. m ? a : b, which has no overload for Twice.
 BA_INLINE Native2 select(Native2Mask m, Native2 a, Native2 b) { return m ? a : b; }

@@ -19,43 +19,6 @@
 
 namespace ba {
 
-// Number r, c of a block's left factor as stored: column by column.
-template <int D>
-inline const double* column_of(const Block<D>& b, int c) {
-  return reinterpret_cast<const double*>(&b.col[c]);
-}
-
-// c -= a b'.
-template <int D>
-inline void subtract_transposed(Block<D>& c, const Block<D>& a, const Block<D>& b) {
-  constexpr int kRows = D == 9 ? 8 : 6;
-  V8 acc[kRows];
-  for (int j = 0; j < kRows; ++j) acc[j] = c.col[j];
-  if constexpr (D == 6) {
-    for (int m = 0; m < D; ++m) {
-      const double* row = column_of(b, m);
-      for (int j = 0; j < kRows; ++j) acc[j] -= a.col[m] * row[j];
-    }
-  } else {
-    V8 last = c.col[8], bottom = c.row;
-    double corner = c.corner;
-    const double* a_row = reinterpret_cast<const double*>(&a.row);
-    const double* b_row = reinterpret_cast<const double*>(&b.row);
-    for (int m = 0; m < D; ++m) {
-      const double* row = column_of(b, m);
-      const double low_a = m < 8 ? a_row[m] : a.corner, low_b = m < 8 ? b_row[m] : b.corner;
-      for (int j = 0; j < kRows; ++j) acc[j] -= a.col[m] * row[j];
-      last -= a.col[m] * low_b;
-      bottom -= b.col[m] * low_a;
-      corner -= low_a * low_b;
-    }
-    c.col[8] = last;
-    c.row = bottom;
-    c.corner = corner;
-  }
-  for (int j = 0; j < kRows; ++j) c.col[j] = acc[j];
-}
-
 // y -= b x, or b' x.
 template <int D>
 inline void subtract_multiplied(const Block<D>& b, const double* x, double* y) {

@@ -45,6 +45,7 @@ class SparseSchur {
   SparseSchur(const Layout& l, int threads) : l_(l), pattern_(shared_points(l)) {
     blocks_.resize(pattern_.index.size());
     cut_rows(threads);
+    index_rows();
   }
 
   const Rows32& pattern() const { return pattern_; }
@@ -55,9 +56,11 @@ class SparseSchur {
   void assemble(Pool& pool, Coupling<D>& coupling, Add add_diagonal) {
     clear(blocks_.data(), static_cast<std::int64_t>(blocks_.size()));
     coupling.with_edges(pool, [&](std::int64_t part, std::int64_t first, std::int64_t end, const Edge<D>* z) {
-      const std::int64_t last = std::min(kLanes * end, l_.n_points);
-      const std::int32_t offset = l_.point_edge[kLanes * first];
-      for (std::int64_t p = kLanes * first; p < last; ++p) sum_point(p, rows_cut_[part], rows_cut_[part + 1], z - offset);
+      const std::int32_t begin = l_.point_edge[kLanes * first], stop = l_.point_edge[kLanes * end];
+      for (std::int32_t e = begin; e < stop; ++e) {
+        const std::int32_t i = l_.edge_column[e];
+        if (i >= rows_cut_[part] && i < rows_cut_[part + 1]) sum_edge(e, i, z - begin);
+      }
     });
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
   }
@@ -70,30 +73,28 @@ class SparseSchur {
       const std::int32_t begin = l_.point_edge[kLanes * first], stop = l_.point_edge[kLanes * end];
       for (std::int32_t e = begin; e < stop; ++e) {
         const std::int32_t k = l_.edge_column[e];
-        if (k >= rows_cut_[part] && k < rows_cut_[part + 1]) subtract_product(out[k], z[e - begin], z[e - begin]);
+        if (k >= rows_cut_[part] && k < rows_cut_[part + 1]) subtract_product(out[k], Left<D>(z[e - begin]), z[e - begin]);
       }
     });
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, out[k]);
   }
 
  private:
-  // What a point adds to rows [begin, end). z: by edge.
-  void sum_point(std::int64_t p, std::int64_t begin, std::int64_t end, const Edge<D>* z) {
-    const std::int32_t last = l_.point_edge[p + 1];
-    for (std::int32_t e = l_.point_edge[p]; e < last; ++e) {
-      const std::int32_t i = l_.edge_column[e];
-      if (i < begin) continue;
-      if (i >= end) return;
-      const std::int32_t *index = &pattern_.index[pattern_.start[i]], *stop = &pattern_.index[pattern_.start[i + 1]];
-      Block<D>* row = &blocks_[pattern_.start[i]];
-      const std::int32_t* at = index;
-      for (std::int32_t f = e; f < last; ++f) {
-        // Columns rise. No further on than this, and just there if all columns between are in the row.
-        const std::int32_t j = l_.edge_column[f];
-        const std::int32_t* most = at + std::min<std::ptrdiff_t>(j - *at, stop - at - 1);
-        at = *most == j ? most : std::lower_bound(at, most, j);
-        subtract_product(row[at - index], z[e], z[f]);
-      }
+  // What the pairs of an edge with itself and the later ones of its point add to row i. z: by edge.
+  void sum_edge(std::int32_t e, std::int32_t i, const Edge<D>* z) {
+    const Left<D> left(z[e]);
+    const std::int32_t *place = place_.data() + place_of_[i], *column = l_.edge_column.data();
+    Block<D>* row = &blocks_[pattern_.start[i]];
+    for (std::int32_t f = e, end = l_.edge_end[e]; f < end; ++f) subtract_product(row[place[column[f]]], left, z[f]);
+  }
+
+  // Where in its row a block is, by row from the diagonal to the last.
+  void index_rows() {
+    for (std::int64_t i = 0; i < l_.n_free; ++i) {
+      const std::int64_t begin = pattern_.start[i], end = pattern_.start[i + 1];
+      place_of_.push_back(static_cast<std::int64_t>(place_.size()) - i);
+      place_.resize(place_.size() + pattern_.index[end - 1] - i + 1);
+      for (std::int64_t k = begin; k < end; ++k) place_[place_of_[i] + pattern_.index[k]] = static_cast<std::int32_t>(k - begin);
     }
   }
 
@@ -117,6 +118,8 @@ class SparseSchur {
   const Layout& l_;
   Rows32 pattern_;
   Buffer<Block<D>> blocks_;
+  Buffer<std::int32_t> place_;          // for columns between those of the row, nothing
+  std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j]
   std::vector<std::int64_t> rows_cut_;
 };
 
