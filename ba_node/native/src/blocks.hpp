@@ -153,21 +153,28 @@ inline void subtract_transposed(Block<6>& c, const Block<6>& a, const Block<6>& 
 }
 
 inline void subtract_transposed(Block<9>& c, const Block<9>& a, const Block<9>& b) {
-  V8 acc[8];
-  for (int j = 0; j < 8; ++j) acc[j] = c.col[j];
-  V8 last = c.col[8], bottom = c.row;
-  double corner = c.corner;
   const double *a_row = reinterpret_cast<const double*>(&a.row), *b_row = reinterpret_cast<const double*>(&b.row);
+  V8 bottom = c.row;
+  double corner = c.corner;
   for (int m = 0; m < 9; ++m) {
-    const double* row = reinterpret_cast<const double*>(&b.col[m]);
     const double low_a = m < 8 ? a_row[m] : a.corner, low_b = m < 8 ? b_row[m] : b.corner;
-    for (int j = 0; j < 8; ++j) acc[j] -= a.col[m] * row[j];
-    last -= a.col[m] * low_b;
     bottom -= b.col[m] * low_a;
     corner -= low_a * low_b;
   }
-  for (int j = 0; j < 8; ++j) c.col[j] = acc[j];
-  c.col[8] = last;
+  // As many rows at a time as leave room for their nine columns.
+  constexpr int kRows = sizeof(Register) / sizeof(double);
+  for (int first = 0; first < 8; first += kRows) {
+    Register acc[9];
+    for (int j = 0; j < 9; ++j) acc[j] = Loaded<Register>::from(reinterpret_cast<const double*>(&c.col[j]) + first);
+    for (int m = 0; m < 9; ++m) {
+      const Register left = Loaded<Register>::from(reinterpret_cast<const double*>(&a.col[m]) + first);
+      const double* row = reinterpret_cast<const double*>(&b.col[m]);
+#pragma GCC unroll 8
+      for (int j = 0; j < 8; ++j) acc[j] -= left * row[j];
+      acc[8] -= left * (m < 8 ? b_row[m] : b.corner);
+    }
+    for (int j = 0; j < 9; ++j) std::memcpy(reinterpret_cast<double*>(&c.col[j]) + first, &acc[j], sizeof(Register));
+  }
   c.row = bottom;
   c.corner = corner;
 }

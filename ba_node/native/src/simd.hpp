@@ -92,13 +92,17 @@ struct Twice {
 #undef BA_COMPARISON
 };
 
+// Register: the widest that the machine has, of four lanes at least.
 #if defined(__AVX512F__)
+using Register = Native8;
 using V8 = Native8;
 using Mask = Native8Mask;
 #elif defined(__AVX__)
+using Register = Native4;
 using V8 = Twice<Native4, Native4Mask>;
 using Mask = TwiceMask<Native4Mask>;
 #else
+using Register = Native4;
 using V8 = Twice<Twice<Native2, Native2Mask>, TwiceMask<Native2Mask>>;
 using Mask = TwiceMask<TwiceMask<Native2Mask>>;
 #endif
