@@ -7,6 +7,7 @@ All in BAL's convention: the camera looks down -z, v upwards, ``u = f (1 + k1 s 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 from ba_node.core.geometry import so3_exp, so3_log
 from ba_node.io.bal import BalProblem
+from ba_node.offline.sphere_file import start_of
+from ba_node.synthetic import generate_sphere, preset
 from benchmarks.problem_file import Case, sorted_by_point
 
 FloatArray = NDArray[np.float64]
@@ -81,25 +84,10 @@ def loop(n_cameras: int, n_points: int, seed: int = 2) -> Case:
     return _case(_cameras(rotation, centre, intrinsics), x, (camera, point), noise, rng)
 
 
-def sphere(n_cameras: int, n_points: int, seed: int = 3) -> Case:
-    """Return points on a sphere of radius 10 m seen from outside by cameras that look near its centre (thesis, 5.1)."""
-    rng = np.random.default_rng(seed)
-    radius, focal = 10.0, 500.0
-    x = _unit(rng.normal(size=(n_points, 3))) * radius
-    outwards = _unit(rng.normal(size=(n_cameras, 3)))
-    centre = outwards * rng.uniform(18.0, 25.0, (n_cameras, 1))
-    rotation = so3_exp(rng.normal(0.0, 0.1, (n_cameras, 3))) @ _looking(-outwards)
-    intrinsics = np.array([focal, 1e-2, 1e-4]) + rng.normal(size=(n_cameras, 3)) * [5.0, 1e-3, 1e-5]
-    cameras = _cameras(rotation, centre, intrinsics)
-    point, camera = (index.ravel() for index in np.mgrid[:n_points, :n_cameras])
-    facing = np.sum((centre[camera] - x[point]) * x[point], axis=1) > 0.0
-    inside = (np.abs(_project(cameras, x, camera, point)) < [400.0, 300.0]).all(axis=1)
-    keep = facing & inside
-    twice = np.bincount(point[keep], minlength=n_points) >= 2
-    keep &= twice[point]
-    renumbered = np.cumsum(twice) - 1
-    noise = Noise(pixel=0.7, rotation=0.005, position=0.05, point=0.1, intrinsics=(0.01, 0.0, 0.0))
-    return _case(cameras, x[twice], (camera[keep], renumbered[point[keep]]), noise, rng)
+def sphere(size: str) -> Case:
+    """Return a sphere of the thesis (section 5.1, sizes of 5.3), without outliers."""
+    data = generate_sphere(dataclasses.replace(preset(size), outlier_share=0.0))
+    return Case(sorted_by_point(start_of(data)), 0, 9)
 
 
 def _case(

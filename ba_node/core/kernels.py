@@ -11,6 +11,7 @@ import scipy.sparse
 from numpy import float64
 from numpy.typing import NDArray
 
+from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.problem import State
 
@@ -86,6 +87,16 @@ class System(Protocol):
 
     def solve_sparse(self) -> FloatArray | None:
         """Return the solution by sparse Cholesky; None if S is not positive definite."""
+
+    def pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution | None:
+        """Solve ``S x = rhs`` by the kernels' own PCG in the space ``D x``; None if they have none.
+
+        Args:
+            kind: preconditioner.
+            scale: (n,) 1/D.
+            limits: see linear.PcgLimits; the radius is that of the scaled space.
+            formed: form S for the products.
+        """
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x without forming S."""

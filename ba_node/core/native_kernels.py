@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.core import scaling
 from ba_node.core.kernels import Demands, Kernels, Moved, System
+from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Rules, reprojection_errors
@@ -24,6 +25,7 @@ FloatArray = NDArray[np.float64]
 # As in the enums of kernel.hpp.
 _LOSSES = ("squared", "huber")
 _CHEIRALITY = ("keep", "constant", "drop")
+_PRECONDITIONERS = ("none", "schur_block", "schur_diag")
 
 
 class KernelsError(ValueError):
@@ -52,7 +54,7 @@ def missing(rules: Rules, demands: Demands) -> str:
     reason = native.missing(rules.parameterisation, rules.loss)
     if not reason and demands.schur != "points":
         return f"the C++ kernels eliminate points only, not schur = {demands.schur}"
-    if not reason and demands.preconditioner in ("b_block", "b_diag"):
+    if not reason and demands.preconditioner not in _PRECONDITIONERS:
         return f"the C++ kernels have no preconditioner {demands.preconditioner}"
     return reason
 
@@ -219,6 +221,12 @@ class _NativeSystem:
         """Return the solution by sparse Cholesky; None if S is not positive definite."""
         x: FloatArray | None = self._kernel.solve_sparse()
         return x
+
+    def pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
+        """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
+        bounds = (limits.t_eps, limits.max_iterations, limits.radius, limits.q_eps)
+        found, steps, on_boundary = self._kernel.pcg(scale, _PRECONDITIONERS.index(kind), bounds, formed, self._x)
+        return Solution(self._x if found else None, steps, on_boundary)
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d)."""

@@ -149,6 +149,9 @@ class _NumpySystem:
         """Return the solution by dense Cholesky; None if S is not positive definite."""
         return linear.cholesky(self.dense(), self.rhs).x
 
+    def pcg(self, _kind: str, _scale: FloatArray, _limits: linear.PcgLimits, *, formed: bool) -> None:
+        """Leave PCG to linear.py."""
+
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""
         return np.asarray(self._matrix @ x) if self._matrix is not None else self._reduction.product(x)

@@ -6,12 +6,15 @@ Directly: dense S with LAPACK's Cholesky, or S by blocks with a sparse one. Or i
 inside the trust region (Algorithm 4). In the scaled space ``x~ = D x`` (3.94-3.99) the system is
 ``D^-1 S D^-1 x~ = D^-1 rhs``; the region, the residual that ends PCG, and the preconditioner all live there. Without a
 region D is that of the damping (Algorithm 7).
+
+Where a step of PCG costs next to nothing beside an exact solution, PCG is tried first, as long as it gets there.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +25,9 @@ from ba_node.core.options import SolverOptions
 
 FloatArray = NDArray[np.float64]
 Hessian = Callable[[], tuple[FloatArray, FloatArray]]
+
+# Where few steps of PCG are tried in the place of an exact solution, these go nearly as far.
+_TRIED_EPS = 0.01
 
 
 class ReducedSolver:
@@ -36,6 +42,9 @@ class ReducedSolver:
         """Keep the choices."""
         self._options = options
         self.kind, self.text = "", ""
+        # PCG is tried before an exact solver that costs as much as so many of its steps; 0 once it did not get there.
+        self._tries = 0
+        self._formed = False
 
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
@@ -49,19 +58,32 @@ class ReducedSolver:
             return linear.Solution(np.zeros(0))
         if not self.kind:
             self._choose(system)
+        if self._tries:
+            eps = min(self._options.t_eps, _TRIED_EPS), min(self._options.q_eps, _TRIED_EPS)
+            found = self._pcg(system, hessian, linear.PcgLimits(eps[0], self._tries, np.inf, eps[1]))
+            if found.x is not None and found.iterations < self._tries:
+                return found
+            self._tries = 0
         if self.kind == "dense":
             return linear.Solution(system.solve_dense())
         if self.kind == "sparse":
             x = system.solve_sparse()
             return linear.Solution(x if x is not None and np.isfinite(x).all() else None)
         options = self._options
-        scale = 1.0 / system.gather(*scaling.scaled_space(options.demands.space, hessian()))
         radius *= system.radius_factor
         limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius, options.q_eps)
-        precondition = preconditioner(options.preconditioner, system, scale)
-        found = linear.pcg_steihaug(_scaled_product(system, scale), scale * system.rhs, precondition, limits)
-        x = None if found.x is None else scale * found.x
-        return linear.Solution(x, found.iterations, found.on_boundary)
+        return self._pcg(system, hessian, limits)
+
+    def _pcg(self, system: System, hessian: Hessian, limits: linear.PcgLimits) -> linear.Solution:
+        """Solve by PCG, by the kernels' own where they have one."""
+        kind = self._options.preconditioner
+        scale = 1.0 / system.gather(*scaling.scaled_space(self._options.demands.space, hessian()))
+        found = system.pcg(kind, scale, limits, formed=self._formed)
+        if found is None:
+            precondition = preconditioner(kind, system, scale)
+            found = linear.pcg_steihaug(_scaled_product(system, scale), scale * system.rhs, precondition, limits)
+            found = replace(found, x=None if found.x is None else scale * found.x)
+        return found
 
     def _choose(self, system: System) -> None:
         """Settle on a linear solver."""
@@ -78,6 +100,12 @@ class ReducedSolver:
         elif asked in ("auto", "cholesky"):
             asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
         self.kind, self.text = asked, linear_costs.describe(asked, n, sizes, factor)
+        self._formed = n <= DENSE_LIMIT
+        if sizes is not None and asked != "pcg" and self._options.linear_solver == "auto":
+            self._tries = linear_costs.pcg_tries(sizes, factor)
+            self._formed &= not self._tries
+            if self._tries:
+                self.text = f"PCG up to {self._tries - 1} steps, where it needs more {self.text}"
 
 
 def preconditioner(kind: str, system: System, scale: FloatArray) -> linear.Product:

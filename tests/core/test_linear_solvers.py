@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ba_node import native
-from ba_node.core import linear_costs, native_kernels, solver
+from ba_node.core import linear, linear_costs, native_kernels, solver
 from ba_node.core.kernels import System
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.objective import Rules
 from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Observations, Problem, State
-from ba_node.core.reduced import ReducedSolver
+from ba_node.core.reduced import ReducedSolver, preconditioner
 from tests.core.conftest import Spec, make
 
 Make = Callable[..., tuple[Problem, State]]
@@ -106,6 +106,62 @@ def test_diagonal_blocks_are_those_of_the_system(shape: dict[str, object], make_
     d = 9 if "free_intrinsics" in shape else 6
     own = np.stack([whole[i : i + d, i : i + d] for i in range(0, len(whole), d)])
     np.testing.assert_allclose(system.diagonal_blocks()[0], own, rtol=0, atol=1e-13 * np.abs(whole).max())
+
+
+@built
+@pytest.mark.parametrize("kind", ["none", "schur_block", "schur_diag"])
+@pytest.mark.parametrize("formed", [False, True])
+@pytest.mark.parametrize("own", [False, True])
+def test_the_kernels_pcg_goes_as_that_of_linear(kind: str, formed: bool, own: bool, make_problem: Make) -> None:
+    """To the same place by as many steps or so, be it converged, at the cap, or at the boundary of a region."""
+    problem, _ = make_problem(keyframes=12, points=300, free_intrinsics=own)
+    system, hessian = systems(ring(problem, 5), 1e-2)
+    scale = 1.0 / np.sqrt(np.maximum(hessian[0].ravel(), 1e-6))
+    s = system.sparse().toarray() * scale[:, None] * scale
+    precondition = preconditioner(kind, system, scale)
+    whole = linear.pcg_steihaug(lambda x: s @ x, scale * system.rhs, precondition, linear.PcgLimits(1e-8, 2000)).x
+    assert whole is not None
+    length = float(np.linalg.norm(whole))
+    for limits in (
+        linear.PcgLimits(1e-9, 5000),
+        linear.PcgLimits(0.1, 500, np.inf, 0.1),
+        linear.PcgLimits(1e-8, 4),
+        linear.PcgLimits(1e-8, 500, 0.3 * length),
+    ):
+        expected = linear.pcg_steihaug(lambda x: s @ x, scale * system.rhs, precondition, limits)
+        found = system.pcg(kind, scale, limits, formed=formed)
+        assert found is not None and found.x is not None and expected.x is not None
+        assert found.on_boundary == expected.on_boundary == np.isfinite(limits.radius)
+        assert abs(found.iterations - expected.iterations) <= 1 + expected.iterations // 6
+        off = float(np.linalg.norm(found.x / scale - expected.x)) / length
+        assert off <= 1e-6, f"{limits}: off by {off:.1e} of the solution"
+        if found.on_boundary:
+            assert abs(np.linalg.norm(found.x / scale) / limits.radius - 1.0) <= 1e-12
+
+
+@built
+def test_pcg_is_tried_where_its_steps_cost_next_to_nothing(make_problem: Make) -> None:
+    """On a problem where every keyframe sees every point; a problem that needs many steps is then solved exactly."""
+    problem, _ = make_problem(keyframes=40, points=300, seen_share=1.0, fixed=2, start_error=0.003)
+    tried = solver.solve(problem, SolverOptions(q_eps=0.1, function_tolerance=1e-9))
+    exact = solver.solve(problem, SolverOptions(linear_solver="cholesky", function_tolerance=1e-9))
+    assert "PCG up to" in tried.linear_solver and "PCG" not in exact.linear_solver
+    assert tried.linear_iterations > 0
+    np.testing.assert_allclose(tried.objective_after, exact.objective_after, rtol=1e-6)
+    few = Sizes(unknowns=228, block=6, edges=600, pairs=1200)
+    assert linear_costs.pcg_tries(few, Factor(100, 300.0)) == 0
+
+
+@built
+def test_a_try_that_does_not_get_there_is_the_last(make_problem: Make) -> None:
+    problem, _ = make_problem(keyframes=12, points=300, fixed=0)
+    system, hessian = systems(problem, 1e-9)
+    reduced = ReducedSolver(SolverOptions())
+    reduced.solve(system, lambda: hessian, np.inf)
+    reduced._tries = 2
+    found = reduced.solve(system, lambda: hessian, np.inf)
+    assert found.x is not None and found.iterations == 0 and reduced._tries == 0
+    np.testing.assert_allclose(system.dense() @ found.x, system.rhs, atol=1e-6 * np.abs(system.rhs).max())
 
 
 @built

@@ -196,6 +196,22 @@ inline void set_entry(Block<9>& s, int r, int c, double value) {
   }
 }
 
+// y += b x or y -= b x, by the sign.
+template <int kSign, int D>
+inline void add_multiplied(const Block<D>& b, const double* x, double* y) {
+  for (int c = 0; c < D; ++c)
+    for (int r = 0; r < D; ++r) y[r] += kSign * entry(b, r, c) * x[c];
+}
+// The same with b'.
+template <int kSign, int D>
+inline void add_multiplied_transposed(const Block<D>& b, const double* x, double* y) {
+  for (int c = 0; c < D; ++c) {
+    double total = 0;
+    for (int r = 0; r < D; ++r) total += entry(b, r, c) * x[r];
+    y[c] += kSign * total;
+  }
+}
+
 // Symmetric block times column.
 inline Column<6> multiply(const Block<6>& b, const Column<6>& x) {
   double out[kLanes] = {};

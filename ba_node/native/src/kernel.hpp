@@ -17,6 +17,7 @@
 #include "coupling.hpp"
 #include "equations.hpp"
 #include "layout.hpp"
+#include "pcg.hpp"
 #include "polish.hpp"
 #include "pool.hpp"
 #include "retract.hpp"
@@ -175,6 +176,30 @@ class Kernel {
     return true;
   }
 
+  // Solve S x = rhs by conjugate gradients; scale: 1/D (n_free x D). formed: products with S by blocks, summed first;
+  // otherwise without it.
+  PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) {
+    if (formed) assemble();
+    diagonal_.resize(l_.n_free);
+    if (kind != Preconditioner::kNone) {
+      for (std::int64_t k = 0; formed && k < l_.n_free; ++k) diagonal_[k] = schur().diagonal_block(k);
+      if (!formed) find_diagonal();
+    }
+    inverse_.set(diagonal_.data(), l_.n_free, scale, kind);
+    pcg_.resize(l_.n_free * D);
+    rhs_as_given_.resize(l_.n_free * D);
+    rhs(rhs_as_given_.data());
+    const auto multiply = [&](const double* in, double* out) {
+      if (formed) {
+        schur().multiply(in, out);
+      } else {
+        product(in, out);
+      }
+    };
+    const auto precondition = [this](const Buffer<double>& r, Buffer<double>& z) { inverse_.apply(r, z); };
+    return pcg_.solve(multiply, precondition, rhs_as_given_.data(), scale, limits, x);
+  }
+
   // S x without forming S.
   void product(const double* x, double* out) {
     coupling_.load_step(x);
@@ -199,9 +224,7 @@ class Kernel {
   }
 
   void diagonal_blocks(double* out) {
-    diagonal_.resize(l_.n_free);
-    const auto add = [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); };
-    schur().diagonal(pool_, coupling_, add, diagonal_.data());
+    find_diagonal();
     for (std::int64_t k = 0; k < l_.n_free; ++k) write_block(diagonal_[k], out + k * D * D, D);
   }
 
@@ -304,6 +327,12 @@ class Kernel {
         take(i, s.pattern().index[k], s.blocks()[k]);
   }
 
+  void find_diagonal() {
+    diagonal_.resize(l_.n_free);
+    const auto add = [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); };
+    schur().diagonal(pool_, coupling_, add, diagonal_.data());
+  }
+
   SparseSchur<D>& schur() {
     if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, pool_.threads());
     return *schur_;
@@ -343,6 +372,9 @@ class Kernel {
   Equations<D> equations_;
   Coupling<D> coupling_;
   DenseCholesky cholesky_;
+  Pcg pcg_;
+  DiagonalInverse<D> inverse_;
+  Buffer<double> rhs_as_given_;
   Buffer<Block<D>> diagonal_;
   Buffer<Column<D>> rhs_, sums_;  // sums_: of each chunk
   Buffer<V8> scaled_gradient_, damping_p_;

@@ -201,6 +201,19 @@ void bind(py::module_& m, const char* name) {
              }
              return found ? py::object(x) : py::none();
            })
+      .def("pcg",
+           [](K& k, const Doubles& scale, int kind, std::tuple<double, std::int64_t, double, double> limits, bool formed,
+              py::array_t<double, py::array::c_style> out) {
+             const auto [t_eps, max_iterations, radius, q_eps] = limits;
+             const double* d = scale.data();
+             double* x = out.mutable_data();
+             ba::PcgEnd end;
+             {
+               py::gil_scoped_release release;
+               end = k.pcg(d, static_cast<ba::Preconditioner>(kind), {t_eps, max_iterations, radius, q_eps}, formed, x);
+             }
+             return py::make_tuple(end.found, end.iterations, end.on_boundary);
+           })
       .def("product",
            [](K& k, const Doubles& x) {
              Doubles out = empty({k.n_free() * D});

@@ -19,21 +19,6 @@
 
 namespace ba {
 
-// y -= b x, or b' x.
-template <int D>
-inline void subtract_multiplied(const Block<D>& b, const double* x, double* y) {
-  for (int c = 0; c < D; ++c)
-    for (int r = 0; r < D; ++r) y[r] -= entry(b, r, c) * x[c];
-}
-template <int D>
-inline void subtract_multiplied_transposed(const Block<D>& b, const double* x, double* y) {
-  for (int c = 0; c < D; ++c) {
-    double total = 0;
-    for (int r = 0; r < D; ++r) total += entry(b, r, c) * x[r];
-    y[c] -= total;
-  }
-}
-
 template <int D>
 class SparseCholesky {
  public:
@@ -85,11 +70,11 @@ class SparseCholesky {
     for (std::int64_t j = 0; j < n; ++j) {
       apply_inverse(j, false, part);
       for (std::int64_t k = fill_.below.start[j]; k < fill_.below.start[j + 1]; ++k)
-        subtract_multiplied(column_[k], part, &x_[fill_.below.index[k] * D]);
+        add_multiplied<-1>(column_[k], part, &x_[fill_.below.index[k] * D]);
     }
     for (std::int64_t j = n - 1; j >= 0; --j) {
       for (std::int64_t k = fill_.below.start[j]; k < fill_.below.start[j + 1]; ++k)
-        subtract_multiplied_transposed(column_[k], &x_[fill_.below.index[k] * D], &x_[j * D]);
+        add_multiplied_transposed<-1>(column_[k], &x_[fill_.below.index[k] * D], &x_[j * D]);
       apply_inverse(j, true, part);
     }
     for (std::int64_t j = 0; j < n; ++j)
@@ -197,8 +182,8 @@ class SparseCholesky {
   // x_j <- L_jj^-1 x_j or L_jj^-T x_j; also in out.
   void apply_inverse(std::int64_t j, bool transposed, double* out) {
     for (int i = 0; i < D; ++i) out[i] = 0.0;
-    if (transposed) subtract_multiplied_transposed(inverse_[j], &x_[j * D], out);
-    else subtract_multiplied(inverse_[j], &x_[j * D], out);
+    if (transposed) add_multiplied_transposed<-1>(inverse_[j], &x_[j * D], out);
+    else add_multiplied<-1>(inverse_[j], &x_[j * D], out);
     for (int i = 0; i < D; ++i) x_[j * D + i] = out[i];
   }
 

@@ -51,6 +51,20 @@ class SparseSchur {
   const Rows32& pattern() const { return pattern_; }
   const Buffer<Block<D>>& blocks() const { return blocks_; }
 
+  const Block<D>& diagonal_block(std::int64_t k) const { return blocks_[pattern_.start[k]]; }
+
+  // S x, of what has been assembled.
+  void multiply(const double* x, double* out) const {
+    std::fill_n(out, l_.n_free * D, 0.0);
+    for (std::int64_t i = 0; i < l_.n_free; ++i) {
+      for (std::int64_t k = pattern_.start[i]; k < pattern_.start[i + 1]; ++k) {
+        const std::int64_t j = pattern_.index[k];
+        add_multiplied<1>(blocks_[k], x + j * D, out + i * D);
+        if (j != i) add_multiplied_transposed<1>(blocks_[k], x + i * D, out + j * D);
+      }
+    }
+  }
+
   // S = B + damping - Z Z', summed point by point. add_diagonal(k, block): add B and damping of keyframe k.
   template <class Add>
   void assemble(Pool& pool, Coupling<D>& coupling, Add add_diagonal) {
