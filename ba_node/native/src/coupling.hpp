@@ -12,7 +12,6 @@
 #include "blocks.hpp"
 #include "equations.hpp"
 #include "layout.hpp"
-#include "pool.hpp"
 #include "rows.hpp"
 
 namespace ba {
@@ -51,20 +50,15 @@ class Coupling {
     }
   }
 
-  // Call sum(part, first, end, z) for runs of batches, for each of as many parts as there are threads; z: Z of the run's
-  // edges. A run is what stays in the cache.
+  // The most edges that a batch has.
+  std::int64_t most_edges() const { return most_edges_; }
+
+  // Call sum(begin, end, z) for the edges of each batch of [first, end); z: their Z, from edge `begin` on, most_edges().
   template <class Sum>
-  void with_edges(Pool& pool, Sum sum) {
-    z_.resize(most_edges_ + (pool.threads() > 1 ? kRunEdges : 0));
-    for (std::int64_t first = 0; first < l_.n_batches;) {
-      std::int64_t end = first + 1;
-      if (pool.threads() > 1)
-        while (end < l_.n_batches && first_edge(end) - first_edge(first) < kRunEdges) ++end;
-      pool.each(end - first, [&](std::int64_t i, int) {
-        edges_of(first + i, z_.data() + (first_edge(first + i) - first_edge(first)));
-      });
-      pool.each(pool.threads(), [&](std::int64_t part, int) { sum(part, first, end, z_.data()); });
-      first = end;
+  void with_edges(std::int64_t first, std::int64_t end, Edge<D>* z, Sum sum) const {
+    for (std::int64_t i = first; i < end; ++i) {
+      edges_of(i, z);
+      sum(l_.point_edge[kLanes * i], l_.point_edge[kLanes * (i + 1)], z);
     }
   }
 
@@ -132,8 +126,6 @@ class Coupling {
   }
 
  private:
-  static constexpr std::int64_t kRunEdges = 2048;
-
   std::int64_t first_edge(std::int64_t batch) const { return l_.point_edge[kLanes * batch]; }
 
   // kGeneral: edges of several observations, or with depth.
@@ -255,7 +247,6 @@ class Coupling {
   Buffer<V8> inverse_l_;
   Buffer<Column<D>> step_;
   std::int64_t most_edges_ = 0;  // of a batch
-  Buffer<Edge<D>> z_;
 };
 
 }  // namespace ba

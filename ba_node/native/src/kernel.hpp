@@ -180,12 +180,7 @@ class Kernel {
   // otherwise without it.
   PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) {
     if (formed) assemble();
-    diagonal_.resize(l_.n_free);
-    if (kind != Preconditioner::kNone) {
-      for (std::int64_t k = 0; formed && k < l_.n_free; ++k) diagonal_[k] = schur().diagonal_block(k);
-      if (!formed) find_diagonal();
-    }
-    inverse_.set(diagonal_.data(), l_.n_free, scale, kind);
+    inverse_.set(kind == Preconditioner::kNone ? nullptr : find_diagonal(), l_.n_free, scale, kind);
     pcg_.resize(l_.n_free * D);
     rhs_as_given_.resize(l_.n_free * D);
     rhs(rhs_as_given_.data());
@@ -224,8 +219,8 @@ class Kernel {
   }
 
   void diagonal_blocks(double* out) {
-    find_diagonal();
-    for (std::int64_t k = 0; k < l_.n_free; ++k) write_block(diagonal_[k], out + k * D * D, D);
+    const Block<D>* blocks = find_diagonal();
+    for (std::int64_t k = 0; k < l_.n_free; ++k) write_block(blocks[k], out + k * D * D, D);
   }
 
   // Step of the points for a step of the free keyframes (n_free x D), added to `base` unless that is null; returns the
@@ -327,14 +322,12 @@ class Kernel {
         take(i, s.pattern().index[k], s.blocks()[k]);
   }
 
-  void find_diagonal() {
-    diagonal_.resize(l_.n_free);
-    const auto add = [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); };
-    schur().diagonal(pool_, coupling_, add, diagonal_.data());
+  const Block<D>* find_diagonal() {
+    return schur().diagonal(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); });
   }
 
   SparseSchur<D>& schur() {
-    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, pool_.threads());
+    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, coupling_.most_edges(), pool_.threads());
     return *schur_;
   }
 
@@ -375,7 +368,6 @@ class Kernel {
   Pcg pcg_;
   DiagonalInverse<D> inverse_;
   Buffer<double> rhs_as_given_;
-  Buffer<Block<D>> diagonal_;
   Buffer<Column<D>> rhs_, sums_;  // sums_: of each chunk
   Buffer<V8> scaled_gradient_, damping_p_;
   std::vector<double> damping_c_;

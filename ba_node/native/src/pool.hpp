@@ -51,13 +51,24 @@ class Pool {
     }
     wake_.notify_all();
     take(0);
-    for (int spin = 0; busy_.load(std::memory_order_acquire) != 0; ++spin)
+    for (int spin = 0; busy_.load(std::memory_order_acquire) != 0; ++spin) {
+      relax();
       if (spin > kSpins) std::this_thread::yield();
+    }
   }
 
  private:
-  // Some ten microseconds: loops follow one another closely, and to wake a thread takes longer than a short loop.
-  static constexpr int kSpins = 10000;
+  // Some hundred microseconds: loops follow one another with a little Python between them, and to wake a thread takes
+  // as long as such a loop.
+  static constexpr int kSpins = 4000;
+
+  static void relax() {
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    asm volatile("yield");
+#endif
+  }
 
   void take(int thread) {
     for (std::int64_t i = next_.fetch_add(1); i < count_; i = next_.fetch_add(1)) call_(function_, i, thread);
@@ -66,8 +77,7 @@ class Pool {
   void work(int thread) {
     std::uint64_t seen = 0;
     while (true) {
-      for (int spin = 0; spin < kSpins && round_.load(std::memory_order_acquire) == seen; ++spin) {
-      }
+      for (int spin = 0; spin < kSpins && round_.load(std::memory_order_acquire) == seen; ++spin) relax();
       if (round_.load(std::memory_order_acquire) == seen) {
         std::unique_lock<std::mutex> lock(mutex_);
         wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != seen; });

@@ -38,7 +38,7 @@ class SparseCholesky {
   const Fill& fill() const { return fill_; }
 
   // Factor; s: blocks of the upper triangle in the order of the pattern. False if it is not positive definite.
-  bool factor(const Buffer<Block<D>>& s) {
+  bool factor(const Block<D>* s) {
     const std::int64_t n = static_cast<std::int64_t>(diagonal_.size());
     for (std::int64_t j = 0; j < n; ++j) {
       load(j, s);
@@ -137,7 +137,7 @@ class SparseCholesky {
     }
   }
 
-  void load(std::int64_t j, const Buffer<Block<D>>& s) {
+  void load(std::int64_t j, const Block<D>* s) {
     clear(column_.data() + fill_.below.start[j], fill_.below.start[j + 1] - fill_.below.start[j]);
     for (std::int64_t k = source_start_[j]; k < source_start_[j + 1]; ++k) {
       const Source& from = sources_[k];

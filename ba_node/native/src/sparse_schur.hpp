@@ -42,16 +42,18 @@ inline Rows32 shared_points(const Layout& l) {
 template <int D>
 class SparseSchur {
  public:
-  SparseSchur(const Layout& l, int threads) : l_(l), pattern_(shared_points(l)) {
-    blocks_.resize(pattern_.index.size());
-    cut_rows(threads);
+  SparseSchur(const Layout& l, std::int64_t most_edges, int threads)
+      : l_(l), pattern_(shared_points(l)), most_edges_(most_edges) {
+    scratch_.resize(most_edges * threads);
+    cut_points();
+    blocks_.resize(n_blocks() * groups());
+    diagonal_.resize(l_.n_free * groups());
     index_rows();
   }
 
   const Rows32& pattern() const { return pattern_; }
-  const Buffer<Block<D>>& blocks() const { return blocks_; }
-
-  const Block<D>& diagonal_block(std::int64_t k) const { return blocks_[pattern_.start[k]]; }
+  // In the order of the pattern.
+  const Block<D>* blocks() const { return blocks_.data(); }
 
   // S x, of what has been assembled.
   void multiply(const double* x, double* out) const {
@@ -67,38 +69,84 @@ class SparseSchur {
 
   // S = B + damping - Z Z', summed point by point. add_diagonal(k, block): add B and damping of keyframe k.
   template <class Add>
-  void assemble(Pool& pool, Coupling<D>& coupling, Add add_diagonal) {
-    clear(blocks_.data(), static_cast<std::int64_t>(blocks_.size()));
-    coupling.with_edges(pool, [&](std::int64_t part, std::int64_t first, std::int64_t end, const Edge<D>* z) {
-      const std::int32_t begin = l_.point_edge[kLanes * first], stop = l_.point_edge[kLanes * end];
-      for (std::int32_t e = begin; e < stop; ++e) {
-        const std::int32_t i = l_.edge_column[e];
-        if (i >= rows_cut_[part] && i < rows_cut_[part + 1]) sum_edge(e, i, z - begin);
-      }
+  void assemble(Pool& pool, const Coupling<D>& coupling, Add add_diagonal) {
+    pool.each(groups(), [&](std::int64_t group, int thread) {
+      Block<D>* blocks = &blocks_[group * n_blocks()];
+      clear(blocks, n_blocks());
+      const auto sum = [&](std::int32_t begin, std::int32_t end, const Edge<D>* z) {
+        for (std::int32_t e = begin; e < end; ++e) sum_edge(e, z - begin, blocks);
+      };
+      coupling.with_edges(cut_[group], cut_[group + 1], &scratch_[thread * most_edges_], sum);
+    });
+    pool.each(groups() > 1 ? kPieces : 0, [&](std::int64_t piece, int) {
+      add_groups(blocks_.data(), n_blocks(), n_blocks() * piece / kPieces, n_blocks() * (piece + 1) / kPieces);
     });
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
   }
 
   // The diagonal blocks alone, n_free.
   template <class Add>
-  void diagonal(Pool& pool, Coupling<D>& coupling, Add add_diagonal, Block<D>* out) const {
-    clear(out, l_.n_free);
-    coupling.with_edges(pool, [&](std::int64_t part, std::int64_t first, std::int64_t end, const Edge<D>* z) {
-      const std::int32_t begin = l_.point_edge[kLanes * first], stop = l_.point_edge[kLanes * end];
-      for (std::int32_t e = begin; e < stop; ++e) {
-        const std::int32_t k = l_.edge_column[e];
-        if (k >= rows_cut_[part] && k < rows_cut_[part + 1]) subtract_product(out[k], Left<D>(z[e - begin]), z[e - begin]);
-      }
+  const Block<D>* diagonal(Pool& pool, const Coupling<D>& coupling, Add add_diagonal) {
+    pool.each(groups(), [&](std::int64_t group, int thread) {
+      Block<D>* blocks = &diagonal_[group * l_.n_free];
+      clear(blocks, l_.n_free);
+      const auto sum = [&](std::int32_t begin, std::int32_t end, const Edge<D>* z) {
+        for (std::int32_t e = begin; e < end; ++e)
+          subtract_product(blocks[l_.edge_column[e]], Left<D>(z[e - begin]), z[e - begin]);
+      };
+      coupling.with_edges(cut_[group], cut_[group + 1], &scratch_[thread * most_edges_], sum);
     });
-    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, out[k]);
+    add_groups(diagonal_.data(), l_.n_free, 0, l_.n_free);
+    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, diagonal_[k]);
+    return diagonal_.data();
   }
 
  private:
-  // What the pairs of an edge with itself and the later ones of its point add to row i. z: by edge.
-  void sum_edge(std::int32_t e, std::int32_t i, const Edge<D>* z) {
+  // Groups of points are summed apart, each by one thread, and then added in turn: the problem alone decides how many.
+  static constexpr std::int64_t kMaxGroups = 4, kPieces = 16;
+  // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
+  static constexpr std::int64_t kWorkOfBlock = 100, kGroupBytes = std::int64_t{1} << 25;
+
+  std::int64_t n_blocks() const { return static_cast<std::int64_t>(pattern_.index.size()); }
+  std::int64_t groups() const { return static_cast<std::int64_t>(cut_.size()) - 1; }
+
+  // Where groups begin, as batches, with about as much work in each: Z of an edge takes as long as a pair and a half.
+  void cut_points() {
+    const auto work = [this](std::int64_t batch) {
+      std::int64_t twice = 0;
+      for (std::int32_t e = l_.point_edge[kLanes * batch]; e < l_.point_edge[kLanes * (batch + 1)]; ++e)
+        twice += 3 + 2 * (l_.edge_end[e] - e);
+      return twice;
+    };
+    std::int64_t all = 0, done = 0;
+    for (std::int64_t i = 0; i < l_.n_batches; ++i) all += work(i);
+    const std::int64_t n = std::max<std::int64_t>(n_blocks(), 1);
+    const std::int64_t fit = kGroupBytes / (n * static_cast<std::int64_t>(sizeof(Block<D>)));
+    const std::int64_t count = std::clamp<std::int64_t>(std::min(1 + all / (kWorkOfBlock * n), fit), 1, kMaxGroups);
+    cut_.push_back(0);
+    for (std::int64_t i = 0; i < l_.n_batches; ++i) {
+      done += work(i);
+      const std::int64_t next = static_cast<std::int64_t>(cut_.size());
+      if (next < count && done * count >= all * next) cut_.push_back(i + 1);
+    }
+    cut_.push_back(l_.n_batches);
+  }
+
+  // Onto the blocks [begin, end) of the first group those of the others; n: blocks of a group.
+  void add_groups(Block<D>* blocks, std::int64_t n, std::int64_t begin, std::int64_t end) const {
+    const std::int64_t count = static_cast<std::int64_t>(sizeof(Block<D>) / sizeof(double));
+    double* to = reinterpret_cast<double*>(blocks);
+    for (std::int64_t group = 1; group < groups(); ++group) {
+      const double* from = to + group * n * count;
+      for (std::int64_t i = begin * count; i < end * count; ++i) to[i] += from[i];
+    }
+  }
+
+  // What the pairs of an edge with itself and the later ones of its point add to its row. z: by edge.
+  void sum_edge(std::int32_t e, const Edge<D>* z, Block<D>* blocks) const {
+    const std::int32_t *column = l_.edge_column.data(), i = column[e], *place = place_.data() + place_of_[i];
     const Left<D> left(z[e]);
-    const std::int32_t *place = place_.data() + place_of_[i], *column = l_.edge_column.data();
-    Block<D>* row = &blocks_[pattern_.start[i]];
+    Block<D>* row = blocks + pattern_.start[i];
     for (std::int32_t f = e, end = l_.edge_end[e]; f < end; ++f) subtract_product(row[place[column[f]]], left, z[f]);
   }
 
@@ -112,29 +160,14 @@ class SparseSchur {
     }
   }
 
-  // Rows of S for each thread, about as many pairs of edges for each. What a row sums does not depend on it.
-  void cut_rows(int threads) {
-    std::vector<double> pairs(l_.n_free, 0.0);
-    double all = 0, done = 0;
-    for (std::int64_t e = 0; e < l_.n_edges(); ++e) {
-      pairs[l_.edge_column[e]] += l_.edge_end[e] - e;
-      all += l_.edge_end[e] - e;
-    }
-    rows_cut_.push_back(0);
-    for (std::int64_t i = 0; i < l_.n_free; ++i) {
-      done += pairs[i];
-      while (static_cast<int>(rows_cut_.size()) < threads && done >= all * static_cast<double>(rows_cut_.size()) / threads)
-        rows_cut_.push_back(i + 1);
-    }
-    rows_cut_.resize(threads + 1, l_.n_free);
-  }
-
   const Layout& l_;
   Rows32 pattern_;
-  Buffer<Block<D>> blocks_;
+  std::vector<std::int64_t> cut_;
+  Buffer<Block<D>> blocks_, diagonal_;  // of each group; the sums are in the first
+  std::int64_t most_edges_;
+  Buffer<Edge<D>> scratch_;  // of each thread
   Buffer<std::int32_t> place_;          // for columns between those of the row, nothing
   std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j]
-  std::vector<std::int64_t> rows_cut_;
 };
 
 }  // namespace ba
