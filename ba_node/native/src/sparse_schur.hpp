@@ -105,7 +105,7 @@ class SparseSchur {
   // Groups of points are summed apart, each by one thread, and then added in turn: the problem alone decides how many.
   static constexpr std::int64_t kMaxGroups = 4, kPieces = 16;
   // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
-  static constexpr std::int64_t kWorkOfBlock = 100, kGroupBytes = std::int64_t{1} << 25;
+  static constexpr std::int64_t kWorkOfBlock = 100, kGroupBytes = 20 << 20;
 
   std::int64_t n_blocks() const { return static_cast<std::int64_t>(pattern_.index.size()); }
   std::int64_t groups() const { return static_cast<std::int64_t>(cut_.size()) - 1; }
