@@ -90,7 +90,11 @@ def case_problem(case: Case) -> Problem:
     fixed = np.arange(problem.n_keyframes) < case.n_fixed
     if case.size == 9:
         return replace(problem, fixed=fixed)
-    own, camera_of = np.unique(case.bal.cameras[:, 6:], axis=0, return_inverse=True)
+    intrinsics = case.bal.cameras[:, 6:]
+    if (intrinsics == intrinsics[:1]).all():
+        own, camera_of = intrinsics[:1], np.zeros(len(intrinsics), dtype=np.intp)
+    else:
+        own, camera_of = np.unique(intrinsics, axis=0, return_inverse=True)
     params = np.zeros((len(own), 12))
     params[:, 0] = params[:, 1] = own[:, 0]
     params[:, 4:6] = own[:, 1:]

@@ -73,8 +73,8 @@ class SolverOptions:
 
     def check(self) -> None:
         """Raise ChoiceError if a choice does not exist or contradicts another; say which, and what to do."""
-        for values in (dataclasses.asdict(self), dataclasses.asdict(self.rules)):
-            for name, value in values.items():
+        for owner in (self, self.rules):
+            for name, value in vars(owner).items():
                 if name in PARTS and value not in PARTS[name].names:
                     PARTS[name].resolve(value)
                     raise ChoiceError(f"option {name} = {value!r} is another name: write {PARTS[name].resolve(value)}")

@@ -132,10 +132,10 @@ class Problem:
         _check_shapes(self, n_obs)
         limits = ((obs.keyframe, self.n_keyframes), (obs.camera, len(self.cameras.model)), (obs.point, self.n_points))
         for (index, limit), name in zip(limits, ("keyframe", "camera", "point"), strict=True):
-            bad = np.flatnonzero((index < 0) | (index >= limit))
-            if len(bad):
+            if n_obs and (index.min() < 0 or index.max() >= limit):
+                bad = np.flatnonzero((index < 0) | (index >= limit))
                 raise ProblemError(f"observation {bad[0]}: {name} index {index[bad[0]]} is out of range [0, {limit})")
-        if np.any(np.diff(obs.point) < 0):
+        if (obs.point[1:] < obs.point[:-1]).any():
             raise ProblemError("observations are not sorted by point: sort them (stable) first")
         for name, array in (("uv", obs.uv), ("sigma_px", obs.sigma_px), ("camera params", self.cameras.params)):
             if not np.isfinite(array).all():

@@ -10,6 +10,7 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdlib>
+#include <cstring>
 #include <mutex>
 #include <new>
 #include <type_traits>
@@ -30,6 +31,13 @@ class Slabs {
   static Slabs& shared() {
     static Slabs* slabs = new Slabs;  // never destroyed: kernels may outlive what is static
     return *slabs;
+  }
+
+  // Touch the first page, so that the first small solve does not.
+  void warm() {
+    void* piece = take(kHugePage);
+    std::memset(piece, 0, kHugePage);
+    give(piece, kHugePage);
   }
 
   void* take(std::size_t bytes) {

@@ -251,6 +251,7 @@ void bind(py::module_& m, const char* name) {
 }  // namespace
 
 PYBIND11_MODULE(_kernels, m) {
+  ba::Slabs::shared().warm();
   m.doc() = "Kernels of bundle adjustment in C++; see ba_node/core/kernels.py.";
   bind<6>(m, "Kernel6");
   bind<9>(m, "Kernel9");
