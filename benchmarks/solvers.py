@@ -70,6 +70,12 @@ def find(build: Path, python: str) -> tuple[list[Solver], list[str]]:
         ours += [Solver(f"ceres {name}", (str(driver),), name, quick=name == "dense") for name in _CERES]
     else:
         absent.append(f"ceres: {reason}")
+    rootba = next(filter(None, map(shutil.which, ("bal", "bal_sc"))), None)
+    if rootba is None:
+        absent.append("rootba: its program bal is not on the PATH")
+    for name in _ROOTBA if rootba else ():
+        command = (sys.executable, "-m", "benchmarks.peers.rootba_run")
+        ours.append(Solver(f"rootba {name}", command, f"{rootba}:{name}", sizes=(9,), quick=False))
     for peer in _WHEELS:
         module = peer.command[-1]
         missing = _missing_modules(python, _IMPORTS[module])
@@ -83,6 +89,7 @@ def find(build: Path, python: str) -> tuple[list[Solver], list[str]]:
 
 
 _CERES = ("dense", "sparse", "iterative")
+_ROOTBA = ("sc", "qr", "power")
 _IMPORTS = {
     "pycolmap_run": ("pycolmap",),
     "gtsam_run": ("gtsam",),
