@@ -19,10 +19,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-# Rates of one core, flop/s and byte/s: measured on an AMD EPYC (AVX-512), which other work shared. Their ratios count.
-_FORM_FLOPS = 12e9
-_DENSE_FLOPS = 23e9
-_SPARSE_FLOPS = 32e9
+# Rates of one core, flop/s and byte/s: measured on an AMD EPYC (AVX2). Their ratios count.
+_FORM_FLOPS = 20e9
+_DENSE_FLOPS = 25e9
+_SPARSE_FLOPS = 28e9
 _SPARSE_FLOPS_LARGE = 10e9
 _BYTES = 12e9
 # Bytes that a column of the factor and its sources may take before the lower rate holds.
