@@ -109,6 +109,16 @@ def test_diagonal_blocks_are_those_of_the_system(shape: dict[str, object], make_
 
 
 @built
+def test_keyframes_far_apart_that_meet_again(make_problem: Make) -> None:
+    """On a ring of 110 the row of the first keyframe spans all columns for three blocks: there they are searched."""
+    whole, _ = make_problem(keyframes=110, points=330, fixed=0, seen_share=1.0)
+    problem = ring(whole, 2)
+    found, expected = systems(problem, 1e-3)[0].dense(), systems(problem, 1e-3, "numpy")[0].dense()
+    assert np.count_nonzero(expected[:6].reshape(6, 110, 6).any(axis=(0, 2))) == 3
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@built
 @pytest.mark.parametrize("kind", ["none", "schur_block", "schur_diag"])
 @pytest.mark.parametrize("formed", [False, True])
 @pytest.mark.parametrize("own", [False, True])

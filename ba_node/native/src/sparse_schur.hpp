@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <limits>
 #include <vector>
 
 #include "block_fill.hpp"
@@ -107,6 +108,9 @@ class SparseSchur {
   // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
   static constexpr std::int64_t kWorkOfBlock = 100, kGroupBytes = 20 << 20;
 
+  // Columns of a row for each of its blocks up to which it has a table; what stands for none.
+  static constexpr std::int64_t kMaxSpan = 32, kSearched = std::numeric_limits<std::int64_t>::min();
+
   std::int64_t n_blocks() const { return static_cast<std::int64_t>(pattern_.index.size()); }
   std::int64_t groups() const { return static_cast<std::int64_t>(cut_.size()) - 1; }
 
@@ -144,18 +148,30 @@ class SparseSchur {
 
   // What the pairs of an edge with itself and the later ones of its point add to its row. z: by edge.
   void sum_edge(std::int32_t e, const Edge<D>* z, Block<D>* blocks) const {
-    const std::int32_t *column = l_.edge_column.data(), i = column[e], *place = place_.data() + place_of_[i];
+    const std::int32_t *column = l_.edge_column.data(), i = column[e], end = l_.edge_end[e];
     const Left<D> left(z[e]);
     Block<D>* row = blocks + pattern_.start[i];
-    for (std::int32_t f = e, end = l_.edge_end[e]; f < end; ++f) subtract_product(row[place[column[f]]], left, z[f]);
+    if (place_of_[i] == kSearched) {
+      const std::int32_t *first = &pattern_.index[pattern_.start[i]], *stop = &pattern_.index[pattern_.start[i + 1]];
+      for (std::int32_t f = e; f < end; ++f)
+        subtract_product(row[std::lower_bound(first, stop, column[f]) - first], left, z[f]);
+      return;
+    }
+    const std::int32_t* place = place_.data() + place_of_[i];
+    for (std::int32_t f = e; f < end; ++f) subtract_product(row[place[column[f]]], left, z[f]);
   }
 
-  // Where in its row a block is, by row from the diagonal to the last.
+  // Where in its row a block is, by column from the diagonal to the last, unless that is too long for what it holds.
   void index_rows() {
     for (std::int64_t i = 0; i < l_.n_free; ++i) {
       const std::int64_t begin = pattern_.start[i], end = pattern_.start[i + 1];
+      const std::int64_t span = pattern_.index[end - 1] - i + 1;
+      if (span > kMaxSpan * (end - begin)) {
+        place_of_.push_back(kSearched);
+        continue;
+      }
       place_of_.push_back(static_cast<std::int64_t>(place_.size()) - i);
-      place_.resize(place_.size() + pattern_.index[end - 1] - i + 1);
+      place_.resize(place_.size() + span);
       for (std::int64_t k = begin; k < end; ++k) place_[place_of_[i] + pattern_.index[k]] = static_cast<std::int32_t>(k - begin);
     }
   }
@@ -167,7 +183,7 @@ class SparseSchur {
   std::int64_t most_edges_;
   Buffer<Edge<D>> scratch_;  // of each thread
   Buffer<std::int32_t> place_;          // for columns between those of the row, nothing
-  std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j]
+  std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j], or kSearched
 };
 
 }  // namespace ba
