@@ -4,12 +4,14 @@
 
 Solves the same problem several times in one process and shows for each part the median over the solves, so that what
 happens once a process (imports, first touch of libraries) is told apart: it is the first solve less the median.
+GFLOP/s are those of the flops counted in floor.py, which leave out polishing: a row with it has none.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import statistics
 import sys
 import time
@@ -25,6 +27,7 @@ from ba_node.core import solver as loop
 from ba_node.core.methods import METHODS
 from ba_node.core.objective import Rules
 from benchmarks import problems
+from benchmarks.floor import flops
 from benchmarks.problem_file import Case, case_problem
 from benchmarks.report import table
 
@@ -96,20 +99,24 @@ def main() -> int:
             print(f"skipped: {problem.name}: no {problem.needs} in {args.data}")
             continue
         runs = [solve_once(prepared[1], problem.loss, {"backend": args.backend}) for _ in range(args.repeats)]
-        print(f"\n{problem.name}: {runs[0][1]} iterations\n\n{_table(runs)}")
+        print(f"\n{problem.name}: {runs[0][1]} iterations\n\n{_table(runs, flops(prepared[1]))}")
     return 0
 
 
-def _table(runs: list[tuple[Seconds, int]]) -> str:
+def _table(runs: list[tuple[Seconds, int]], counted: Mapping[str, float]) -> str:
     iterations = max(runs[0][1], 1)
     middle = {name: statistics.median(run[name] for run, _ in runs) for name in runs[0][0]}
+    factor = counted["eliminate"] + counted["solve"]
+    work = {"linearise": counted["linearise"], "solve_sparse": factor, "solve_dense": factor}
     rows = []
     for name, seconds in sorted(middle.items(), key=lambda item: -item[1]):
         first = 1e3 * (runs[0][0][name] - seconds)
         once = name.startswith("set-up")
         each = "" if once else f"{1e3 * seconds / iterations:.3f}"
-        rows.append([name, f"{1e3 * seconds:.2f}", each, f"{100 * seconds / middle['total']:.0f} %", f"{first:.1f}"])
-    return table(["part", "ms a solve", "ms/iter", "share", "more in the first solve, ms"], rows)
+        rate = f"{1e-9 * work[name] * iterations / seconds:.1f}" if math.isfinite(work.get(name, math.nan)) else ""
+        share = f"{100 * seconds / middle['total']:.0f} %"
+        rows.append([name, f"{1e3 * seconds:.2f}", each, share, rate, f"{first:.1f}"])
+    return table(["part", "ms a solve", "ms/iter", "share", "GFLOP/s", "more in the first solve, ms"], rows)
 
 
 if __name__ == "__main__":

@@ -42,22 +42,29 @@ class Peak:
     gbytes_s: float
 
 
-def work(case: Case) -> tuple[float, float]:
-    """Return flops and bytes of one iteration; NaN where S would not be dense."""
+def flops(case: Case) -> dict[str, float]:
+    """Return the flops of one iteration by part: linearise, eliminate, solve, judge; NaN where S would not be dense."""
     bal, d = case.bal, case.size
-    n_free = len(bal.cameras) - case.n_fixed
-    n = d * n_free
-    if n > _MAX_DENSE:
-        return np.nan, np.nan
+    n = d * (len(bal.cameras) - case.n_fixed)
     n_obs = len(bal.observations)
     free = bal.camera_index >= case.n_fixed
     seen = np.bincount(bal.point_index[free], minlength=len(bal.points)).astype(float)
     n_free_obs = float(free.sum())
     pairs = float(np.sum(seen * (seen + 1.0) / 2.0))
-    flops = 180.0 * n_obs + 4.0 * 9.0 * n_obs + 4.0 * n_free_obs * (d * (d + 1) / 2.0 + 4.0 * d)
-    flops += 60.0 * len(bal.points) + 18.0 * d * n_free_obs + 6.0 * d * d * pairs
-    flops += n**3 / 3.0 + 2.0 * n * n + 12.0 * d * n_free_obs
-    return flops, 24.0 * n_obs + 72.0 * d * n_free_obs + 16.0 * n * n
+    return {
+        "linearise": 156.0 * n_obs + 4.0 * n_free_obs * (d * (d + 1) / 2.0 + 4.0 * d),
+        "eliminate": 60.0 * len(bal.points) + 18.0 * d * n_free_obs + 6.0 * d * d * pairs,
+        "solve": n**3 / 3.0 + 2.0 * n * n if n <= _MAX_DENSE else np.nan,
+        "judge": 60.0 * n_obs + 12.0 * d * n_free_obs,
+    }
+
+
+def work(case: Case) -> tuple[float, float]:
+    """Return flops and bytes of one iteration; NaN where S would not be dense."""
+    bal, d = case.bal, case.size
+    n = d * (len(bal.cameras) - case.n_fixed)
+    n_free_obs = float((bal.camera_index >= case.n_fixed).sum())
+    return sum(flops(case).values()), 24.0 * len(bal.observations) + 72.0 * d * n_free_obs + 16.0 * n * n
 
 
 def floor_s(case: Case, peak: Peak) -> float:

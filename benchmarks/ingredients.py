@@ -37,6 +37,8 @@ def variants(loss: str) -> dict[str, SolverOptions]:
         "all": base,
         "polish_steps=0": dataclasses.replace(base, polish_steps=0),
         "damping_policy=nielsen": dataclasses.replace(base, damping_policy="nielsen"),
+        "linear_solver=cholesky": dataclasses.replace(base, linear_solver="cholesky"),
+        "linear_solver=pcg": dataclasses.replace(base, linear_solver="pcg"),
         "threads=2": dataclasses.replace(base, threads=2),
         "backend=numpy": dataclasses.replace(base, backend="numpy"),
         "backend=numpy parameterisation=global": dataclasses.replace(base, backend="numpy", rules=wide),
