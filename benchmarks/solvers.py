@@ -89,7 +89,7 @@ def find(build: Path, python: str) -> tuple[list[Solver], list[str]]:
 
 
 _CERES = ("dense", "sparse", "iterative")
-_ROOTBA = ("sc", "qr", "power")
+_ROOTBA = ("sc", "qr", "power", "power-50")
 _IMPORTS = {
     "pycolmap_run": ("pycolmap",),
     "gtsam_run": ("gtsam",),

@@ -29,7 +29,7 @@ _BYTES = 12e9
 _CACHE_BYTES = 5e6
 # Steps of PCG that an outer iteration is charged.
 _PCG_STEPS = 60
-# From so many steps of PCG on for the cost of an exact solution PCG is tried first, for half as many.
+# From so many steps of PCG on for the cost of forming S PCG is tried first, for half as many.
 _WORTH_A_TRY = 15
 # No factor may take more memory than this.
 MAX_BYTES = 4.8e9
@@ -100,13 +100,13 @@ def pcg_s(sizes: Sizes) -> float:
     return _PCG_STEPS * 3.0 * 8.0 * sizes.block * sizes.edges / _BYTES
 
 
-def pcg_tries(sizes: Sizes, factor: Factor | None) -> int:
+def pcg_tries(sizes: Sizes) -> int:
     """Return how many steps of PCG to try before an exact solution; 0 for none.
 
-    At half the steps that cost as much, a try that fails makes one iteration half as long again.
+    That costs as much as forming S at least. At half the steps that cost as much, a try that fails makes one iteration
+    half as long again.
     """
-    exact = min(dense_s(sizes), sparse_s(sizes, factor) if factor is not None else math.inf)
-    steps = exact / (pcg_s(sizes) / _PCG_STEPS) if sizes.edges and math.isfinite(exact) else 0.0
+    steps = _form_s(sizes) / (pcg_s(sizes) / _PCG_STEPS) if sizes.edges else 0.0
     return int(0.5 * steps) if steps >= _WORTH_A_TRY else 0
 
 

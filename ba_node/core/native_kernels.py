@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 # As in the enums of kernel.hpp.
 _LOSSES = ("squared", "huber")
 _CHEIRALITY = ("keep", "constant", "drop")
-_PRECONDITIONERS = ("none", "schur_block", "schur_diag")
+_PRECONDITIONERS = ("none", "schur_block", "schur_diag", "b_block", "b_diag")
 
 
 class KernelsError(ValueError):
@@ -54,8 +54,6 @@ def missing(rules: Rules, demands: Demands) -> str:
     reason = native.missing(rules.parameterisation, rules.loss)
     if not reason and demands.schur != "points":
         return f"the C++ kernels eliminate points only, not schur = {demands.schur}"
-    if not reason and demands.preconditioner not in _PRECONDITIONERS:
-        return f"the C++ kernels have no preconditioner {demands.preconditioner}"
     return reason
 
 
@@ -233,8 +231,8 @@ class _NativeSystem:
         return (self._kernel.diagonal_blocks(),)
 
     def own_blocks(self) -> tuple[FloatArray, ...]:
-        """Refuse: see :func:`missing`."""
-        raise KernelsError("the C++ kernels keep no blocks of B apart; take backend numpy or auto")
+        """Refuse: PCG makes its preconditioner inside the kernels."""
+        raise KernelsError("the C++ kernels give no blocks of B away; take backend numpy")
 
     def gather(self, of_keyframes: FloatArray, _of_points: FloatArray) -> FloatArray:
         """Return what belongs to the unknowns of S out of values for all unknowns."""

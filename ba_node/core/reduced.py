@@ -34,17 +34,16 @@ class ReducedSolver:
     """Solve the systems of one run, all in the same way.
 
     Attributes:
-        kind: dense, sparse or pcg; empty before the first system.
-        text: the same for the report, with what it costs.
+        kind: dense, sparse or pcg; empty while none has been needed.
+        text: how, for the report, with what it costs.
     """
 
     def __init__(self, options: SolverOptions) -> None:
         """Keep the choices."""
         self._options = options
         self.kind, self.text = "", ""
-        # PCG is tried before an exact solver that costs as much as so many of its steps; 0 once it did not get there.
-        self._tries = 0
-        self._formed = False
+        # Steps of PCG to be tried before an exact solver; 0 once they did not get there; None before the first system.
+        self._tries: int | None = None
 
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
@@ -56,14 +55,15 @@ class ReducedSolver:
         """
         if len(system.rhs) == 0:
             return linear.Solution(np.zeros(0))
-        if not self.kind:
-            self._choose(system)
+        if self._tries is None:
+            self._tries = self._worth_trying(system)
         if self._tries:
-            eps = min(self._options.t_eps, _TRIED_EPS), min(self._options.q_eps, _TRIED_EPS)
-            found = self._pcg(system, hessian, linear.PcgLimits(eps[0], self._tries, np.inf, eps[1]))
-            if found.x is not None and found.iterations < self._tries:
+            found = self._try(system, hessian, self._tries)
+            if found.iterations < self._tries:
                 return found
             self._tries = 0
+        if not self.kind:
+            self._choose(system)
         if self.kind == "dense":
             return linear.Solution(system.solve_dense())
         if self.kind == "sparse":
@@ -72,13 +72,31 @@ class ReducedSolver:
         options = self._options
         radius *= system.radius_factor
         limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius, options.q_eps)
-        return self._pcg(system, hessian, limits)
+        return self._pcg(system, hessian, limits, options.preconditioner, formed=len(system.rhs) <= DENSE_LIMIT)
 
-    def _pcg(self, system: System, hessian: Hessian, limits: linear.PcgLimits) -> linear.Solution:
-        """Solve by PCG, by the kernels' own where they have one."""
-        kind = self._options.preconditioner
+    def _worth_trying(self, system: System) -> int:
+        """Return how many steps of PCG to try before an exact solver."""
+        options = self._options
+        sizes = system.sizes() if options.linear_solver == "auto" and options.trust_region == "none" else None
+        tries = linear_costs.pcg_tries(sizes) if sizes is not None else 0
+        if tries:
+            self.text = f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
+        return tries
+
+    def _try(self, system: System, hessian: Hessian, steps: int) -> linear.Solution:
+        """Solve by a few steps of PCG; if all of them were taken they did not get there.
+
+        M is made of B: Z, of which the blocks of S are made, would cost as much as the steps that it saves.
+        """
+        t_eps, q_eps = (min(eps, _TRIED_EPS) for eps in (self._options.t_eps, self._options.q_eps))
+        return self._pcg(system, hessian, linear.PcgLimits(t_eps, steps, np.inf, q_eps), "b_block", formed=False)
+
+    def _pcg(
+        self, system: System, hessian: Hessian, limits: linear.PcgLimits, kind: str, *, formed: bool
+    ) -> linear.Solution:
+        """Solve by PCG with a preconditioner, by the kernels' own where they have one."""
         scale = 1.0 / system.gather(*scaling.scaled_space(self._options.demands.space, hessian()))
-        found = system.pcg(kind, scale, limits, formed=self._formed)
+        found = system.pcg(kind, scale, limits, formed=formed)
         if found is None:
             precondition = preconditioner(kind, system, scale)
             found = linear.pcg_steihaug(_scaled_product(system, scale), scale * system.rhs, precondition, limits)
@@ -100,12 +118,6 @@ class ReducedSolver:
         elif asked in ("auto", "cholesky"):
             asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
         self.kind, self.text = asked, linear_costs.describe(asked, n, sizes, factor)
-        self._formed = n <= DENSE_LIMIT
-        if sizes is not None and asked != "pcg" and self._options.linear_solver == "auto":
-            self._tries = linear_costs.pcg_tries(sizes, factor)
-            self._formed &= not self._tries
-            if self._tries:
-                self.text = f"PCG up to {self._tries - 1} steps, where it needs more {self.text}"
 
 
 def preconditioner(kind: str, system: System, scale: FloatArray) -> linear.Product:

@@ -119,7 +119,7 @@ def test_keyframes_far_apart_that_meet_again(make_problem: Make) -> None:
 
 
 @built
-@pytest.mark.parametrize("kind", ["none", "schur_block", "schur_diag"])
+@pytest.mark.parametrize("kind", ["none", "schur_block", "schur_diag", "b_block", "b_diag"])
 @pytest.mark.parametrize("formed", [False, True])
 @pytest.mark.parametrize("own", [False, True])
 def test_the_kernels_pcg_goes_as_that_of_linear(kind: str, formed: bool, own: bool, make_problem: Make) -> None:
@@ -128,7 +128,7 @@ def test_the_kernels_pcg_goes_as_that_of_linear(kind: str, formed: bool, own: bo
     system, hessian = systems(ring(problem, 5), 1e-2)
     scale = 1.0 / np.sqrt(np.maximum(hessian[0].ravel(), 1e-6))
     s = system.sparse().toarray() * scale[:, None] * scale
-    precondition = preconditioner(kind, system, scale)
+    precondition = preconditioner(kind, systems(ring(problem, 5), 1e-2, "numpy")[0], scale)
     whole = linear.pcg_steihaug(lambda x: s @ x, scale * system.rhs, precondition, linear.PcgLimits(1e-8, 2000)).x
     assert whole is not None
     length = float(np.linalg.norm(whole))
@@ -152,14 +152,14 @@ def test_the_kernels_pcg_goes_as_that_of_linear(kind: str, formed: bool, own: bo
 @built
 def test_pcg_is_tried_where_its_steps_cost_next_to_nothing(make_problem: Make) -> None:
     """On a problem where every keyframe sees every point; a problem that needs many steps is then solved exactly."""
-    problem, _ = make_problem(keyframes=40, points=300, seen_share=1.0, fixed=2, start_error=0.003)
+    problem, _ = make_problem(keyframes=80, points=200, seen_share=1.0, fixed=2, start_error=0.003)
     tried = solver.solve(problem, SolverOptions(q_eps=0.1, function_tolerance=1e-9))
     exact = solver.solve(problem, SolverOptions(linear_solver="cholesky", function_tolerance=1e-9))
-    assert "PCG up to" in tried.linear_solver and "PCG" not in exact.linear_solver
+    assert tried.linear_solver.startswith("PCG") and "PCG" not in exact.linear_solver
     assert tried.linear_iterations > 0
     np.testing.assert_allclose(tried.objective_after, exact.objective_after, rtol=1e-6)
     few = Sizes(unknowns=228, block=6, edges=600, pairs=1200)
-    assert linear_costs.pcg_tries(few, Factor(100, 300.0)) == 0
+    assert linear_costs.pcg_tries(few) == 0
 
 
 @built
@@ -167,7 +167,6 @@ def test_a_try_that_does_not_get_there_is_the_last(make_problem: Make) -> None:
     problem, _ = make_problem(keyframes=12, points=300, fixed=0)
     system, hessian = systems(problem, 1e-9)
     reduced = ReducedSolver(SolverOptions())
-    reduced.solve(system, lambda: hessian, np.inf)
     reduced._tries = 2
     found = reduced.solve(system, lambda: hessian, np.inf)
     assert found.x is not None and found.iterations == 0 and reduced._tries == 0

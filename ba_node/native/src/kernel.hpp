@@ -180,7 +180,8 @@ class Kernel {
   // otherwise without it.
   PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) {
     if (formed) assemble();
-    inverse_.set(kind == Preconditioner::kNone ? nullptr : find_diagonal(), l_.n_free, scale, kind);
+    const bool whole = kind == Preconditioner::kSchurBlock || kind == Preconditioner::kOwnBlock;
+    inverse_.set(blocks_of(kind), l_.n_free, scale, whole);
     pcg_.resize(l_.n_free * D);
     rhs_as_given_.resize(l_.n_free * D);
     rhs(rhs_as_given_.data());
@@ -322,6 +323,15 @@ class Kernel {
         take(i, s.pattern().index[k], s.blocks()[k]);
   }
 
+  // What M is made of, null for none.
+  const Block<D>* blocks_of(Preconditioner kind) {
+    if (kind == Preconditioner::kNone) return nullptr;
+    if (kind == Preconditioner::kSchurBlock || kind == Preconditioner::kSchurDiagonal) return find_diagonal();
+    own_.assign(l_.n_free, Block<D>{});
+    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, own_[k]);
+    return own_.data();
+  }
+
   const Block<D>* find_diagonal() {
     return schur().diagonal(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); });
   }
@@ -367,6 +377,7 @@ class Kernel {
   DenseCholesky cholesky_;
   Pcg pcg_;
   DiagonalInverse<D> inverse_;
+  Buffer<Block<D>> own_;
   Buffer<double> rhs_as_given_;
   Buffer<Column<D>> rhs_, sums_;  // sums_: of each chunk
   Buffer<V8> scaled_gradient_, damping_p_;

@@ -14,7 +14,8 @@
 
 namespace ba {
 
-enum class Preconditioner : std::uint8_t { kNone, kSchurBlock, kSchurDiagonal };
+// M: none, or the diagonal blocks or the diagonal of S or of damped B.
+enum class Preconditioner : std::uint8_t { kNone, kSchurBlock, kSchurDiagonal, kOwnBlock, kOwnDiagonal };
 
 struct PcgLimits {
   double t_eps;
@@ -31,13 +32,14 @@ struct PcgEnd {
 template <int D>
 class DiagonalInverse {
  public:
-  // blocks: n diagonal blocks of S; scale: 1/D, n x D.
-  void set(const Block<D>* blocks, std::int64_t n, const double* scale, Preconditioner kind) {
-    kind_ = kind;
-    inverse_.resize(kind == Preconditioner::kNone ? 0 : n * D * (kind == Preconditioner::kSchurBlock ? D : 1));
-    for (std::int64_t k = 0; k < n && kind != Preconditioner::kNone; ++k) {
+  // blocks: n diagonal blocks, null for M = I; scale: 1/D, n x D; whole: the blocks, not their diagonals alone.
+  void set(const Block<D>* blocks, std::int64_t n, const double* scale, bool whole) {
+    is_identity_ = blocks == nullptr;
+    whole_ = whole;
+    inverse_.resize(is_identity_ ? 0 : n * D * (whole ? D : 1));
+    for (std::int64_t k = 0; k < n && !is_identity_; ++k) {
       const double* s = scale + k * D;
-      if (kind == Preconditioner::kSchurBlock) {
+      if (whole) {
         invert(blocks[k], s, &inverse_[k * D * D]);
       } else {
         for (int i = 0; i < D; ++i) inverse_[k * D + i] = reciprocal(entry(blocks[k], i, i) * s[i] * s[i]);
@@ -46,9 +48,9 @@ class DiagonalInverse {
   }
 
   void apply(const Buffer<double>& r, Buffer<double>& z) const {
-    if (kind_ == Preconditioner::kNone) {
+    if (is_identity_) {
       std::copy(r.begin(), r.end(), z.begin());
-    } else if (kind_ == Preconditioner::kSchurDiagonal) {
+    } else if (!whole_) {
       for (std::size_t i = 0; i < r.size(); ++i) z[i] = inverse_[i] * r[i];
     } else {
       for (std::size_t k = 0; k * D < r.size(); ++k) {
@@ -94,7 +96,7 @@ class DiagonalInverse {
         for (int m = std::max(r, c); m < D; ++m) out[c * D + r] += k[m][r] * k[m][c];
   }
 
-  Preconditioner kind_ = Preconditioner::kNone;
+  bool is_identity_ = true, whole_ = false;
   Buffer<double> inverse_;
 };
 
