@@ -55,6 +55,7 @@ class Host:
         place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
         tf: what becomes of the transform map -> odom, in words.
         at_cleanup: what is undone when the node is cleaned up, last made first.
+        after_cleanup: what is undone a moment later: who was answered at cleanup must still hear it.
         report: of the last solve, with its latency; None before the first.
     """
 
@@ -71,6 +72,7 @@ class Host:
     tf: str = ""
     report: SolveReport | None = None
     at_cleanup: ExitStack = field(default_factory=ExitStack)
+    after_cleanup: ExitStack = field(default_factory=ExitStack)
 
 
 class Component:
@@ -115,10 +117,6 @@ class Component:
         """Make a subscription that is destroyed at cleanup. Its profile can be overridden by parameters."""
         options = qos.for_subscription(self.host.node, topic, self.host.log) | options
         return self._owned("subscription", kind, topic, take, profile, **options)
-
-    def service(self, *arguments: Any, **options: Any) -> Any:
-        """Make a service that is destroyed at cleanup."""
-        return self._owned("service", *arguments, **options)
 
     def timer(self, *arguments: Any, **options: Any) -> Any:
         """Make a timer that is destroyed at cleanup. Without ``clock=`` it stands still when /clock does."""

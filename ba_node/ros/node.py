@@ -17,7 +17,10 @@ from __future__ import annotations
 
 import time
 import traceback
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
+
+from rclpy.clock import Clock, ClockType
 
 from ba_node.backend import Backend
 from ba_node.estimate import Estimate
@@ -56,6 +59,8 @@ COMPONENTS: tuple[type[Component], ...] = (
 _LOG_PERIOD_S = 5.0
 # For a worker that is idle; one that solves ends by itself.
 _STOP_S = 0.02
+# In DDS an answer and the word that its writer has gone come on different ways; the second must not overtake the first.
+_LINGER_S = 1.0
 
 
 class BaNode(ManagedNode):
@@ -75,6 +80,9 @@ class BaNode(ManagedNode):
         self._host: Host | None = None
         self._components: list[Component] = []
         self._leaving: list[Worker] = []
+        self._lingering = ExitStack()
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._linger_timer = self.create_timer(_LINGER_S, self._end_lingering, clock=clock, autostart=False)
         self._refined_before = 0
 
     @property
@@ -96,6 +104,7 @@ class BaNode(ManagedNode):
     def configure(self) -> None:
         """Make an empty map and everything that works on it."""
         self.cleanup()
+        self._end_lingering()
         config = self._settings.config
         inbox = Inbox(config.node.inbox_size)
         backend = Backend(config, clock=time.perf_counter)
@@ -132,6 +141,13 @@ class BaNode(ManagedNode):
         self._leaving = [worker for worker in [*self._leaving, host.worker] if not worker.stop(_STOP_S)]
         self._refined_before += host.worker.refined
         host.at_cleanup.close()
+        self._lingering = host.after_cleanup
+        self._linger_timer.reset()
+
+    def _end_lingering(self) -> None:
+        """Destroy what was left for a moment after the last cleanup."""
+        self._linger_timer.cancel()
+        self._lingering.close()
 
     def _configured(self) -> Host:
         assert self._host is not None, "rclpy's state machine lets only a configured node do this"

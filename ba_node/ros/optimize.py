@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 _NAME = "optimize"
 _GONE = "the map was reset or replaced meanwhile"
+_CLEANED_UP = "the node was cleaned up meanwhile"
 _RCLError = rclpy_implementation.RCLError
 # Feedback comes in bursts where iterations are short.
 _FEEDBACK_DEPTH = 100
@@ -64,6 +65,7 @@ class Optimize(Component):
         super().__init__(host)
         self._relay = Relay(self)
         self._goal: _Goal | None = None
+        self._cleaned_up = False
         self._type = message_class(ACTION_TYPES[_NAME])
         self._server = ActionServer(
             host.node,
@@ -75,13 +77,14 @@ class Optimize(Component):
             cancel_callback=self._cancel,
             feedback_pub_qos_profile=QoSProfile(depth=_FEEDBACK_DEPTH),
         )
-        host.at_cleanup.callback(self._server.destroy)
         host.at_cleanup.callback(self._abandon)
 
     def _judge(self, request: Any) -> Any:
         """Accept a goal, or reject it and say why in the log: the answer to a goal has no room for it."""
         reason = ""
-        if self._goal is not None:
+        if self._cleaned_up:
+            reason = _CLEANED_UP
+        elif self._goal is not None:
             reason = "another goal is at work: cancel it, or wait for its result"
         elif request.method and request.method not in METHODS:
             reason = f"method = {request.method!r}: choose one of {', '.join(METHODS)}"
@@ -104,11 +107,16 @@ class Optimize(Component):
         return CancelResponse.ACCEPT
 
     def _abandon(self) -> None:
-        if self._goal is not None:
-            self._goal.stop = "the node was cleaned up meanwhile"
-            # After a signal there is nobody left to tell, and nothing to tell it with.
-            with contextlib.suppress(_RCLError):
-                self._finish(self._goal, Status.SKIPPED, self._goal.stop)
+        """End a goal when the node is cleaned up, and go; with its result on the way, a moment later."""
+        self._cleaned_up = True
+        if self._goal is None:
+            self._server.destroy()
+            return
+        self.host.after_cleanup.callback(self._server.destroy)
+        self._goal.stop = _CLEANED_UP
+        # After a signal there is nobody left to tell, and nothing to tell it with.
+        with contextlib.suppress(_RCLError):
+            self._finish(self._goal, Status.SKIPPED, self._goal.stop)
 
     def _copy(self, backend: Backend, goal: _Goal) -> None:
         """Copy the map, on the solver's thread."""

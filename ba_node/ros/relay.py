@@ -10,6 +10,7 @@ is destroyed meanwhile, the caller never hears. So here the callback returns at 
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ba_node.ros.component import Component
 
 _RCLError = rclpy_implementation.RCLError
+_CLEANED_UP = "the node was cleaned up meanwhile"
 
 
 class Relay:
@@ -87,12 +89,13 @@ class LateService:
 
     def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Answer], None]) -> None:
         self._begin = begin
+        self._host = component.host
         self._owed: set[Answer] = set()
-        service = component.service(kind, name, lambda request, response: (request, response))
-        self._send = service.send_response
+        self._service = self._host.node.create_service(kind, name, lambda request, response: (request, response))
+        self._send = self._service.send_response
         # The executor passes on to it what the callback returns, with the address of the caller.
-        service.send_response = self._receive
-        component.host.at_cleanup.callback(self._abandon)
+        self._service.send_response = self._receive
+        self._host.at_cleanup.callback(self._abandon)
 
     def _receive(self, call: tuple[Any, Any], header: Any) -> None:
         request, response = call
@@ -105,6 +108,16 @@ class LateService:
             raise
 
     def _abandon(self) -> None:
-        """Answer those who still wait when the node is cleaned up."""
-        for answer in list(self._owed):
-            answer.give(success=False, message="the node was cleaned up meanwhile")
+        """Answer those who still wait when the node is cleaned up, and go; with answers on the way, a moment later."""
+        owed, self._begin = list(self._owed), _refuse
+        for answer in owed:
+            answer.give(success=False, message=_CLEANED_UP)
+        destroy = functools.partial(self._host.node.destroy_service, self._service)
+        if owed:
+            self._host.after_cleanup.callback(destroy)
+        else:
+            destroy()
+
+
+def _refuse(_request: Any, answer: Answer) -> None:
+    answer.give(success=False, message=_CLEANED_UP)
