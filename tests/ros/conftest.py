@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -34,6 +35,7 @@ from ba_node.synthetic import SyntheticData
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 30.0
 FACTORY = RclpyFactory()
+_ASK_AGAIN_S = 0.5
 _SLOW_SOLVE = """
 import sys, time
 from ba_node import backend
@@ -143,6 +145,29 @@ class Peer:
         self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()), "the node to subscribe")
         topics = [s.topic_name for s in self.node.subscriptions]
         self.until(lambda: all(self.node.count_publishers(topic) for topic in topics), "the node to publish")
+        self.be_found()
+
+    def be_found(self) -> None:
+        """Wait until the node has found all subscriptions and clients that this peer has now.
+
+        That this peer has found the node's side is not enough: what the node publishes or answers before it has found
+        the subscription or client in its turn is lost. It finds them in the order in which they were made; so when the
+        newest client has an answer, the others have been found too. Requests to that one are repeated until then.
+        """
+        client = self.node.create_client(GetState, "ba_node/get_state")
+        try:
+            self.until(client.service_is_ready, "the node")
+            futures: list[Any] = []
+
+            def answered() -> bool:
+                if len(futures) < 1 + (time.monotonic() - began) / _ASK_AGAIN_S:
+                    futures.append(client.call_async(GetState.Request()))
+                return any(future.done() for future in futures)
+
+            began = time.monotonic()
+            self.until(answered, "the node to find this peer")
+        finally:
+            self.node.destroy_client(client)
 
     def publish(self, measurement: Measurement, stamp_ns: int = 0) -> None:
         """Send a measurement on its topic."""
@@ -193,6 +218,7 @@ class Peer:
         """Send a request to a service of the node and return the future of its response."""
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
+            self.be_found()
         self.until(self._clients[service].service_is_ready, f"service {service}")
         return self._clients[service].call_async(request)
 

@@ -55,9 +55,8 @@ def test_the_python_example_feeds_the_node(start_node: StartNode, make_peer: Mak
     rclpy.init(args=[], context=context)
     front_end = names["FrontEnd"](*mono.rig.intrinsics[0].tolist(), context=context)
     try:
-        peer.until(front_end.keyframes.get_subscription_count, "the node to subscribe")
-        peer.until(front_end.tracks.get_subscription_count, "the node to subscribe")
-        peer.until(lambda: all(peer.node.count_publishers(s.topic_name) for s in peer.node.subscriptions), "the node")
+        peer.publishers = {"keyframes": front_end.keyframes, "feature_tracks": front_end.tracks}
+        peer.connect()
         for keyframe, (image,) in zip(mono.keyframes, mono.tracks, strict=True):
             stamp = header_message(FACTORY, keyframe.stamp_ns, "").stamp
             ids, u, v = (
