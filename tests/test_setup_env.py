@@ -242,7 +242,10 @@ def test_shell_names_the_pythons_it_tried(tmp_path: Path) -> None:
 def test_make_alone_prints_the_commands() -> None:
     listed = subprocess.run(["make", "-s"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     named = [line.split()[0] for line in listed.splitlines()]
-    assert named[:6] == ["help", "setup", "demo", "test", "bench", "lint"]
+    phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert phony is not None
+    assert named == phony[1].split()
+    assert {"setup", "demo", "test", "lint"} <= set(named)
 
 
 def test_only_interfaces_that_no_wheel_brought_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
