@@ -75,6 +75,9 @@ class Parameters:
         # Declared with checked values: rclpy itself would refuse an int for a double, which YAML makes of "5".
         for name, value in self.config.values().items():
             node.declare_parameter(name, value, describe(self._declared[name]), ignore_override=True)
+        # Requests come here first: rclpy's answer to an unknown name does not say the name.
+        self._set = node.set_parameters_atomically
+        node.set_parameters_atomically = self._on_request
         node.add_pre_set_parameters_callback(self._coerce)
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
@@ -90,11 +93,27 @@ class Parameters:
             if name.startswith(qos.OVERRIDES) and name not in there:
                 raise ConfigError(unknown(name, there))
 
+    def _on_request(self, given: list[Any]) -> Any:
+        """Take a set of changes or refuse it; what can be set at start only may be given the value that it has."""
+        unknown_names = [item.name for item in given if not self._node.has_parameter(item.name)]
+        if unknown_names:
+            reason = unknown(unknown_names[0], list(self._node._parameters))
+            return SetParametersResult(successful=False, reason=reason)
+        fixed = [item for item in self._coerce(given) if self._node.describe_parameter(item.name).read_only]
+        for item in fixed:
+            value = self._node.get_parameter(item.name).value
+            if type(item.value) is not type(value) or item.value != value:
+                reason = f"parameter {item.name} = {value!r} is read-only: start the node with -p {item.name}:=..."
+                return SetParametersResult(successful=False, reason=reason)
+        names = {item.name for item in fixed}
+        changes = [item for item in given if item.name not in names]
+        return self._set(changes) if changes else SetParametersResult(successful=True)
+
     def _coerce(self, given: list[Any]) -> list[Any]:
-        """Turn ints given for doubles into doubles."""
+        """Turn what stands for doubles into doubles: ints, and 1e-9, which is a string in YAML."""
         return [
-            RclpyParameter(item.name, RclpyParameter.Type.DOUBLE, float(item.value))
-            if item.type_ is RclpyParameter.Type.INTEGER and self._kind(item.name) is float
+            RclpyParameter(item.name, RclpyParameter.Type.DOUBLE, _as_float(item.value))
+            if self._kind(item.name) is float and _as_float(item.value) is not None
             else item
             for item in given
         ]
@@ -118,3 +137,13 @@ class Parameters:
         if changes:
             self.config = self.config.with_values(changes)
             self._changed(self.config)
+
+
+def _as_float(value: object) -> float | None:
+    """Return the number that a value is or spells, None if it is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return None
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return None

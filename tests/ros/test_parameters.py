@@ -93,9 +93,40 @@ def test_each_read_only_parameter_is_set_at_start_only(make_node: MakeNode, name
     node = make_node(**{name: value})
     parameters = Parameters(node, lambda _: None)
     assert parameters.config.values()[name] == value
-    result = _set(node, **{name: value})
+    # As when the output of `ros2 param dump` is loaded.
+    assert _set(node, **{name: value}).successful
+    result = _set(node, **{name: Config().values()[name]})
     assert not result.successful
-    assert "read-only" in result.reason
+    assert f"parameter {name} = {value!r} is read-only: start the node with -p {name}:=" in result.reason
+    assert node.get_parameter(name).value == value
+
+
+def test_a_set_with_a_fixed_parameter_is_taken_or_refused_as_a_whole(make_node: MakeNode) -> None:
+    node = make_node()
+    parameters = Parameters(node, lambda _: None)
+    assert _set(node, node__inbox_size=500, window__max_keyframes=7).successful
+    assert parameters.config.window.max_keyframes == 7
+    assert not _set(node, node__inbox_size=501, window__max_keyframes=8).successful
+    assert parameters.config.window.max_keyframes == 7
+
+
+def test_an_unknown_name_is_answered_with_the_nearest(make_node: MakeNode) -> None:
+    node = make_node()
+    Parameters(node, lambda _: None)
+    result = _set(node, window__max_keyframe=7)
+    assert not result.successful
+    assert result.reason == "parameter 'window.max_keyframe' does not exist; did you mean 'window.max_keyframes'?"
+
+
+def test_a_number_that_yaml_takes_for_a_string_is_taken_for_double(make_node: MakeNode) -> None:
+    """`ros2 param set` and `load` send 1e-9 as a string, since YAML 1.1 wants 1.0e-9."""
+    node = make_node()
+    parameters = Parameters(node, lambda _: None)
+    assert _set(node, solver__gradient_tolerance="1e-7").successful
+    assert parameters.config.solver.gradient_tolerance == 1e-7
+    result = _set(node, solver__gradient_tolerance="small")
+    assert not result.successful
+    assert not _set(node, solver__gradient_tolerance=True).successful
 
 
 def test_int_is_taken_for_double(make_node: MakeNode) -> None:
