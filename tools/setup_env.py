@@ -255,18 +255,20 @@ class Environment:
         """Install ba_node so that changes of its files take effect at once."""
         say("building the C++ kernels and installing ba_node")
         self.pip("--no-deps", "--no-build-isolation", "--editable", str(self.root))
-        # An editable installation leaves the share folder out.
+        # An editable installation leaves out the share folder, and the one where `ros2 run` looks for executables.
+        share, programs = self.venv / "share" / "ba_node", self.venv / "lib" / "ba_node"
         index = self.venv / "share" / "ament_index" / "resource_index" / "packages"
-        share = self.venv / "share" / "ba_node"
-        share.mkdir(parents=True, exist_ok=True)
-        for link, target in (
-            (index / "ba_node", "resource/ba_node"),
-            (share / "package.xml", "package.xml"),
-            (share / "launch", "launch"),
-            (share / "config", "config"),
-        ):
+        links = {index / "ba_node": self.root / "resource" / "ba_node"}
+        links |= {share / name: self.root / name for name in ("package.xml", "config", "bags")}
+        # `ros2 launch` looks for files, and not behind links to folders.
+        links |= {share / "launch" / path.name: path for path in (self.root / "launch").glob("*.launch.py")}
+        links |= {programs / name: self.venv / "bin" / name for name in ("ba", "ba_adapter", "ba_node")}
+        if (share / "launch").is_symlink():
+            (share / "launch").unlink()
+        for link, target in links.items():
+            link.parent.mkdir(parents=True, exist_ok=True)
             link.unlink(missing_ok=True)
-            link.symlink_to(self.root / target)
+            link.symlink_to(target)
 
 
 @contextlib.contextmanager
