@@ -35,6 +35,8 @@ _ROBUST_ROUNDS = 5
 # Where the robust weight leaves 1, in sigmas.
 _HUBER = 1.5
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_ROWS, _COLUMNS = np.transpose(_SYMMETRIC)
+_DIAGONAL = np.arange(3)
 
 
 @dataclass(frozen=True)
@@ -112,12 +114,13 @@ def triangulate(rays: Rays, n_points: int) -> Triangulation:
     distance = _first_distance(rays, measured_row, n_points)
     trust = np.ones(len(distance))
     points = np.zeros((n_points, 3))
+    sums = _Sums(rays, n_points)
     for i in range(_PLAIN_ROUNDS + _ROBUST_ROUNDS):
-        points = _weighted_midpoint(rays, centre, distance, trust, n_points)
-        away = points[rays.point] - centre
-        distance = np.linalg.norm(away, axis=1)
+        points = sums.weighted_midpoint(centre, distance, trust)
+        away = points.take(rays.point, axis=0) - centre
+        distance = _length(away)
         if i >= _PLAIN_ROUNDS - 1:
-            across = np.linalg.norm(np.cross(rays.direction, away), axis=1) / np.maximum(distance, 1e-9)
+            across = _length(_cross(rays.direction, away)) / np.maximum(distance, 1e-9)
             trust = _HUBER / np.maximum(rays.px_per_rad * across, _HUBER)
     points = points + origin
     points[(count < 2) & ~measured] = np.nan
@@ -152,25 +155,45 @@ def _first_distance(rays: Rays, measured_row: BoolArray, n_points: int) -> Float
     return mean[rays.point]
 
 
-def _weighted_midpoint(
-    rays: Rays, centre: FloatArray, distance: FloatArray, trust: FloatArray, n_points: int
-) -> FloatArray:
-    """Solve the 3x3 systems of the module's equation for given distances and weights in (0, 1]; (n_points, 3)."""
-    across = trust * (rays.px_per_rad / np.maximum(distance, 1e-9)) ** 2
-    along = np.nan_to_num(1.0 / rays.distance_sigma_m**2, nan=0.0)
-    d = rays.direction
-    # W = across (I - d d') + along d d';  sum W x = sum W c + along m d
-    outer = (along - across)[:, None, None] * d[:, :, None] * d[:, None, :]
-    weight = outer + across[:, None, None] * np.eye(3)
-    shift = (along * np.nan_to_num(rays.distance_m, nan=0.0))[:, None] * d
-    rhs = _sum_by_point((weight @ centre[:, :, None])[..., 0] + shift, rays.point, n_points)
-    matrix = np.empty((n_points, 3, 3))
-    for i, j in _SYMMETRIC:
-        matrix[:, i, j] = matrix[:, j, i] = np.bincount(rays.point, weight[:, i, j], n_points)
-    trace = np.trace(matrix, axis1=1, axis2=2)
-    # A whiff of damping: parallel rays give a far point instead of a singular matrix.
-    matrix += (1e-14 * trace + np.where(trace > 0, 0.0, 1.0))[:, None, None] * np.eye(3)
-    return np.asarray(np.linalg.solve(matrix, rhs[:, :, None])[..., 0])
+class _Sums:
+    """The 3x3 systems of the module's equation, with what stays the same from round to round."""
+
+    def __init__(self, rays: Rays, n_points: int) -> None:
+        self._rays, self._n = rays, n_points
+        self._along = np.nan_to_num(1.0 / rays.distance_sigma_m**2, nan=0.0)
+        self._shift = (self._along * np.nan_to_num(rays.distance_m, nan=0.0))[:, None] * rays.direction
+        n_sums = len(_SYMMETRIC) + 3
+        self._bins = (rays.point[:, None] * n_sums + np.arange(n_sums)).ravel()
+
+    def weighted_midpoint(self, centre: FloatArray, distance: FloatArray, trust: FloatArray) -> FloatArray:
+        """Solve for given distances and weights in (0, 1]; (n_points, 3)."""
+        across = trust * (self._rays.px_per_rad / np.maximum(distance, 1e-9)) ** 2
+        d = self._rays.direction
+        # W = across (I - d d') + along d d';  sum W x = sum W c + along m d
+        weight = ((self._along - across)[:, None] * d)[:, :, None] * d[:, None, :]
+        weight[:, _DIAGONAL, _DIAGONAL] += across[:, None]
+        values = np.empty((len(d), len(_SYMMETRIC) + 3))
+        values[:, :-3] = weight[:, _ROWS, _COLUMNS]
+        values[:, -3:] = (weight @ centre[:, :, None])[..., 0] + self._shift
+        # All sums in one go.
+        sums = np.bincount(self._bins, values.ravel(), self._n * values.shape[1]).reshape(self._n, -1)
+        matrix = np.empty((self._n, 3, 3))
+        matrix[:, _ROWS, _COLUMNS] = matrix[:, _COLUMNS, _ROWS] = sums[:, :-3]
+        trace = matrix[:, 0, 0] + matrix[:, 1, 1] + matrix[:, 2, 2]
+        # A whiff of damping: parallel rays give a far point instead of a singular matrix.
+        matrix[:, _DIAGONAL, _DIAGONAL] += (1e-14 * trace + np.where(trace > 0, 0.0, 1.0))[:, None]
+        return np.asarray(np.linalg.solve(matrix, sums[:, -3:, None])[..., 0])
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    """Return the length of each row: np.linalg.norm without its overhead."""
+    return np.asarray(np.sqrt((vectors * vectors).sum(axis=1)))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the vector product of each pair of rows: np.cross without its overhead."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _sum_by_point(values: FloatArray, point: IntArray, n_points: int) -> FloatArray:

@@ -58,7 +58,7 @@ def choose(problem: Problem, old: BoolArray) -> Gauge:
     for part in np.unique(part_of):
         members = part_of == part
         free = np.flatnonzero(members & ~old)
-        scaled = bool(np.any(shows_scale & members[obs.keyframe]))
+        scaled = bool(np.any(shows_scale & members.take(obs.keyframe)))
         missing = (1 if scaled else 2) - int(np.count_nonzero(members & old & strong))
         if not scaled and not np.any(members & old):
             fixed[free[:1]] = True
@@ -88,13 +88,13 @@ def _parts(obs: Observations, n_kf: int, n_points: int) -> IntArray:
     label = np.arange(n_kf)
     while True:
         by_point = np.full(n_points, n_kf)
-        np.minimum.at(by_point, obs.point, label[obs.keyframe])
+        np.minimum.at(by_point, obs.point, label.take(obs.keyframe))
         spread = label.copy()
-        np.minimum.at(spread, obs.keyframe, by_point[obs.point])
+        np.minimum.at(spread, obs.keyframe, by_point.take(obs.point))
         # Labels name keyframes, so a label's own label is a shortcut: long chains settle in few rounds.
         spread = spread[spread]
-        if np.array_equal(spread, label):
-            return label
+        if np.array_equal(spread, label) or not spread.any():
+            return spread
         label = spread
 
 
@@ -106,10 +106,10 @@ def _shows_scale(problem: Problem) -> BoolArray:
     obs = problem.observations
     scale = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
     centres = _camera_centres(problem)
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2) > _MIN_BASELINE_M
     # Rows are sorted by point, keyframe, camera: the views of one point from one keyframe are neighbours.
-    second = 1 + np.flatnonzero((obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1]))
-    between = centres[obs.camera[second]] - centres[obs.camera[second - 1]]
-    scale[second] |= np.linalg.norm(between, axis=1) > _MIN_BASELINE_M
+    second = (obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1])
+    scale[1:] |= second & apart.ravel().take(obs.camera[1:] * len(apart) + obs.camera[:-1])
     return scale
 
 

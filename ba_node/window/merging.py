@@ -89,8 +89,8 @@ def judge(scene: Scene, selection: Selection, norm: FloatArray, outlier_px: floa
     outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
     scene.sightings.outlier[selection.rows] = outlier
     if outlier_px > 0:
-        measured = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(norm), bool)
-        good = np.bincount(obs.point, ~outlier * np.where(measured, 2, 1), n_points)
+        worth = ~outlier * np.where(np.isfinite(obs.depth_m), 2, 1) if len(obs.depth_m) else ~outlier
+        good = np.bincount(obs.point, worth, n_points)
         _displace(scene, selection.landmarks[good < 2])
     error = norm * obs.sigma_px
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
@@ -105,7 +105,8 @@ def _displace(scene: Scene, landmarks: IntArray) -> None:
 def _rms_by_point(squared: FloatArray, point: IntArray, believed: BoolArray, n_points: int) -> FloatArray:
     """Return the root mean square error per coordinate of each point's believed observations, px."""
     good = np.asarray(believed & np.isfinite(squared))
-    total = np.bincount(point[good], squared[good], n_points)
-    count = np.bincount(point[good], minlength=n_points)
+    point = point[good]
+    total = np.bincount(point, squared[good], n_points)
+    count = np.bincount(point, minlength=n_points)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.sqrt(total / (2 * count)))

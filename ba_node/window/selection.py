@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ba_node.core import native_kernels
 from ba_node.window import gauge
-from ba_node.window.initial_points import initial_points, widened
+from ba_node.window.initial_points import SPREAD, initial_points, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
 
 if TYPE_CHECKING:
@@ -213,9 +213,13 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
     far = norms > gate
     placed = ~np.isnan(part.problem.start.points[:, 0])
     # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
-    for k in np.unique(obs.keyframe[far]):
+    judged = usable & placed.take(obs.point)
+    n_kf = len(part.keyframes)
+    large = np.bincount(obs.keyframe, judged & (SPREAD * norms > gate), n_kf)
+    suspect = (2 * large >= np.bincount(obs.keyframe, judged, n_kf)) & (np.bincount(obs.keyframe, far, n_kf) > 0)
+    for k in np.flatnonzero(suspect):
         own = np.flatnonzero(obs.keyframe == k)
-        far[own] = norms[own] > widened(gate, norms[own[placed[obs.point[own]] & usable[own]]], 1)
+        far[own] = norms[own] > widened(gate, norms[own[judged[own]]], 1)
     return usable & ~far
 
 
