@@ -92,6 +92,8 @@ setup(
             "ba_adapter = ba_node.ros.adapter:main",
             "ba_node = ba_node.ros.main:main",
         ],
+        # So that the linter ament_copyright understands the second line of this file.
+        "ament_copyright.license": ["apache2_spdx = ba_node.licence:APACHE2_SPDX"],
     },
     zip_safe=False,
 )

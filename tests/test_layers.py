@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ba_node"
 
 # Lowest first. A module may import modules of the layers before its own, and of its own layer where SAME says so.
 LAYERS: dict[str, tuple[str, ...]] = {
-    "config": ("config",),
+    "config": ("config", "licence"),
     "native": ("native",),
     "core": ("core",),
     "scene": ("measurements", "estimate", "scene"),
