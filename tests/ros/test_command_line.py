@@ -1,0 +1,175 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The node under the command line of ROS 2, as a user types it; left out where ros2cli is not installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from ba_node.config import Config
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+
+NO_ROS2 = shutil.which("ros2") is None or importlib.util.find_spec("ros2cli") is None
+pytestmark = [
+    pytest.mark.dds,
+    pytest.mark.slow,
+    pytest.mark.skipif(NO_ROS2, reason="ros2cli is not installed (it is not among the wheels)"),
+]
+
+NODE = "/ba_node"
+KEYFRAMES = 6
+TIMEOUT_S = 60.0
+# Each command looks for itself: a daemon would outlive the test.
+LOOK = ("--no-daemon", "--spin-time", "4")
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticData:
+    return generate(SyntheticOptions(seed=3, keyframes=KEYFRAMES, length_m=10.0, path="line", outlier_share=0.0))
+
+
+def _ros2(*words: str, code: int | None = 0) -> str:
+    """Run a command of ros2 and return what it prints."""
+    run = subprocess.run(["ros2", *words], capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert code is None or run.returncode == code, f"ros2 {' '.join(words)}: {run.stdout}{run.stderr}"
+    return run.stdout + run.stderr
+
+
+@pytest.fixture
+def played(start_node: Callable[..., Any], make_peer: Callable[..., Any], scene: SyntheticData) -> Any:
+    """Return a node that has refined a scene."""
+    node, peer = start_node(), make_peer()
+    peer.advertise()
+    peer.play(scene)
+    return node
+
+
+def test_parameters(played: Any, tmp_path: Path) -> None:
+    assert "Integer value is: 20" in _ros2("param", "get", *LOOK, NODE, "window.max_keyframes")
+    described = _ros2("param", "describe", *LOOK, NODE, "window.max_keyframes", "solver.loss", "node.inbox_size")
+    for words in ("Min value: 2", "Max value: 100000", "one of: squared, huber", "Read only: true"):
+        assert words in described
+    for value in ("2", "2.5", "1e-3"):
+        assert "successful" in _ros2("param", "set", *LOOK, NODE, "solver.loss_scale_px", value)
+    assert "Double value is: 0.001" in _ros2("param", "get", *LOOK, NODE, "solver.loss_scale_px")
+    for name, value, reason in (
+        ("window.max_keyframe", "30", "did you mean 'window.max_keyframes'?"),
+        ("window.max_keyframes", "1", "out of range"),
+        ("solver.loss", "hubert", "choose one of squared, huber"),
+        ("node.inbox_size", "50", "is read-only: start the node with"),
+    ):
+        assert reason in _ros2("param", "set", *LOOK, NODE, name, value, code=None)
+    dump = tmp_path / "dump.yaml"
+    dump.write_text(_ros2("param", "dump", *LOOK, NODE))
+    values = yaml.safe_load(dump.read_text())[NODE]["ros__parameters"]
+    assert set(values) >= {name.split(".")[0] for name in Config().values()}
+    loaded = _ros2("param", "load", *LOOK, NODE, str(dump))
+    lines = [line for line in loaded.splitlines() if line.startswith("Set parameter")]
+    # The last is rclpy's own.
+    refused = [line for line in lines if not line.endswith("successful") and "start_type_description" not in line]
+    assert len(lines) >= len(Config().values()) and not refused, refused
+    assert played.alive
+
+
+def test_a_node_starts_with_its_own_dump(played: Any, start_node: Callable[..., Any], tmp_path: Path) -> None:
+    _ros2("param", "set", *LOOK, NODE, "window.max_keyframes", "7")
+    dump = tmp_path / "dump.yaml"
+    dump.write_text(_ros2("param", "dump", *LOOK, NODE))
+    assert played.stop() == 0
+    again = start_node("--ros-args", "--params-file", str(dump))
+    assert yaml.safe_load(_ros2("param", "dump", *LOOK, NODE)) == yaml.safe_load(dump.read_text())
+    assert again.stop() == 0
+
+
+def test_lifecycle(played: Any) -> None:
+    assert NODE in _ros2("lifecycle", "nodes", *LOOK)
+    assert "active [3]" in _ros2("lifecycle", "get", *LOOK, NODE)
+    assert "deactivate [4]" in _ros2("lifecycle", "list", *LOOK, NODE)
+    assert "Unknown transition requested" in _ros2("lifecycle", "set", *LOOK, NODE, "configure", code=None)
+    for transition, state in (("deactivate", "inactive [2]"), ("cleanup", "unconfigured [1]")):
+        assert "successful" in _ros2("lifecycle", "set", *LOOK, NODE, transition)
+        assert state in _ros2("lifecycle", "get", *LOOK, NODE)
+    assert played.stop() == 0
+
+
+def test_services_and_action(played: Any, tmp_path: Path) -> None:
+    path = tmp_path / "site.npz"
+    saved = _ros2("service", "call", f"{NODE}/save_map", "ba_msgs/srv/SaveMap", f"{{path: {path}}}")
+    assert "success=True" in saved and f"keyframes={KEYFRAMES}" in saved
+    assert "success=True" in _ros2("service", "call", f"{NODE}/pause", "std_srvs/srv/SetBool", "{data: true}")
+    goal = (f"{NODE}/optimize", "ba_msgs/action/Optimize", "{method: lma_cd, max_iterations: 5}")
+    told = _ros2("action", "send_goal", "--feedback", *goal)
+    assert "iteration: 1" in told and "Goal finished with status: SUCCEEDED" in told
+    refused = _ros2("action", "send_goal", goal[0], goal[1], "{method: magic}", code=None)
+    assert "rejected" in refused
+    assert "forgot 6 keyframes" in _ros2("service", "call", f"{NODE}/reset", "std_srvs/srv/Trigger")
+    assert "success=True" in _ros2("service", "call", f"{NODE}/load_map", "ba_msgs/srv/LoadMap", f"{{path: {path}}}")
+    assert played.stop() == 0
+
+
+def test_topics(played: Any) -> None:
+    listed = _ros2("topic", "list", "-t", *LOOK)
+    for topic in ("/keyframes [ba_msgs/msg/Keyframe]", "/ba_node/path [nav_msgs/msg/Path]"):
+        assert topic in listed
+    info = _ros2("topic", "info", "-v", *LOOK, "/ba_node/points")
+    assert "Node name: ba_node" in info and "Durability: TRANSIENT_LOCAL" in info
+    # Latched, and taken with the quality of service of the publisher.
+    path = _ros2("topic", "echo", "--once", "--no-daemon", "--spin-time", "4", "/ba_node/path")
+    assert path.count("pose:") == KEYFRAMES
+    assert "level" in _ros2("topic", "echo", "--once", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    assert played.stop() == 0
+
+
+@pytest.fixture
+def launch(domain: int) -> Iterator[Callable[..., subprocess.Popen[str]]]:  # noqa: ARG001
+    """Return a function that launches a file of the package."""
+    if "ba_node" not in _ros2("pkg", "list", code=None).split():
+        pytest.skip("ros2 does not find the package ba_node")
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*words: str) -> subprocess.Popen[str]:
+        command = ["ros2", "launch", "ba_node", *words]
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+        return started[-1]
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=TIMEOUT_S)
+
+
+def test_launch_with_every_argument(
+    launch: Callable[..., subprocess.Popen[str]], make_peer: Callable[..., Any], tmp_path: Path
+) -> None:
+    file = tmp_path / "my.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    window.max_keyframes: 9\n")
+    arguments = ["namespace:=lane", f"params_file:={file}", "use_sim_time:=true", "autostart:=false", "log_level:=warn"]
+    process = launch("ba_node.launch.py", *arguments)
+    peer = make_peer(namespace="lane")
+    peer.be_found()
+    assert "unconfigured [1]" in _ros2("lifecycle", "get", *LOOK, "/lane/ba_node")
+    assert "value is: 9" in _ros2("param", "get", *LOOK, "/lane/ba_node", "window.max_keyframes")
+    assert "value is: True" in _ros2("param", "get", *LOOK, "/lane/ba_node", "use_sim_time")
+    assert "successful" in _ros2("lifecycle", "set", *LOOK, "/lane/ba_node", "configure")
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=TIMEOUT_S)
+    assert "process has finished cleanly" in out, out
+    assert "configure: done" not in out, "that is below log_level"
+
+
+def test_launch_plays_a_recording_to_its_end(launch: Callable[..., subprocess.Popen[str]]) -> None:
+    out, _ = launch("replay.launch.py", "bag:=mono_loop.mcap", "rate:=10").communicate(timeout=4 * TIMEOUT_S)
+    stopped = re.search(r"stopped: (\d+) keyframes refined", out)
+    assert stopped is not None and int(stopped[1]) > 0, out
+    assert out.count("process has finished cleanly") == 2, out
