@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, stamp_ns_from_message
 from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
@@ -29,11 +31,13 @@ def scene() -> SyntheticData:
 
 
 def _send(peer: Any, scene: SyntheticData, shift_ns: int = 0) -> None:
-    """Publish a scene, each keyframe when the one before was solved."""
+    """Publish a scene, each keyframe when the one before was solved, and the time if somebody made /clock."""
     reports = peer.received["report"]
     peer.publish(scene.rig)
     for keyframe, tracks in zip(scene.keyframes, scene.tracks, strict=True):
         stamp_ns = keyframe.stamp_ns + shift_ns
+        if "/clock" in peer.publishers:
+            peer.publishers["/clock"].publish(Clock(clock=Time(nanoseconds=stamp_ns).to_msg()))
         peer.publish(dataclasses.replace(keyframe, stamp_ns=stamp_ns))
         for image in tracks:
             peer.publish(image, stamp_ns)
@@ -118,11 +122,17 @@ def test_silence_names_topics_and_publishers(start_node: StartNode, make_peer: M
     assert node.stop() == 0
 
 
+@pytest.mark.parametrize("sim_time", [False, True], ids=["wall time", "use_sim_time"])
 def test_a_bag_that_plays_again_begins_a_new_session(
-    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
+    sim_time: bool, start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
-    node = start_node("--ros-args", "-p", "scene.max_reorder_s:=0.5")
-    peer = _connected(make_peer)
+    arguments = ["-p", "scene.max_reorder_s:=0.5", "-p", f"use_sim_time:={str(sim_time).lower()}"]
+    node, peer = start_node("--ros-args", *arguments), make_peer()
+    if sim_time:
+        peer.publishers["/clock"] = peer.node.create_publisher(Clock, "/clock", 10)
+    peer.advertise()
+    peer.listen("report", "refined_keyframes", "path")
+    peer.connect()
     _send(peer, scene)
     span_s = (scene.keyframes[-1].stamp_ns - scene.keyframes[0].stamp_ns) * 1e-9
     assert span_s > 0.5, "the first keyframe lies further back than the bound"
@@ -133,7 +143,39 @@ def test_a_bag_that_plays_again_begins_a_new_session(
     again = peer.received["report"][first_round:]
     assert [r.newest_keyframe_id for r in again][-1] == KEYFRAMES - 1
     assert max(r.keyframes + r.fixed_keyframes for r in again) <= KEYFRAMES, "the map of the first round is gone"
+    # By the wall clock the data is years old.
+    ages_s = [abs(r.stamp_latency_p50_s) for r in peer.received["report"]]
+    assert max(ages_s) < 60.0 if sim_time else min(ages_s) > 1e7, ages_s
     assert node.stop() == 0
+
+
+def test_keyframes_out_of_order_are_sorted_by_their_stamps(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
+) -> None:
+    node, peer = start_node(), _connected(make_peer)
+    peer.publish(scene.rig)
+    for i in (0, 1, 3, 2, 5, 4):
+        peer.publish(scene.keyframes[i])
+        for image in scene.tracks[i]:
+            peer.publish(image, scene.keyframes[i].stamp_ns)
+        wanted = scene.keyframes[i].keyframe_id
+        # The first has nothing to be refined against.
+        peer.until(lambda i=i, wanted=wanted: i == 0 or wanted in _ids(peer), f"keyframe {wanted}, refined")
+    stamps = [keyframe.stamp_ns for keyframe in scene.keyframes]
+
+    def path_stamps() -> list[int]:
+        paths = peer.received["path"]
+        return [stamp_ns_from_message(pose.header.stamp) for pose in paths[-1].poses] if paths else []
+
+    peer.until(lambda: path_stamps() == stamps, "a path in the order of time")
+    assert "a new session begins" not in node.err
+    last = peer.received["report"][-1]
+    assert last.keyframes + last.fixed_keyframes == KEYFRAMES
+    assert node.stop() == 0
+
+
+def _ids(peer: Any) -> set[int]:
+    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
 
 
 def _stamps(peer: Any) -> set[int]:
