@@ -16,6 +16,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from ba_node.config import ConfigError
+from ba_node.ros import arguments
 from ba_node.ros.node import NODE_NAME, BaNode
 
 if TYPE_CHECKING:
@@ -35,19 +36,29 @@ _ARGUMENT_ERRORS = (
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit code, 2 if parameters or arguments are wrong."""
+    """Run the node until SIGINT or SIGTERM; return the exit code, 2 if parameters or arguments are wrong.
+
+    Args:
+        args: the program and its arguments; None for those of the process.
+    """
+    given = list(sys.argv if args is None else args)
     with _one_interrupt():
         try:
-            rclpy.init(args=None if args is None else list(args))
+            rclpy.init(args=given)
         except _ARGUMENT_ERRORS as error:
             return _refuse(str(error))
         try:
-            return _run()
+            return _run(given)
         finally:
             rclpy.try_shutdown()
 
 
-def _run() -> int:
+def _run(given: list[str]) -> int:
+    if arguments.asks_for_help(given):
+        print(arguments.USAGE, end="")
+        return 0
+    if reason := arguments.objection(given):
+        return _refuse(reason)
     try:
         node = BaNode()
     except (ConfigError, InvalidNodeNameException, InvalidNamespaceException) as error:
@@ -58,6 +69,8 @@ def _run() -> int:
         return 0  # a signal came while the node was being made
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    for text in arguments.idle_files(given, node.get_fully_qualified_name()):
+        node.get_logger().warning(text)
     node.start()
     try:
         _spin(executor, node)
