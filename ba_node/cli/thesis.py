@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     # Processor time is compared: threads that wait for each other would count.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ba_node.thesis import catalogue  # noqa: PLC0415
+    from ba_node.thesis.data_sets import DATA_SETS  # noqa: PLC0415
     from ba_node.thesis.problems import DATA  # noqa: PLC0415
     from ba_node.thesis.repeat import Repetition  # noqa: PLC0415
 
@@ -63,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if bool(args.names) == args.all:
         raise ChoiceError("say which experiments, for example `ba thesis 3.8 5.1`, or --all, or --list to see them")
     repetition = Repetition(catalogue.chosen(args.names), args.data or DATA, args.out, quick=args.quick)
+    for name in repetition.absent:
+        print(f"left out: {DATA_SETS[name].left_out(name, args.data or DATA)}", file=sys.stderr)
     with progress_bar("thesis", "steps") as show:
         done, total = 0, sum(task.weight for task in repetition.missing())
 

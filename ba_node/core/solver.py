@@ -30,6 +30,7 @@ import numpy as np
 
 from ba_node.core import linear, native_kernels
 from ba_node.core.annealing import Annealing
+from ba_node.core.kernels import Kernels
 from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem
 from ba_node.core.reduced import ReducedSolver
@@ -51,6 +52,7 @@ def solve(
     *,
     clock: Callable[[], float] = _no_clock,
     on_iteration: Callable[[Iteration], bool] | None = None,
+    kernels: Kernels | None = None,
 ) -> Result:
     """Minimise the robust objective of a problem.
 
@@ -59,6 +61,7 @@ def solve(
         options: the parts of the method.
         clock: seconds, for the trace alone; nothing depends on it.
         on_iteration: called with each row of the trace; returning False stops the solve.
+        kernels: of the problem, to work with in place of those that the options ask for: for experiments.
 
     Returns:
         The best state found, with a trace and the reason for stopping; finite always.
@@ -72,7 +75,7 @@ def solve(
     if len(problem.observations) == 0 or (problem.fixed.all() and problem.n_points == 0):
         return Result(problem.start, Status.SKIPPED, "no observations: nothing to solve", options.method, ())
     try:
-        run = _Run(problem, options, clock, on_iteration)
+        run = _Run(problem, options, clock, on_iteration, kernels)
     except native_kernels.KernelsError as error:
         return Result(problem.start, Status.FAILED, str(error), options.method, ())
     with np.errstate(all="ignore"):
@@ -88,12 +91,13 @@ class _Run:
         options: SolverOptions,
         clock: Callable[[], float],
         on_iteration: Callable[[Iteration], bool] | None,
+        kernels: Kernels | None,
     ) -> None:
         self.options = options
         self.clock, self.began = clock, clock()
         self.on_iteration = on_iteration
         with np.errstate(all="ignore"):
-            self.kernels = native_kernels.make(problem, options.rules, options.backend, options.demands)
+            self.kernels = kernels or native_kernels.make(problem, options.rules, options.backend, options.demands)
         self.reduced = ReducedSolver(options)
         self.state = problem.start
         self.value = np.inf

@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ba_node.config import ConfigError, Value, parse_assignment
@@ -64,6 +64,7 @@ def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
     if method not in methods.METHODS:
         raise ConfigError(f"method {method!r} does not exist{_nearest(method, methods.METHODS)}")
     options = methods.options(method)
+    _require_scale(options, changes)
     rules = dataclasses.replace(options.rules, **_taken(changes, _RULES))
     options = dataclasses.replace(options, rules=rules, **_taken(changes, _OPTIONS))
     try:
@@ -83,6 +84,16 @@ def describe(options: SolverOptions) -> dict[str, Value]:
     return {**named, **rules}
 
 
+def _require_scale(options: SolverOptions, changes: Mapping[str, Value]) -> None:
+    """Refuse a robust loss without a scale for a method that has none of its own."""
+    loss = changes.get("loss", "squared")
+    if loss != "squared" and options.rules.loss == "squared" and "loss_scale" not in changes:
+        raise ConfigError(
+            f"option loss = {loss!r} without loss_scale (gamma): method {options.method} has none, as its loss is"
+            " squared; add the residual, in sigmas, where the loss shall leave the square, for example gamma=1"
+        )
+
+
 def _taken(changes: dict[str, Value], names: Iterable[str]) -> dict[str, Any]:
     """Remove some of the changes and return them."""
     return {name: changes.pop(name) for name in names if name in changes}
@@ -91,7 +102,7 @@ def _taken(changes: dict[str, Value], names: Iterable[str]) -> dict[str, Any]:
 def _read(text: str) -> tuple[str, Value]:
     name, separator, raw = text.partition("=")
     if not separator:
-        raise ConfigError(f"{text!r}: expected name=value, for example loss=huber")
+        raise ConfigError(f"{text!r}: expected name=value, for example damping=diag")
     if name.startswith(_GROUP):
         name, value = parse_assignment(text)
         bare = name.removeprefix(_GROUP)
@@ -123,4 +134,5 @@ def _number(name: str, raw: str) -> int | float:
 def _nearest(name: str, known: Iterable[str]) -> str:
     names = list(known)
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    return f"; did you mean {near[0]!r}?" if near else f": choose one of {', '.join(names)}"
+    listed = f"hoose one of {', '.join(names)}"
+    return f"; did you mean {near[0]!r}? C{listed}" if near else f": c{listed}"

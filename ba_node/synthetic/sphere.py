@@ -198,8 +198,9 @@ def _draw_camera(options: SphereOptions, rng: np.random.Generator) -> FloatArray
     right = np.cross(rng.normal(size=3), back)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(back, right), back])
-    focal = options.focal_px * (1.0 + 0.02 * rng.normal())
-    intrinsics = [focal, _K1[0] + _K1[1] * rng.normal(), _K2[0] + _K2[1] * rng.normal()]
+    spread = options.camera_spread
+    focal = options.focal_px * (1.0 + 0.02 * spread * rng.normal())
+    intrinsics = [focal, _K1[0] + _K1[1] * spread * rng.normal(), _K2[0] + _K2[1] * spread * rng.normal()]
     return np.concatenate([so3_log(rotation[None])[0], -rotation @ centre, intrinsics])
 
 

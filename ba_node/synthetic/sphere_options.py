@@ -32,6 +32,9 @@ class SphereOptions:
     focal_px: float = _option(
         350.0, "Mean focal length; as a number it is best below the radius.", unit="px", minimum=10.0, maximum=1e5
     )
+    camera_spread: float = _option(
+        1.0, "How much f, k1 and k2 differ between images; 0: one camera took all.", minimum=0.0, maximum=10.0
+    )
     near: float = _option(1.6, "Least distance of a camera from the centre, in radii.", minimum=1.05, maximum=100.0)
     far: float = _option(2.0, "Largest distance of a camera from the centre, in radii.", minimum=1.05, maximum=100.0)
     cone_deg: float = _option(

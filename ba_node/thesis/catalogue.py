@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from ba_node.thesis.chapter3 import CHAPTER_3
 from ba_node.thesis.chapter45 import CHAPTER_4, CHAPTER_5
 from ba_node.thesis.experiments import Experiment
+from ba_node.thesis.open_problems import OPEN
 
-EXPERIMENTS: tuple[Experiment, ...] = (*CHAPTER_3, *CHAPTER_4, *CHAPTER_5)
+EXPERIMENTS: tuple[Experiment, ...] = (*CHAPTER_3, *CHAPTER_4, *CHAPTER_5, *OPEN)
 _FIGURE = re.compile(r"(?:fig(?:ure)?)[-. ]?(\d+\.\d+)")
 _TABLE = re.compile(r"(?:table[-. ]?)?(\d+\.\d+)")
 

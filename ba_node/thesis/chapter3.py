@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from ba_node.thesis.data_sets import LADYBUG
 from ba_node.thesis.experiments import Case, Experiment
-from ba_node.thesis.problems import LADYBUG, LADYBUG_PART
+from ba_node.thesis.problems import LADYBUG_PART
 from ba_node.thesis.tasks import Measure, Run
 
 # One kind of kernels for all of a table, as its ratios are compared: numpy's, which have every choice.

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from ba_node.synthetic import PRESETS
 from ba_node.thesis.chapter3 import CAP, CURVES, NUMPY, SOLVE_COLUMNS, STEPPED, dinm, ladybug
+from ba_node.thesis.data_sets import LADYBUG
 from ba_node.thesis.experiments import Case, Experiment
-from ba_node.thesis.problems import LADYBUG
 from ba_node.thesis.tasks import Measure, Run
 
 _CAP_3000 = "cap=3000"

@@ -24,6 +24,7 @@ from ba_node.core.problem import State
 from ba_node.core.reduced import preconditioner
 from ba_node.core.schur import Structure, normal_equations
 from ba_node.core.step_search import search_steps
+from ba_node.thesis.conditioning import conditions
 from ba_node.thesis.finals import truth_errors
 from ba_node.thesis.problems import Posed
 
@@ -176,4 +177,5 @@ MEASURES: dict[str, Callable[[Posed, Sequence[str], Clock], Measured]] = {
     "start": start,
     "layout": layout,
     "linearisation": linearisation,
+    "conditions": conditions,
 }

@@ -11,7 +11,7 @@ from ba_node.thesis.catalogue import EXPERIMENTS
 from ba_node.thesis.claims import CLAIMS
 from ba_node.thesis.judging import HOLDS, HOLDS_NOT, PARTLY, Results, Verdict, judge
 from ba_node.thesis.problems import DATA, Library
-from ba_node.thesis.tables import Table
+from ba_node.thesis.tables import Table, escaped
 from ba_node.thesis.tasks import key
 
 _INTRO = """\
@@ -20,11 +20,11 @@ _INTRO = """\
 The local DINM method comes from Z. Qu, *Efficient Optimization for Robust Bundle Adjustment*, master's thesis, TU
 Munich, 2018. `ba thesis --all` repeats its experiments; from the figures recorded there
 ([thesis_results.json](thesis_results.json)) each of its claims is judged by comparisons that were declared with it
-(`ba_node/thesis/claims.py`): it **holds** if all of them do, **partly** if some do. + and - mark the comparisons.
+(`ba_node/thesis/claims.py`): it **holds** if all of them do, **partly** if some do. The comparisons stand below the
+table. What the thesis leaves open: [open_problems.md](open_problems.md).
 
 """
 _HOW = """\
-
 ## How it was done
 
 - All of a table runs with the same kernels, numpy's; a row "C++" is an addition. Times are processor time of one
@@ -53,19 +53,29 @@ Figure 5.4: reprojection in two images of Ladybug-49 before and after DINM.
 
 
 def verdict_table(verdicts: Sequence[Verdict], old: Collection[tuple[str, str]] = ()) -> Table:
-    """Return the claims with their verdicts and what they rest on.
+    """Return the claims with their verdicts, numbered.
 
     Args:
         verdicts: of judging.judge.
         old: experiment and label of cases whose figures were recorded with other options than are declared now.
     """
     rows = []
-    for verdict in verdicts:
+    for number, verdict in enumerate(verdicts, start=1):
         claim = verdict.claim
         is_old = any(case in old for check in claim.checks for case in check.cases())
-        lines = [f"{'+' if so else '-'} {text}" for so, text in verdict.found]
-        rows.append((claim.text, claim.where, f"{verdict.word}{' (old)' * is_old}", "; ".join(lines), claim.remark))
-    return Table(("claim", "where", "verdict", "found", "remark"), tuple(rows))
+        rows.append((str(number), claim.text, claim.where, f"{verdict.word}{' (old)' * is_old}"))
+    return Table(("", "claim", "where", "verdict"), tuple(rows))
+
+
+def grounds(verdicts: Sequence[Verdict]) -> str:
+    """Return, as Markdown, what each verdict rests on, numbered as in the table."""
+    parts = []
+    for number, verdict in enumerate(verdicts, start=1):
+        parts.append(f"**{number}. {verdict.claim.text}**: {verdict.word}\n")
+        parts.append("".join(f"- {'yes' if so else '**no**'}: {escaped(text)}\n" for so, text in verdict.found))
+        if verdict.claim.remark:
+            parts.append(f"{verdict.claim.remark}\n")
+    return "\n".join(parts)
 
 
 def old_cases(results: Results) -> set[tuple[str, str]]:
@@ -89,4 +99,5 @@ def claims_page(results: Results) -> str:
             ' "(old)": the options of the method have changed since its figures were recorded; `ba thesis --all` and a'
             " copy of its results.json renew them."
         )
-    return f"{_INTRO}{summary}\n\n{verdict_table(verdicts, old).markdown()}{_HOW}"
+    table = verdict_table(verdicts, old).markdown()
+    return f"{_INTRO}{summary}\n\n{table}\n{_HOW}\n## What the verdicts rest on\n\n{grounds(verdicts)}"

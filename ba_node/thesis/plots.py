@@ -165,6 +165,85 @@ def growth(experiment: Experiment, records: Records) -> Figure:
     return figure
 
 
+def pcg(experiment: Experiment, records: Records) -> Figure:
+    """Draw the PCG steps of every linear solve."""
+    figure = new_figure(9.0, 5.0)
+    axis = figure.subplots()
+    for index, (label, record) in enumerate(records.items()):
+        steps = [row["linear_iterations"] for row in record["trace"][1:]]
+        axis.plot(range(1, len(steps) + 1), steps, label=label, **style(index))
+    axis.set(yscale="log", xlabel="step tried", ylabel="PCG steps of its linear solve")
+    axis.grid(visible=True, alpha=0.3)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False)
+    _title(figure, experiment.heading)
+    return figure
+
+
+def conditions(experiment: Experiment, records: Records) -> Figure:
+    """Draw the conditions of C, B and S against the steps, without the cure above, with it below; crosses: breaks."""
+    figure = new_figure(13.0, 8.0)
+    axes = figure.subplots(2, 3, sharey="col", sharex=True)
+    for below, line in enumerate(axes):
+        chosen = {label: record for label, record in records.items() if label.endswith(", cured") == bool(below)}
+        for index, (label, record) in enumerate(chosen.items()):
+            columns = record["data"]["conditions"]
+            steps = np.arange(1, len(columns["plain"]) + 1)
+            broken = np.array(columns["plain"]) == 0.0
+            for axis, name in zip(line, "cbs", strict=True):
+                values = np.array(columns[f"condition_{name}"])
+                axis.semilogy(steps, values, label=label.removesuffix(", cured"), **style(index))
+                if name == "s":
+                    axis.semilogy(steps[broken], values[broken], "x", color=COLOURS[index], ms=4.0)
+        for axis, name in zip(line, ("C, worst block", "B, worst block", "S"), strict=True):
+            axis.set_title(f"{name}, {'with the cure' if below else 'without'}", fontsize=10)
+            axis.grid(visible=True, alpha=0.3)
+    for axis in axes[1]:
+        axis.set_xlabel("step tried")
+    for line in axes:
+        line[0].set_ylabel("condition, damping included")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    _title(figure, f"{experiment.heading}; crosses: textbook algebra breaks")
+    return figure
+
+
+def shares(experiment: Experiment, records: Records) -> Figure:
+    """Draw errors to truth against the share of outliers, which labels begin with, a line for each method."""
+    figure = new_figure(11.0, 4.8)
+    axes = figure.subplots(1, 2)
+    found: dict[str, list[tuple[float, Any]]] = {}
+    for label, record in records.items():
+        share, _, method = label.partition(" %, ")
+        found.setdefault(method, []).append((float(share), record["truth_after"]))
+    names = (("rmse_cameras", "RMSE of cameras"), ("median_points", "median error of points"))
+    for index, (method, rows) in enumerate(found.items()):
+        for axis, (name, _) in zip(axes, names, strict=True):
+            x, y = [share for share, _ in rows], [errors[name] for _, errors in rows]
+            axis.plot(x, y, marker="o", ms=4.0, label=method, **style(index))
+    for axis, (_, title) in zip(axes, names, strict=True):
+        axis.set(yscale="log", xlabel="outliers [%]", ylabel=title)
+        axis.grid(visible=True, which="both", alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    _title(figure, experiment.heading)
+    return figure
+
+
+def bars(experiment: Experiment, records: Records) -> Figure:
+    """Draw errors to truth of each case as bars."""
+    figure = new_figure(9.0, 3.6)
+    axes = figure.subplots(1, 2, sharey=True)
+    known = {label: record["truth_after"] for label, record in records.items() if "truth_after" in record}
+    for axis, (name, title) in zip(
+        axes, (("rmse_cameras", "RMSE of cameras"), ("median_points", "median error of points")), strict=True
+    ):
+        drawn = axis.barh(list(known), [errors[name] for errors in known.values()], color=COLOURS[5])
+        axis.bar_label(drawn, fmt="%.3g", padding=3)
+        axis.margins(x=0.15)
+        axis.set_xlabel(title)
+    axes[0].invert_yaxis()
+    _title(figure, experiment.heading)
+    return figure
+
+
 PLOTS: dict[str, Plot] = {
     "curves": curves,
     "taylor": taylor,
@@ -172,4 +251,8 @@ PLOTS: dict[str, Plot] = {
     "histograms": histograms,
     "layout": layout,
     "growth": growth,
+    "pcg": pcg,
+    "conditions": conditions,
+    "shares": shares,
+    "bars": bars,
 }

@@ -61,6 +61,12 @@ QUANTITIES: dict[str, Quantity] = {
     "observations": Quantity("observations", ".0f"),
     "fill_of_e": Quantity("share of E's blocks", ".2f"),
     "views_per_point": Quantity("images per point", ".1f"),
+    "condition_c": Quantity("condition of C", ".1e"),
+    "condition_b": Quantity("condition of B", ".1e"),
+    "condition_s": Quantity("condition of S", ".1e"),
+    "lone_points": Quantity("points held by < 2 observations", ".0f"),
+    "first_break": Quantity("first break in step", ".0f"),
+    "breaks": Quantity("breaks", ".0f"),
 }
 
 

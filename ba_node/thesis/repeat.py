@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from ba_node.io.json_file import write_json
 from ba_node.thesis.claims import CLAIMS
 from ba_node.thesis.experiments import Experiment
 from ba_node.thesis.judging import judge_all
-from ba_node.thesis.page import verdict_table
 from ba_node.thesis.problems import Library
 from ba_node.thesis.report import Section, write_report
 from ba_node.thesis.runner import Clock, Progress, Runner
@@ -35,8 +34,12 @@ class Repetition:
             out: folder for records and pages.
             quick: a few steps a run, and no large problem.
         """
-        self._experiments = [_quick(e) for e in experiments] if quick else list(experiments)
         self._library, self._out, self._quick = Library(data), out, quick
+        # Names of problems that are left out, as their files are not there and the others do without.
+        problems = {case.task.problem for experiment in experiments for case in experiment.cases}
+        self.absent = sorted(filter(self._library.absent, problems))
+        there = [_without(experiment, self.absent) for experiment in experiments]
+        self._experiments = [_quick(experiment) for experiment in there] if quick else there
 
     def missing(self) -> list[Task]:
         """Return the tasks that have no record yet.
@@ -62,7 +65,7 @@ class Repetition:
         found = results(sections)
         write_json(self._out / "results.json", found)
         verdicts = [] if self._quick else judge_all(CLAIMS, found)
-        return write_report(self._out, sections, verdict_table(verdicts) if verdicts else None)
+        return write_report(self._out, sections, verdicts)
 
     def _tasks(self) -> list[Task]:
         return [case.task for experiment in self._experiments for case in experiment.cases]
@@ -87,9 +90,11 @@ def _short(value: float | str | None) -> float | str | None:
 
 
 def _quick(experiment: Experiment) -> Experiment:
-    cases = tuple(
-        dataclasses.replace(case, task=case.task.quick())
-        for case in experiment.cases
-        if case.task.problem not in _LARGE
-    )
+    there = _without(experiment, _LARGE)
+    cases = tuple(dataclasses.replace(case, task=case.task.quick()) for case in there.cases)
+    return dataclasses.replace(there, cases=cases)
+
+
+def _without(experiment: Experiment, problems: Collection[str]) -> Experiment:
+    cases = tuple(case for case in experiment.cases if case.task.problem not in problems)
     return dataclasses.replace(experiment, cases=cases)

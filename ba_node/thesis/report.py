@@ -13,6 +13,8 @@ from typing import Any
 
 from ba_node.io.files import whole_file
 from ba_node.thesis.experiments import Experiment
+from ba_node.thesis.judging import Verdict
+from ba_node.thesis.page import grounds, verdict_table
 from ba_node.thesis.plots import PLOTS, png
 from ba_node.thesis.quantities import figures
 from ba_node.thesis.tables import Table, table
@@ -57,27 +59,28 @@ class Section:
         return {name: png(PLOTS[name](self.experiment, self.records)) for name in self.experiment.plots}
 
 
-def write_report(folder: Path, sections: Sequence[Section], verdicts: Table | None) -> Path:
+def write_report(folder: Path, sections: Sequence[Section], verdicts: Sequence[Verdict]) -> Path:
     """Write report.html and report.md with its images; return the former.
 
     Args:
         folder: exists.
         sections: what has been run.
-        verdicts: on the thesis's claims; None to leave them out.
+        verdicts: on the thesis's claims; none to leave them out.
     """
     title = "The thesis's experiments"
     page = [f"<!doctype html><meta charset='utf-8'><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
     text = [f"# {title}\n", f"{INTRO}\n"]
     page.append(f"<p>{html.escape(INTRO)}</p>")
-    if verdicts is not None:
-        page.append(f"<h2>Claims</h2>\n{verdicts.html()}")
-        text += ["## Claims\n", verdicts.markdown()]
+    if verdicts:
+        shown = verdict_table(verdicts)
+        page.append(f"<h2>Claims</h2>\n{shown.html()}\n{_grounds(verdicts)}")
+        text += ["## Claims\n", shown.markdown(), grounds(verdicts)]
     images = folder / "images"
     images.mkdir(exist_ok=True)
     for section in sections:
-        experiment, shown = section.experiment, section.table()
-        page.append(f"<h2 id='{experiment.name}'>{html.escape(experiment.heading)}</h2>\n{shown.html()}")
-        text += [f"## {experiment.heading}\n", shown.markdown()]
+        experiment, rows = section.experiment, section.table()
+        page.append(f"<h2 id='{experiment.name}'>{html.escape(experiment.heading)}</h2>\n{rows.html()}")
+        text += [f"## {experiment.heading}\n", rows.markdown()]
         if experiment.note:
             page.append(f"<p>{html.escape(experiment.note)}</p>")
             text.append(f"{experiment.note}\n")
@@ -90,6 +93,16 @@ def write_report(folder: Path, sections: Sequence[Section], verdicts: Table | No
     _write(folder / "report.md", "\n".join(text).encode())
     _write(folder / "report.html", "\n".join(page).encode())
     return folder / "report.html"
+
+
+def _grounds(verdicts: Sequence[Verdict]) -> str:
+    """Return what the verdicts rest on, to be unfolded."""
+    parts = []
+    for number, verdict in enumerate(verdicts, start=1):
+        lines = "".join(f"<li>{'yes' if so else '<b>no</b>'}: {html.escape(text)}</li>" for so, text in verdict.found)
+        head = html.escape(f"{number}. {verdict.claim.text}: {verdict.word}")
+        parts.append(f"<p><b>{head}</b></p><ul>{lines}</ul><p>{html.escape(verdict.claim.remark)}</p>")
+    return f"<details><summary>What the verdicts rest on</summary>{''.join(parts)}</details>\n"
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -20,6 +20,7 @@ from ba_node.offline.solver_settings import describe
 from ba_node.thesis import finals, measures
 from ba_node.thesis.problems import NAMES, Library, Posed
 from ba_node.thesis.tasks import Measure, Run, Task, key
+from ba_node.thesis.variants import VARIANTS
 
 Clock = Callable[[], float]
 Record = Mapping[str, Any]
@@ -86,7 +87,10 @@ class Runner:
             self._tell(task, max(taken, 0) / max(task.iterations, 1))
             return taken < task.iterations
 
-        result = solve(posed.problem, options, clock=self._clock, on_iteration=watch)
+        kernels = None
+        if task.kernels:
+            kernels = VARIANTS[task.kernels](posed.problem, options.rules, options.demands)
+        result = solve(posed.problem, options, clock=self._clock, on_iteration=watch, kernels=kernels)
         return {
             "method": task.method,
             "settings": list(task.settings),

@@ -24,7 +24,7 @@ class Table:
     def markdown(self) -> str:
         """Return it for Markdown."""
         lines = [self.head, ("---",) * len(self.head), *self.rows]
-        return "".join(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |\n" for line in lines)
+        return "".join(f"| {' | '.join(map(escaped, line))} |\n" for line in lines)
 
     def html(self) -> str:
         """Return it for HTML."""
@@ -34,6 +34,11 @@ class Table:
 
         rows = "\n".join(line(row, "td") for row in self.rows)
         return f"<table>\n{line(self.head, 'th')}\n{rows}\n</table>\n"
+
+
+def escaped(text: str) -> str:
+    """Return text without what Markdown takes for the border of a cell."""
+    return text.replace("|", "&#124;")
 
 
 def table(experiment: Experiment, figures: Mapping[str, Figures]) -> Table:

@@ -35,6 +35,7 @@ class Run:
         settings: changes to it, as of ``--set``.
         iterations: steps that are taken, as the thesis counts; rejected ones come on top, up to as many again.
         images: of these the reprojections before and after are kept.
+        kernels: name in variants.VARIANTS, empty for the solver's own.
     """
 
     problem: str
@@ -42,6 +43,7 @@ class Run:
     settings: tuple[str, ...] = ()
     iterations: int = 50
     images: tuple[int, ...] = ()
+    kernels: str = ""
 
     def options(self) -> SolverOptions:
         """Return the method with its changes."""
@@ -50,7 +52,9 @@ class Run:
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""
         options: dict[str, Value] = {k: v for k, v in describe(self.options()).items() if k not in _WITHOUT_EFFECT}
-        return {"run": options, "inc": INC_STEPS, "iterations": self.iterations, "images": self.images}
+        content: dict[str, object] = {"run": options, "inc": INC_STEPS}
+        content |= {"iterations": self.iterations, "images": self.images}
+        return content | {"kernels": self.kernels} if self.kernels else content
 
     @property
     def weight(self) -> int:

@@ -15,8 +15,9 @@ import pytest
 
 from ba_node.core.solver import solve
 from ba_node.thesis import runner
+from ba_node.thesis.data_sets import DataError
 from ba_node.thesis.experiments import Case, Experiment
-from ba_node.thesis.problems import DataError, Library
+from ba_node.thesis.problems import Library
 from ba_node.thesis.repeat import Repetition, results
 from ba_node.thesis.tasks import Measure, Run, Task, key
 
@@ -152,5 +153,5 @@ def test_quick_takes_few_steps_and_leaves_out_what_is_large(tiny: Experiment, tm
 def test_a_missing_data_set_is_named_with_where_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"problem-49-7776-pre\.txt\.bz2 from the Ladybug data sets of https://grail"):
         Library(tmp_path).get("ladybug-49")
-    with pytest.raises(DataError, match="choose one of ladybug-49, ladybug-10, 10-253"):
+    with pytest.raises(DataError, match=r"choose one of ladybug-49, ladybug-10, .*, kitti, 10-253"):
         Library(tmp_path).identity("ladybug-50")
