@@ -27,6 +27,7 @@ FloatArray = NDArray[np.float64]
 
 # What stands for a condition that is infinite, or lost in rounding.
 WORST = 1e20
+_WORST_OF = ("condition_c", "condition_b", "condition_s", "lone_points")
 
 
 class Watched(NumpyKernels):
@@ -97,9 +98,8 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
     result = solve(posed.problem, options, kernels=kernels)
     rows = kernels.rows
     broken = [index for index, row in enumerate(rows, start=1) if not row["plain"]]
-    figures: dict[str, Any] = {
-        name: max(row[name] for row in rows) for name in ("condition_c", "condition_b", "condition_s", "lone_points")
-    }
+    # A solve that ends where it begins has no system to look at.
+    figures: dict[str, Any] = {name: max((row[name] for row in rows), default=None) for name in _WORST_OF}
     figures |= {
         "first_break": float(broken[0]) if broken else None,
         "breaks": float(len(broken)),
@@ -107,5 +107,5 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
         "objective": result.objective_after,
         "gradient": result.gradient_norm,
     }
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    columns = {name: [row[name] for row in rows] for name in (*_WORST_OF, "active", "plain")}
     return {"figures": figures, "data": {"conditions": columns}}

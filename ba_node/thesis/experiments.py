@@ -66,4 +66,5 @@ class Experiment:
         repeated = [f"Table {self.name}"] if self.is_table else []
         if self.figures:
             repeated.append(f"Figure{'s' if len(self.figures) > 1 else ''} {', '.join(self.figures)}")
-        return f"{', '.join(repeated) or self.name.capitalize()}: {self.title}"
+        name = f"Open problem ({self.name})" if self.name.startswith("open-") else self.name.capitalize()
+        return f"{', '.join(repeated) or name}: {self.title}"

@@ -70,7 +70,7 @@ def write_report(folder: Path, sections: Sequence[Section], verdicts: Sequence[V
     title = "The thesis's experiments"
     page = [f"<!doctype html><meta charset='utf-8'><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
     text = [f"# {title}\n", f"{INTRO}\n"]
-    page.append(f"<p>{html.escape(INTRO)}</p>")
+    page.append(f"<p>{html.escape(INTRO)}</p>\n{_contents(sections)}")
     if verdicts:
         shown = verdict_table(verdicts)
         page.append(f"<h2>Claims</h2>\n{shown.html()}\n{_grounds(verdicts)}")
@@ -93,6 +93,13 @@ def write_report(folder: Path, sections: Sequence[Section], verdicts: Sequence[V
     _write(folder / "report.md", "\n".join(text).encode())
     _write(folder / "report.html", "\n".join(page).encode())
     return folder / "report.html"
+
+
+def _contents(sections: Sequence[Section]) -> str:
+    """Return links to all experiments."""
+    found = [section.experiment for section in sections]
+    links = "".join(f"<li><a href='#{one.name}'>{html.escape(one.heading)}</a></li>" for one in found)
+    return f"<details><summary>Contents</summary><ul>{links}</ul></details>"
 
 
 def _grounds(verdicts: Sequence[Verdict]) -> str:
