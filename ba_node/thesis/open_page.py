@@ -44,15 +44,15 @@ B, diagonals; its solves end near the cap of 1000.
 The weights of Huber's loss are small but never zero, and every block of H loses about as much: conditions stay near
 those of squared loss. The truncated quadratic takes all weight from observations beyond its scale. A point that keeps
 fewer than two of them is held by damping alone in one direction or three: its block of C is singular, and with damping
-its condition is `|C|/mu`. Nielsen's policy lets mu fall by a third in every good step, so after 30 to 40 of them it is
+its condition is `|C|/mu`. Nielsen's policy divides mu by three in every good step, so in 35 of them it falls
 below what a float64 holds beside `|C|`: the inverse of the block is rounding, S = B - E C^-1 E' takes it over, and
 Cholesky meets a pivot that is not positive. B sees hundreds of observations an image, and hardly notices.
 
 S has another reason to break, with any loss: nothing but mu holds the seven directions of the gauge. On the sphere,
-where nearly every step is good, mu is at 1e-16 after 35 steps and S is not positive definite to rounding. That is how
-LMA-CD and IRLS end in NaN within 10 to 40 steps in textbook algebra (crosses). We do not know the thesis's program; the
-solver here inverts C with a look at its pivots and takes a step that is not finite as rejected, so it goes on, but on
-what such a matrix gives.
+where nearly every step is good, mu soon is below rounding and S is not positive definite any more. That is how IRLS and
+methods with squared loss end in NaN within 10 to 40 steps in textbook algebra (crosses). We do not know the thesis's
+program; the solver here inverts C with a look at its pivots and takes a step that is not finite as rejected, so it goes
+on, but on what such a matrix gives.
 """,
         """\
 ![Condition of C, B and S along 50 steps on ten frames of Ladybug-49](images/open_conditioning.png)
@@ -61,12 +61,12 @@ what such a matrix gives.
 
 The cure has three parts: first-order weights, which are never negative (all of these use them); points that fewer than
 two observations hold leave the equations; D = diag(H) with a floor on its entries and on mu. With it no condition goes
-beyond 1e14 and nothing breaks. It does not make a truncated quadratic start well: from the plateau of the sphere all
-points leave at once, hence the annealing of `irls_tq`. Where a cured curve falls to a low, level line, steps are
-rejected and mu rises: the run has arrived.
+beyond what float64 holds, and nothing breaks. It does not make a truncated quadratic start well: from the plateau of
+the sphere all points leave at once, hence the annealing of `irls_tq`. Where a cured curve falls to a low, level line,
+steps are rejected and mu rises: the run has arrived.
 
-In the node the window takes the same three measures (docs/concepts.md); `ba solve --set damping=diag` has the second
-half of it, and rejected steps for the rest.
+`auto` damps with diag(H) and the floor on its entries; any method does with `--set damping=diag`. Blocks that are
+singular all the same are inverted as pseudo-inverses.
 """,
         ("open-conditioning", "open-conditioning-sphere"),
     ),
@@ -81,7 +81,7 @@ and every run led to its end, the loss decides and the method does not.
 
 Squared loss shares an outlier of 30 px out among all that it touches. The RMSE of points is ruled by a few that two
 near images see, hence the median. The truncated quadratic has D = diag(H) here: with D = I and
-mu = 10 the first surrogates are over before the points have moved, and 2 % of outliers cost it 2107 instead of 901.
+mu = 10 the first surrogates are over before the points have moved.
 """,
         ("open-outliers",),
     ),

@@ -207,7 +207,7 @@ OPEN = (
                 ),
             ),
         ),
-        (*_ERRORS, "objective", "gradient", "steps", "seconds", "end"),
+        (*_ERRORS, "objective", "steps", "seconds", "end"),
         (),
         ("bars",),
         "A sphere of 50 images that one camera took, without outliers; errors in units in which the radius is 500."

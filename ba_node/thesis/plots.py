@@ -23,6 +23,8 @@ Plot = Callable[[Experiment, Records], Figure]
 # Okabe-Ito colours, told apart by colour-blind readers; then the same dashed.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":")
+# Below this share objectives are the same.
+_LEVEL = 1e-9
 _MEASURED, _PREDICTED = "#D55E00", "#0072B2"
 
 
@@ -51,24 +53,40 @@ def style(index: int) -> dict[str, Any]:
 
 
 def curves(experiment: Experiment, records: Records) -> Figure:
-    """Draw objective and norm of the gradient against steps taken and against time."""
-    figure = new_figure(13.0, 9.0)
-    axes = figure.subplots(2, 2, sharey="row")
+    """Draw objective, what it is above the lowest one, and norm of the gradient, against steps taken and time."""
+    figure = new_figure(13.0, 12.5)
+    axes = figure.subplots(3, 2, sharey="row", sharex="col")
     runs = {label: record for label, record in records.items() if len(record.get("trace", ())) > 1}
+    lowest = _lowest(runs)
     for index, (label, record) in enumerate(runs.items()):
         rows = [row for row in record["trace"] if row["accepted"]]
-        for line, name in zip(axes, ("objective", "gradient_norm"), strict=True):
-            values = [row[name] if row[name] and row[name] > 0.0 else math.nan for row in rows]
+        best = lowest[record["options"]["loss"]]
+        objective, gradient = (np.array([row[n] or math.nan for row in rows]) for n in ("objective", "gradient_norm"))
+        above = np.maximum((objective - best) / best, _LEVEL) if best > 0.0 else np.full(len(rows), math.nan)
+        for line, values in zip(axes, (objective, above, gradient), strict=True):
             line[0].plot(range(len(rows)), values, label=label, **style(index))
             line[1].plot([row["time_s"] for row in rows], values, label=label, **style(index))
-    for line, name in zip(axes, ("objective", "norm of the gradient"), strict=True):
-        for axis, unit in zip(line, ("steps taken", "processor time [s]"), strict=True):
-            axis.set(yscale="log", xlabel=unit)
+    names = ("objective", "objective above the lowest of its loss, share", "norm of the gradient")
+    for line, name in zip(axes, names, strict=True):
+        for axis in line:
+            axis.set_yscale("log")
             axis.grid(visible=True, alpha=0.3)
         line[0].set_ylabel(name)
+    for axis, unit in zip(axes[-1], ("steps taken", "processor time [s]"), strict=True):
+        axis.set_xlabel(unit)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     _title(figure, experiment.heading)
     return figure
+
+
+def _lowest(runs: Records) -> dict[str, float]:
+    """Return the lowest objective of all runs with the same loss."""
+    out: dict[str, float] = {}
+    for record in runs.values():
+        values = [row["objective"] for row in record["trace"] if row["objective"] is not None]
+        loss = record["options"]["loss"]
+        out[loss] = min([*values, out.get(loss, math.inf)])
+    return out
 
 
 def taylor(experiment: Experiment, records: Records) -> Figure:
@@ -166,12 +184,14 @@ def growth(experiment: Experiment, records: Records) -> Figure:
 
 
 def pcg(experiment: Experiment, records: Records) -> Figure:
-    """Draw the PCG steps of every linear solve."""
+    """Draw the PCG steps of every linear solve; what follows a comma in a label is dashed in the colour before it."""
     figure = new_figure(9.0, 5.0)
     axis = figure.subplots()
-    for index, (label, record) in enumerate(records.items()):
+    kinds = list(dict.fromkeys(label.split(",")[0] for label in records))
+    for label, record in records.items():
         steps = [row["linear_iterations"] for row in record["trace"][1:]]
-        axis.plot(range(1, len(steps) + 1), steps, label=label, **style(index))
+        colour = COLOURS[kinds.index(label.split(",")[0]) % len(COLOURS)]
+        axis.plot(range(1, len(steps) + 1), steps, color=colour, ls="--" if "," in label else "-", lw=1.4, label=label)
     axis.set(yscale="log", xlabel="step tried", ylabel="PCG steps of its linear solve")
     axis.grid(visible=True, alpha=0.3)
     figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False)

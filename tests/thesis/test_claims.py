@@ -32,6 +32,8 @@ from ba_node.thesis.page import claims_page, old_cases
 from ba_node.thesis.quantities import QUANTITIES
 
 RECORDED = Path(__file__).resolve().parents[2] / "docs" / "thesis_results.json"
+# Where the objective at the end is that of a point on the way.
+FAR_FROM_THE_END = ("3.5", "3.6", "inm-tnm")
 # By what factor another machine's rounding moves a figure.
 NOISE = {
     "gradient_smallest": 2.0,
@@ -100,22 +102,22 @@ class TestRecorded:
         assert len(left) <= len(CLAIMS) // 5, left
 
     @pytest.mark.parametrize("claim", CLAIMS + FINDINGS, ids=lambda claim: claim.text)
-    def test_no_comparison_hangs_on_what_another_run_may_change(
+    def test_no_verdict_hangs_on_what_another_run_may_change(
         self, claim: Claim, recorded: dict[str, dict[str, dict[str, Any]]]
     ) -> None:
         """Each figure is moved by what was seen between two machines; what it is compared with stays."""
-        found = judge(claim, recorded).found
+        word = judge(claim, recorded).word
         for check in claim.checks:
             for name, label, quantity in used(check):
-                by = 1.1 if QUANTITIES[quantity].is_time else NOISE.get(quantity, 1.0)
                 value = recorded[name][label].get(quantity)
-                if value is None:
-                    continue
-                for moved in (value * by, value / by):
+                by = 1.1 if QUANTITIES[quantity].is_time else NOISE.get(quantity, 1.0)
+                if quantity == "objective" and name in FAR_FROM_THE_END:
+                    by = 1.02
+                for moved in (value * by, value / by) if value is not None else ():
                     recorded[name][label][quantity] = moved
-                    again = judge(claim, recorded).found
+                    again = judge(claim, recorded).word
                     recorded[name][label][quantity] = value
-                    assert [so for so, _ in again] == [so for so, _ in found], (label, quantity, value, moved)
+                    assert again == word, (label, quantity, value, moved)
 
     def test_the_page_shows_every_claim(self, recorded: dict[str, dict[str, dict[str, Any]]]) -> None:
         page = claims_page(recorded)
