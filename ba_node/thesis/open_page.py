@@ -114,7 +114,7 @@ has no shared free ones; the row "shared" ties the steps in an experiment of its
 def open_page(results: Results) -> str:
     """Return docs/open_problems.md."""
     verdicts = [judge(finding, results) for finding in FINDINGS]
-    parts = [_INTRO, verdict_table(verdicts, old_cases(results)).markdown()]
+    parts = [_INTRO, verdict_table(verdicts, old_cases(results), "finding").markdown()]
     for title, before, after, names in _SECTIONS:
         parts.append(f"\n## {title}\n\n{before}\n")
         for name in names:

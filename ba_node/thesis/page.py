@@ -52,19 +52,20 @@ Figure 5.4: reprojection in two images of Ladybug-49 before and after DINM.
 """
 
 
-def verdict_table(verdicts: Sequence[Verdict], old: Collection[tuple[str, str]] = ()) -> Table:
+def verdict_table(verdicts: Sequence[Verdict], old: Collection[tuple[str, str]] = (), what: str = "claim") -> Table:
     """Return the claims with their verdicts, numbered.
 
     Args:
         verdicts: of judging.judge.
         old: experiment and label of cases whose figures were recorded with other options than are declared now.
+        what: head of the column of claims.
     """
     rows = []
     for number, verdict in enumerate(verdicts, start=1):
         claim = verdict.claim
         is_old = any(case in old for check in claim.checks for case in check.cases())
         rows.append((str(number), claim.text, claim.where, f"{verdict.word}{' (old)' * is_old}"))
-    return Table(("", "claim", "where", "verdict"), tuple(rows))
+    return Table(("", what, "where", "verdict"), tuple(rows))
 
 
 def grounds(verdicts: Sequence[Verdict]) -> str:
