@@ -67,8 +67,8 @@ FINDINGS: tuple[Claim, ...] = (
         tuple(Below(_C, "condition_b", name, ("squared, PCG",), 0.1) for name in ("Huber", "TQ", "TQ, annealed")),
     ),
     Claim(
-        "textbook algebra breaks: with the truncated quadratic on both problems, and with every loss on the sphere,"
-        " where mu falls until nothing holds the gauge",
+        "textbook algebra breaks: with the truncated quadratic on both problems, and under PCG with squared and Huber's"
+        " loss on the sphere, where mu falls until nothing holds the gauge",
         "reweighting",
         (
             *(Within(_C, "breaks", name, low=1.0) for name in ("TQ", "TQ, annealed")),
