@@ -12,6 +12,7 @@ from typing import Any
 from ba_node.io.json_file import write_json
 from ba_node.thesis.claims import CLAIMS
 from ba_node.thesis.experiments import Experiment
+from ba_node.thesis.findings import FINDINGS
 from ba_node.thesis.judging import judge_all
 from ba_node.thesis.problems import Library
 from ba_node.thesis.report import Section, write_report
@@ -64,7 +65,7 @@ class Repetition:
         """Write the pages and results.json; return the page that holds all."""
         found = results(sections)
         write_json(self._out / "results.json", found)
-        verdicts = [] if self._quick else judge_all(CLAIMS, found)
+        verdicts = [] if self._quick else judge_all((*CLAIMS, *FINDINGS), found)
         return write_report(self._out, sections, verdicts)
 
     def _tasks(self) -> list[Task]:

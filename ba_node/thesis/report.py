@@ -27,9 +27,12 @@ INTRO = (
     " compare: they stand in parentheses. Steps are those taken, as the thesis counts; a rejected one is tried again."
 )
 _STYLE = (
-    "body{font-family:sans-serif;max-width:75em;margin:auto;padding:1em}table{border-collapse:collapse;margin:1em 0}"
-    "td,th{border:1px solid #bbb;padding:.2em .6em;text-align:right}td:first-child,th:first-child{text-align:left}"
-    "td:last-child{text-align:left}img{max-width:100%}"
+    "body{font-family:sans-serif;max-width:75em;margin:auto;padding:1em}"
+    "table{border-collapse:collapse;margin:1em 0;display:block;overflow-x:auto;font-size:.85em}"
+    "td,th{border:1px solid #bbb;padding:.2em .6em;text-align:right;vertical-align:top}"
+    "td:first-child,th:first-child,td:last-child,.claims td,.claims th{text-align:left}"
+    "th{background:#eee}img{max-width:100%}"
+    "summary{cursor:pointer;font-weight:bold;margin:1em 0}"
 )
 
 
@@ -65,7 +68,7 @@ def write_report(folder: Path, sections: Sequence[Section], verdicts: Sequence[V
     Args:
         folder: exists.
         sections: what has been run.
-        verdicts: on the thesis's claims; none to leave them out.
+        verdicts: on the thesis's claims and on our findings; none to leave them out.
     """
     title = "The thesis's experiments"
     page = [f"<!doctype html><meta charset='utf-8'><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
@@ -73,8 +76,8 @@ def write_report(folder: Path, sections: Sequence[Section], verdicts: Sequence[V
     page.append(f"<p>{html.escape(INTRO)}</p>\n{_contents(sections)}")
     if verdicts:
         shown = verdict_table(verdicts)
-        page.append(f"<h2>Claims</h2>\n{shown.html()}\n{_grounds(verdicts)}")
-        text += ["## Claims\n", shown.markdown(), grounds(verdicts)]
+        page.append(f"<h2>Claims and findings</h2>\n<div class='claims'>{shown.html()}</div>\n{_grounds(verdicts)}")
+        text += ["## Claims and findings\n", shown.markdown(), grounds(verdicts)]
     images = folder / "images"
     images.mkdir(exist_ok=True)
     for section in sections:

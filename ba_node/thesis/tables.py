@@ -76,5 +76,6 @@ def _cell(name: str, case: Case, experiment: Experiment, figures: Mapping[str, F
     for label in (case.versus, ""):
         base = figures.get(experiment.case(label).label, {}).get(name)
         if isinstance(base, float) and base > 0.0:
-            return f"{text} ({value / base:.2g})"
+            ratio = value / base
+            return f"{text} ({ratio:.0f})" if ratio >= 100.0 else f"{text} ({ratio:.2g})"
     return text
