@@ -51,9 +51,11 @@ _DINM = dataclasses.replace(_THESIS, damping="identity", trust_region="inc")
 _ADINM = dataclasses.replace(
     _DINM, schur="adaptive", preconditioner="schur_block", max_linear_iterations=3000, initial_radius=1e4
 )
-_LOCAL_DINM = dataclasses.replace(_DINM, rules=Rules(parameterisation="local"))
-_HUBER = dataclasses.replace(_LOCAL_DINM, rules=Rules(loss="huber"))
-_TQ = dataclasses.replace(_LOCAL_DINM, rules=Rules(loss="truncated_quadratic"), annealing="gnc")
+_LOCAL = dataclasses.replace(_DINM, rules=Rules(parameterisation="local"))
+# Where damping alone holds points back, the gradient falls with mu: a tenth of it is two steps gained.
+_LOCAL_DINM = dataclasses.replace(_LOCAL, initial_damping=1.0)
+_HUBER = dataclasses.replace(_LOCAL, rules=Rules(loss="huber"))
+_TQ = dataclasses.replace(_LOCAL, rules=Rules(loss="truncated_quadratic"), annealing="gnc")
 
 _DECLARED: dict[str, Method] = {
     "auto": Method(

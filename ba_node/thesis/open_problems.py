@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from ba_node.thesis.chapter3 import CAP, CURVES, NUMPY, SOLVE_COLUMNS, dinm, ladybug
+from ba_node.thesis.chapter45 import MU
 from ba_node.thesis.data_sets import KITTI, LADYBUG
 from ba_node.thesis.experiments import Case, Experiment
 from ba_node.thesis.problems import (
@@ -42,7 +43,7 @@ def _conditions(problem: str, gammas: tuple[str, str], steps: int = 50) -> tuple
     huber, truncated = gammas
     rows: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ("squared, Cholesky", "lma_cd", ()),
-        ("squared, PCG", "local_dinm", ()),
+        ("squared, PCG", "local_dinm", (MU,)),
         ("Huber", "irls_huber", (huber,)),
         ("TQ", "irls_tq", (truncated, "annealing=none")),
         ("TQ, annealed", "irls_tq", (truncated,)),
@@ -88,7 +89,7 @@ _CONDITIONS = tuple(
 
 _OUTLIER_METHODS = (
     ("LMA-CD", "lma_cd", ("parameterisation=local", _NATIVE)),
-    ("local DINM", "local_dinm", (_BLOCKS, _NATIVE)),
+    ("local DINM", "local_dinm", (_BLOCKS, MU, _NATIVE)),
     ("IRLS, Huber", "irls_huber", (_BLOCKS, _HUBER, _NATIVE)),
     ("IRLS, TQ", "irls_tq", (_BLOCKS, _TRUNCATED, "damping=diag", "initial_damping=1e-3", NUMPY)),
     ("auto, Huber", "auto", ("loss=huber", _HUBER, "q_eps=0", _NATIVE)),
@@ -105,12 +106,12 @@ _DATA = (
 _DATA_METHODS = (
     ("LMA-CD", "lma_cd", (NUMPY,)),
     ("DINM", "dinm", (NUMPY, CAP)),
-    ("local DINM", "local_dinm", (NUMPY, CAP)),
+    ("local DINM", "local_dinm", (NUMPY, CAP, MU)),
     ("IRLS", "irls_huber", (NUMPY, CAP)),
     ("auto, C++", "auto", (_NATIVE, _TO_THE_END)),
 )
 _LARGE = (
-    ("local DINM, M of blocks", "local_dinm", (_BLOCKS,)),
+    ("local DINM, M of blocks", "local_dinm", (_BLOCKS, MU)),
     ("IRLS, Huber, M of blocks", "irls_huber", (_BLOCKS, _HUBER)),
     ("auto, Huber", "auto", ("loss=huber", _HUBER, "q_eps=0", "function_tolerance=1e-8")),
 )
