@@ -111,7 +111,7 @@ _PARTS = (
         "How mu follows the gain ratio rho.",
         (
             Choice("nielsen", "rho > 0: mu max(1/3, 1 - (2 rho - 1)^3); else mu nu, nu = 2, 4, 8, ...", "Alg. 6"),
-            Choice("fast", "as nielsen, but mu/5 where rho > 1/2"),
+            Choice("fast", "as nielsen, but mu/5 where rho > 1/2, and mu/2 where rho > 1/4"),
         ),
     ),
     Part(

@@ -14,7 +14,8 @@ that of points far away: there p = -g / mu, the objective falls by |g|^2 / mu, a
 lets mu fall by its most, a third, with the damped model alone.
 Radius (Algorithm 2): rho < 1/4: radius / 4; rho > 3/4 on the boundary: radius * 2.
 Damping: ``nielsen`` (Algorithm 6): rho > 0: mu *= max(1/3, 1 - (2 rho - 1)^3), nu = 2, else mu *= nu, nu *= 2;
-``fast``: the same, but mu / 5 where rho > 1/2.
+``fast``: the same, but mu / 5 where rho > 1/2 and mu / 2 where rho > 1/4: along a flat valley rho stays a little below
+1/2, and Nielsen's mu where it is.
 
 With ``polish_steps`` > 0 each step of the keyframes is followed by that many damped Newton steps of every point alone
 (inner iterations); a step that was bad only because the points had not followed it is saved by them.
@@ -190,8 +191,9 @@ class _Run:
         accepted = rho > 0.0
         if accepted:
             shrink = max(1.0 / 3.0, 1.0 - (2.0 * rho - 1.0) ** 3)
-            fast = self.options.damping_policy == "fast" and rho > 0.5
-            self.mu, self.nu = self.mu * (0.2 if fast else shrink), 2.0
+            if self.options.damping_policy == "fast" and rho > 0.25:
+                shrink = 0.2 if rho > 0.5 else 0.5
+            self.mu, self.nu = self.mu * shrink, 2.0
         else:
             self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
         if rho < 0.25:
