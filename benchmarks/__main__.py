@@ -62,7 +62,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--solvers", nargs="+", default=[], metavar="NAME", help='those of exactly this name: "ceres dense"'
     )
-    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="runs a solver; medians are shown (5)")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="runs a solver; medians are shown (3)")
     parser.add_argument("--iterations", type=int, default=100, metavar="N", help="cap on iterations (100)")
     parser.add_argument("--tolerance", type=float, default=1e-8, help="relative decrease at which solvers stop (1e-8)")
     parser.add_argument(
