@@ -33,12 +33,14 @@ def draw_profiles(comparisons: Sequence[Comparison], path: Path) -> None:
         times = {name: [row.get(name, {}).get(key, math.nan) for row in medians] for name in solvers}
         for name, (ratios, share) in metrics.profile(times).items():
             if ratios:
-                axis.step([1.0, *ratios, 1e3], [0.0, *share, share[-1]], where="post", label=name)
+                steps = [1.0, *ratios, 1e3], [0.0, *share, share[-1]]
+                axis.step(*steps, where="post", label=name, **_style(solvers.index(name)))
         axis.set(title=title, xscale="log", xlim=(1.0, 1e3), ylim=(0.0, 1.05), xlabel="factor over the fastest")
         axis.grid(visible=True, alpha=0.3)
     axes[0, 0].set_ylabel("share of problems")
     axes[1, 0].set_ylabel("share of problems")
-    axes[0, 0].legend(fontsize="small")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize="small")
     _save(figure, path)
 
 
@@ -74,18 +76,25 @@ def draw_growth(rows: Sequence[dict[str, Any]], path: Path) -> None:
     if not families:
         return
     figure, axes = plt.subplots(
-        len(families), len(_QUANTITIES), figsize=(13, 5 * len(families)), squeeze=False, layout="constrained"
+        len(families), len(_QUANTITIES), figsize=(17, 5 * len(families)), squeeze=False, layout="constrained"
     )
+    solvers = list(dict.fromkeys(row["solver"] for row in rows))
     for line, family in zip(axes, families, strict=True):
         for axis, quantity in zip(line, _QUANTITIES, strict=True):
             for row in rows:
                 if (row["family"], row["quantity"]) == (family, quantity):
                     x, y = zip(*row["points"], strict=True)
-                    axis.plot(x, y, "o-", label=f"{row['solver']}: N^{row['exponent']:.2f}")
+                    style = _style(solvers.index(row["solver"]))
+                    axis.plot(x, y, marker="o", label=f"{row['solver']}: N^{row['exponent']:.2f}", **style)
             axis.set(title=family, xscale="log", yscale="log", xlabel="observations N", ylabel=quantity)
             axis.grid(visible=True, which="both", alpha=0.3)
-            axis.legend(fontsize="small")
+            axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     _save(figure, path)
+
+
+def _style(solver: int) -> dict[str, str]:
+    """Return colour and dashes by which the n-th solver is known from the others."""
+    return {"color": f"C{solver % 10}", "linestyle": ("-", "--", ":")[solver // 10 % 3]}
 
 
 def _save(figure: Any, path: Path) -> None:
