@@ -25,7 +25,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 
 from ba_node.core import native_kernels

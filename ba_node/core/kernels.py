@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import scipy.sparse
+import scipy
 from numpy import float64
 from numpy.typing import NDArray
 

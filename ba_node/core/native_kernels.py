@@ -8,7 +8,7 @@ import os
 from typing import Any
 
 import numpy as np
-import scipy.sparse
+import scipy
 from numpy.typing import NDArray
 
 from ba_node import native

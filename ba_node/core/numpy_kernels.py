@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
+import scipy
 from numpy.typing import NDArray
 
 from ba_node.core import linear, parameterisation, polish, scaling

@@ -15,7 +15,7 @@ as one on the other side, 2 block products an observation, but forming it takes 
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
+import scipy
 from numpy.typing import NDArray
 
 from ba_node.core import blocks
