@@ -68,8 +68,8 @@ class Factor:
 
 
 def block_bytes(block: int) -> int:
-    """Return the memory of a padded d x d block."""
-    return 64 * 11 if block == 9 else 64 * 6
+    """Return the memory of a d x d block; those of 9 x 9 are padded."""
+    return 64 * 11 if block == 9 else 8 * 36
 
 
 def max_blocks(block: int) -> int:
