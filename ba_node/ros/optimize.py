@@ -128,8 +128,8 @@ class Optimize(Component):
         if isinstance(taken, str):
             self._end(goal, Status.SKIPPED, taken)
             return
-        # Not a daemon: Python must not end while the kernels run.
-        threading.Thread(target=self._solve, args=(backend, goal, taken), name=_NAME).start()
+        # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
+        threading.Thread(target=self._solve, args=(backend, goal, taken), name=_NAME, daemon=False).start()
 
     def _solve(self, backend: Backend, goal: _Goal, taken: full.Copy) -> None:
         """Solve the copy, on a thread of its own."""

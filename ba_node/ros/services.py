@@ -125,8 +125,8 @@ class Services(Component):
             with self._telling(answer):
                 action()
 
-        # Not a daemon: a file that is being written when the node ends is written to the end.
-        threading.Thread(target=guarded, name="map file").start()
+        # Not a daemon, as the solver's thread is that starts it: a file is written to the end when the node ends.
+        threading.Thread(target=guarded, name="map file", daemon=False).start()
 
     @contextmanager
     def _telling(self, answer: Answer) -> Iterator[None]:

@@ -279,26 +279,34 @@ def slow_solve() -> str:
 
 
 class Gates:
-    """Holds the solvers of a node after each iteration, as long as their gates are shut."""
+    """Holds the solvers of a node after each iteration, and files before they are written, at gates that are shut."""
 
-    # Threads are known by their names: "solver" solves windows, "optimize" everything.
+    # Threads are known by their names: "solver" solves windows, "optimize" everything, "map file" writes.
     SCRIPT = """
 import pathlib, sys, threading, time
 from ba_node.core import solver
+from ba_node.ros import services
 from ba_node.ros.main import main
 
-folder, solve = pathlib.Path({folder!r}), solver.solve
+folder, solve, write_map = pathlib.Path({folder!r}), solver.solve, services.write_map
+
+def wait():
+    name = threading.current_thread().name
+    while (folder / name).exists():
+        (folder / (name + ".waits")).touch()
+        time.sleep(0.005)
 
 def gated(problem, options, *, on_iteration=None, **others):
-    name = threading.current_thread().name
     def watch(row):
-        while (folder / name).exists():
-            (folder / (name + ".waits")).touch()
-            time.sleep(0.005)
+        wait()
         return on_iteration is None or on_iteration(row)
     return solve(problem, options, on_iteration=watch, **others)
 
-solver.solve = gated
+def gated_write(path, content):
+    wait()
+    write_map(path, content)
+
+solver.solve, services.write_map = gated, gated_write
 sys.exit(main(sys.argv))
 """
 

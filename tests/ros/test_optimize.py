@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -224,6 +225,9 @@ def test_the_node_ends_during_it(
         assert node.stop() == 0
     else:
         node.process.send_signal(2)
+        peer.until(lambda: "stopped" in node.out, "the end of all but the solve")
+        time.sleep(0.3)
+        assert node.alive, "Python waits for the solve: to end under its feet would abort"
         gates.open("optimize")
         assert node.wait() == 0, node.err
     assert "internal error" not in node.err + node.out

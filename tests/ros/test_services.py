@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import SetBool, Trigger
 
 from ba_node.estimate import Status
+from ba_node.io.map_file import read_map
 from ba_node.messages.commands import SERVICE_TYPES
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
@@ -271,3 +273,21 @@ def test_who_waits_at_cleanup_is_answered(
     gates.open("solver")
     assert node.stop() == 0
     assert not (tmp_path / "a.npz").exists()
+
+
+def test_a_file_is_written_to_the_end(
+    start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
+) -> None:
+    node = start_node(python=gates.script)
+    peer.connect()
+    _play(peer, scene, *range(3))
+    gates.shut("map file")
+    peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
+    peer.until(lambda: gates.waits("map file"), "the file")
+    node.process.send_signal(2)
+    peer.until(lambda: "stopped" in node.out, "the end of all but the file")
+    time.sleep(0.3)
+    assert node.alive
+    gates.open("map file")
+    assert node.wait() == 0, node.err
+    assert len(read_map(tmp_path / "a.npz").arrays["keyframes/position"]) == 3
