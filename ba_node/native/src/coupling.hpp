@@ -5,7 +5,6 @@
 // edges, with C + D = L L'.
 #pragma once
 
-#include <algorithm>
 #include <cstdint>
 #include <vector>
 
@@ -23,7 +22,6 @@ class Coupling {
     inverse_l_.resize(6 * l_.n_batches);
     step_.resize(l_.n_free);
     find_columns();
-    for (std::int64_t i = 0; i < l_.n_batches; ++i) most_edges_ = std::max(most_edges_, first_edge(i + 1) - first_edge(i));
   }
 
   // L^-1 of the points of a batch.
@@ -41,24 +39,12 @@ class Coupling {
   }
   const Column<D>& step(std::int64_t k) const { return step_[k]; }
 
-  // Z of the edges of a batch; z: from the batch's first edge on.
+  // Z of the edges of a batch, z[edge].
   void edges_of(std::int64_t batch, Edge<D>* z) const {
     if (l_.has_depth || l_.has_rigs) {
       edges_of_batch<true>(batch, z);
     } else {
       edges_of_batch<false>(batch, z);
-    }
-  }
-
-  // The most edges that a batch has.
-  std::int64_t most_edges() const { return most_edges_; }
-
-  // Call sum(begin, end, z) for the edges of each batch of [first, end); z: their Z, from edge `begin` on, most_edges().
-  template <class Sum>
-  void with_edges(std::int64_t first, std::int64_t end, Edge<D>* z, Sum sum) const {
-    for (std::int64_t i = first; i < end; ++i) {
-      edges_of(i, z);
-      sum(l_.point_edge[kLanes * i], l_.point_edge[kLanes * (i + 1)], z);
     }
   }
 
@@ -126,8 +112,6 @@ class Coupling {
   }
 
  private:
-  std::int64_t first_edge(std::int64_t batch) const { return l_.point_edge[kLanes * batch]; }
-
   // kGeneral: edges of several observations, or with depth.
   template <bool kGeneral>
   void edges_of_batch(std::int64_t batch, Edge<D>* z) const {
@@ -136,7 +120,7 @@ class Coupling {
     V8 c[6] = {}, f[D == 9 ? 9 : 1] = {};
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       couple<kGeneral>(slot, c, f);
-      store_edges(slot, li, x, c, f, z - l_.point_edge[kLanes * batch]);
+      store_edges(slot, li, x, c, f, z);
     }
   }
 
@@ -246,7 +230,6 @@ class Coupling {
   std::vector<std::int32_t> image_column_;
   Buffer<V8> inverse_l_;
   Buffer<Column<D>> step_;
-  std::int64_t most_edges_ = 0;  // of a batch
 };
 
 }  // namespace ba

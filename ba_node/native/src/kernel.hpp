@@ -337,7 +337,7 @@ class Kernel {
   }
 
   SparseSchur<D>& schur() {
-    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, coupling_.most_edges(), pool_.threads());
+    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, pool_.threads());
     return *schur_;
   }
 

@@ -43,10 +43,10 @@ inline Rows32 shared_points(const Layout& l) {
 template <int D>
 class SparseSchur {
  public:
-  SparseSchur(const Layout& l, std::int64_t most_edges, int threads)
-      : l_(l), pattern_(shared_points(l)), most_edges_(most_edges) {
-    scratch_.resize(most_edges * threads);
+  SparseSchur(const Layout& l, int threads) : l_(l), pattern_(shared_points(l)) {
     cut_points();
+    order_edges();
+    scratch_.resize(most_edges_ * threads);
     blocks_.resize(n_blocks() * groups());
     diagonal_.resize(l_.n_free * groups());
     index_rows();
@@ -68,16 +68,13 @@ class SparseSchur {
     }
   }
 
-  // S = B + damping - Z Z', summed point by point. add_diagonal(k, block): add B and damping of keyframe k.
+  // S = B + damping - Z Z'. add_diagonal(k, block): add B and damping of keyframe k.
   template <class Add>
   void assemble(Pool& pool, const Coupling<D>& coupling, Add add_diagonal) {
     pool.each(groups(), [&](std::int64_t group, int thread) {
       Block<D>* blocks = &blocks_[group * n_blocks()];
       clear(blocks, n_blocks());
-      const auto sum = [&](std::int32_t begin, std::int32_t end, const Edge<D>* z) {
-        for (std::int32_t e = begin; e < end; ++e) sum_edge(e, z - begin, blocks);
-      };
-      coupling.with_edges(cut_[group], cut_[group + 1], &scratch_[thread * most_edges_], sum);
+      each_stretch(group, coupling, thread, [&](std::int32_t e, const Edge<D>* z) { sum_edge(e, z, blocks); });
     });
     pool.each(groups() > 1 ? kPieces : 0, [&](std::int64_t piece, int) {
       add_groups(blocks_.data(), n_blocks(), n_blocks() * piece / kPieces, n_blocks() * (piece + 1) / kPieces);
@@ -91,11 +88,9 @@ class SparseSchur {
     pool.each(groups(), [&](std::int64_t group, int thread) {
       Block<D>* blocks = &diagonal_[group * l_.n_free];
       clear(blocks, l_.n_free);
-      const auto sum = [&](std::int32_t begin, std::int32_t end, const Edge<D>* z) {
-        for (std::int32_t e = begin; e < end; ++e)
-          subtract_product(blocks[l_.edge_column[e]], Left<D>(z[e - begin]), z[e - begin]);
-      };
-      coupling.with_edges(cut_[group], cut_[group + 1], &scratch_[thread * most_edges_], sum);
+      each_stretch(group, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
+        subtract_product(blocks[l_.edge_column[e]], Left<D>(z[e]), z[e]);
+      });
     });
     add_groups(diagonal_.data(), l_.n_free, 0, l_.n_free);
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, diagonal_[k]);
@@ -107,6 +102,8 @@ class SparseSchur {
   static constexpr std::int64_t kMaxGroups = 4, kPieces = 16;
   // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
   static constexpr std::int64_t kWorkOfBlock = 100, kGroupBytes = 20 << 20;
+  // Z of as many points as stay in the nearer caches.
+  static constexpr std::int64_t kStretchBytes = 256 << 10;
 
   // Columns of a row for each of its blocks up to which it has a table; what stands for none.
   static constexpr std::int64_t kMaxSpan = 32, kSearched = std::numeric_limits<std::int64_t>::min();
@@ -134,6 +131,39 @@ class SparseSchur {
       if (next < count && done * count >= all * next) cut_.push_back(i + 1);
     }
     cut_.push_back(l_.n_batches);
+  }
+
+  // Cut groups into stretches, and put the edges of each in the order of their rows: a row stays in the nearest cache
+  // while all edges of the stretch add to it.
+  void order_edges() {
+    const std::int64_t fit = kStretchBytes / static_cast<std::int64_t>(sizeof(Edge<D>));
+    for (std::int64_t group = 0; group < groups(); ++group) {
+      group_stretch_.push_back(static_cast<std::int64_t>(stretch_.size()));
+      for (std::int64_t i = cut_[group]; i < cut_[group + 1]; ++i)
+        if (i == cut_[group] || first_edge(i + 1) - first_edge(stretch_.back()) > fit) stretch_.push_back(i);
+    }
+    group_stretch_.push_back(static_cast<std::int64_t>(stretch_.size()));
+    stretch_.push_back(l_.n_batches);
+    std::vector<std::int32_t> begin;
+    for (std::int64_t batch : stretch_) begin.push_back(static_cast<std::int32_t>(first_edge(batch)));
+    for (std::size_t i = 1; i < begin.size(); ++i) most_edges_ = std::max<std::int64_t>(most_edges_, begin[i] - begin[i - 1]);
+    order_.resize(l_.n_edges());
+    std::vector<std::int32_t> next = begin;
+    for (std::int32_t e : l_.edges_of_keyframe)
+      order_[next[std::upper_bound(begin.begin(), begin.end(), e) - begin.begin() - 1]++] = e;
+  }
+
+  std::int64_t first_edge(std::int64_t batch) const { return l_.point_edge[kLanes * batch]; }
+
+  // Call sum(e, z) for the edges e of a group; z[e]: their Z.
+  template <class Sum>
+  void each_stretch(std::int64_t group, const Coupling<D>& coupling, int thread, Sum sum) {
+    for (std::int64_t part = group_stretch_[group]; part < group_stretch_[group + 1]; ++part) {
+      const std::int64_t begin = first_edge(stretch_[part]), end = first_edge(stretch_[part + 1]);
+      Edge<D>* z = &scratch_[thread * most_edges_] - begin;
+      for (std::int64_t i = stretch_[part]; i < stretch_[part + 1]; ++i) coupling.edges_of(i, z);
+      for (std::int64_t at = begin; at < end; ++at) sum(order_[at], z);
+    }
   }
 
   // Onto the blocks [begin, end) of the first group those of the others; n: blocks of a group.
@@ -180,8 +210,10 @@ class SparseSchur {
   Rows32 pattern_;
   std::vector<std::int64_t> cut_;
   Buffer<Block<D>> blocks_, diagonal_;  // of each group; the sums are in the first
-  std::int64_t most_edges_;
-  Buffer<Edge<D>> scratch_;  // of each thread
+  std::vector<std::int64_t> stretch_, group_stretch_;  // first batch of each stretch; first stretch of each group
+  Buffer<std::int32_t> order_;                          // edges, stretch by stretch and there by rows
+  std::int64_t most_edges_ = 0;                         // of a stretch
+  Buffer<Edge<D>> scratch_;                             // of each thread
   Buffer<std::int32_t> place_;          // for columns between those of the row, nothing
   std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j], or kSearched
 };
