@@ -110,13 +110,19 @@ class NativeKernels:
         self._system = _NativeSystem(self._kernel, self.size)
         # Where steps lead, in turn: the state that a step starts from is one of them.
         self._states = [_like(problem.start), _like(problem.start)]
+        self._moved: Moved | None = None
 
     def graduate(self, graduation: float) -> None:
         """Do nothing: these kernels have no truncated quadratic."""
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        value: float = self._kernel.linearise(_arrays(state))
+        moved, self._moved = self._moved, None
+        # Polishing has seen all of it where it ended.
+        if moved is not None and state is moved.state and self._kernel.linearise_polished():
+            value = moved.objective
+        else:
+            value = self._kernel.linearise(_arrays(state))
         self.gradient_norm = self._kernel.gradient_norm
         return value
 
@@ -142,7 +148,9 @@ class NativeKernels:
         """Take the step whose part in the system is x, and polish the points after it; see Kernels."""
         target = self._states[self._states[0] is state]
         predicted, damping, value, polished = self._kernel.move(_arrays(state), x, polish_steps, _arrays(target))
-        return Moved(target, predicted, damping, value, polished)
+        moved = Moved(target, predicted, damping, value, polished)
+        self._moved = moved if polish_steps and np.isfinite(polished) else None
+        return moved
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
@@ -151,6 +159,7 @@ class NativeKernels:
 
     def polish_points(self, state: State, steps: int) -> tuple[float, State]:
         """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
+        self._moved = None
         _before, value, points = self._kernel.polish_points(_arrays(state), steps)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
 

@@ -126,6 +126,46 @@ def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make
 
 
 @built
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_native_linearises_where_polishing_ended(shape: dict[str, object], rules: Rules, make_problem: Make) -> None:
+    """What polishing kept of its last look is what a linearisation there finds anew."""
+    problem = some_behind(make_problem(start_error=0.02, **shape)[0])
+    kernels = native_kernels.make(problem, rules, "native")
+    kernels.linearise(problem.start)
+    system = kernels.damp("diag", 1e-2)
+    step = system.solve_dense()
+    assert step is not None
+    first = kernels.move(problem.start, system, step.copy(), 3).state
+    oracle = native_kernels.make(problem, rules, "numpy")
+
+    def agree() -> None:
+        assert kernels.linearise(first) == pytest.approx(oracle.linearise(first), rel=1e-12)
+        assert kernels.gradient_norm == pytest.approx(oracle.gradient_norm, rel=1e-9)
+        for ours, others in zip(kernels.diagonals(), oracle.diagonals(), strict=True):
+            near(others, ours)
+        a, b = (k.damp("diag", 1e-3) for k in (oracle, kernels))
+        near(a.dense(), b.dense(), 1e-9)
+        near(a.rhs, b.rhs, 1e-9)
+
+    agree()
+    # Another step was polished since, and rejected: the linearisation is one from the beginning.
+    kernels.move(first, kernels.damp("diag", 1.0), step, 3)
+    agree()
+
+
+@built
+def test_native_knows_once_where_polishing_ended(make_problem: Make) -> None:
+    kernels = native_kernels.make(make_problem()[0], Rules(), "native")
+    assert isinstance(kernels, native_kernels.NativeKernels)
+    polished = kernels.polish_points(make_problem()[0].start, 2)[1]
+    assert kernels._kernel.linearise_polished()
+    assert not kernels._kernel.linearise_polished()
+    kernels.linearise(polished)
+    assert not kernels._kernel.linearise_polished()
+
+
+@built
 def test_a_step_that_is_not_finite_has_no_objective(make_problem: Make) -> None:
     problem, _ = make_problem()
     for kernels in pair(problem, Rules()):

@@ -222,7 +222,7 @@ class Coupling {
     image_column_.assign(l_.images.size(), -1);
     for (std::int64_t k = 0; k < l_.n_free; ++k)
       for (std::int64_t i = l_.keyframe_seen[k]; i < l_.keyframe_seen[k + 1]; ++i)
-        if (l_.seen[i] >= 0) image_column_[l_.slot_image[l_.seen[i]]] = static_cast<std::int32_t>(k);
+        if (l_.seen[i] < kLanes * l_.n_slots()) image_column_[l_.slot_image[l_.seen[i]]] = static_cast<std::int32_t>(k);
   }
 
   const Layout& l_;

@@ -7,6 +7,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "blocks.hpp"
@@ -50,29 +51,32 @@ template <int kRows>
   for (int i = 0; i < 3; ++i) out[3 + i] = a[i];
 }
 
+// What is kept at a state.
+struct AtPoints {
+  // By batch: three registers of points, six of C (packed), three of g.
+  Buffer<V8> point, c, gradient_p;
+  // By observation: the rows of the Jacobian: (a_u, a_v, r_u, r_v); (i_u, i_v, -, -) with i by f, k1, k2 if those are
+  // free; (a_depth, r_depth, -) if depth is measured. The last is zero, of no observation.
+  Buffer<V8> record;
+};
+
 template <int D>
-class Equations {
+class Equations : public AtPoints {
  public:
   explicit Equations(const Layout& layout)
-      : lines((D == 9 ? 2 : 1) + (layout.has_depth ? 1 : 0)), l_(layout) {
-    record.resize(kLanes * l_.n_slots() * lines);
+      : lines(lines_with(layout.has_depth)), l_(layout) {
+    const std::int64_t bytes = resize(*this);
+    if (bytes <= kMostAhead) resize(ahead_);
     b.resize(l_.n_free);
     gradient_c.resize(l_.n_free);
-    point.resize(3 * l_.n_batches);
-    c.resize(6 * l_.n_batches);
-    gradient_p.resize(3 * l_.n_batches);
     part_.resize(l_.n_chunks());
   }
 
   double gradient_norm = 0;
   Buffer<Block<D>> b;
   Buffer<Column<D>> gradient_c;
-  // By batch: three registers of points, six of C (packed), three of g.
-  Buffer<V8> point, c, gradient_p;
-  // By observation: the rows of the Jacobian, each `lines` registers: (a_u, a_v, r_u, r_v); (i_u, i_v, -, -) with
-  // i by f, k1, k2 if those are free; (a_depth, r_depth, -) if depth is measured.
+  // Rows of the Jacobian an observation, each `lines` registers.
   const int lines;
-  Buffer<V8> record;
 
   double linearise(Rows& rows, const StateView& s, Pool& pool) {
     rows.load_images(s);
@@ -80,18 +84,79 @@ class Equations {
       pool.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
         part_[chunk] = linearise_chunk<decltype(lens)::value, decltype(depth)::value>(rows, s, chunk);
       });
-      pool.each(l_.n_free, [&](std::int64_t k, int) { sum_keyframe<decltype(depth)::value>(k); });
     });
-    double total = 0, norm2 = 0;
+    sum_keyframes(pool);
+    double total = 0;
     for (double part : part_) total += part;
-    for (const auto& x : gradient_c) norm2 += dot(x, x);
-    V8 squares{};
-    for (const V8& x : gradient_p) squares += x * x;
-    gradient_norm = std::sqrt(norm2 + sum(squares));
     return total;
   }
 
+  // Polishing ends with what a linearisation at its end begins with; that is kept if it is small.
+  bool looks_ahead() const { return ahead_.record.size() == this->record.size(); }
+  // Registers a record, and those that hold() needs for a slot.
+  static constexpr int lines_with(bool depth) { return (D == 9 ? 2 : 1) + (depth ? 1 : 0); }
+  static constexpr int held_with(bool depth) { return kLanes * lines_with(depth) + 2; }
+
+  // Rows of a slot, by lane, into `to`; weights last.
+  template <bool kDepth>
+  [[gnu::always_inline]] static void hold(const Seen& seen, V8* to) {
+    constexpr int kLines = lines_with(kDepth);
+    for (int i = 0; i < 6; ++i) to[i] = seen.d_point[i / 3][i % 3];
+    to[6] = seen.residual[0];
+    to[7] = seen.residual[1];
+    to[kLanes * kLines] = seen.weight[0];
+    if constexpr (D == 9)
+      for (int i = 0; i < 6; ++i) to[kLanes + i] = seen.d_intrinsics[i / 3][i % 3];
+    if constexpr (kDepth) {
+      V8* last = to + kLanes * (kLines - 1);
+      for (int i = 0; i < 3; ++i) last[i] = seen.d_point[2][i];
+      last[3] = seen.residual[2];
+      to[kLanes * kLines + 1] = seen.weight[1];
+    }
+  }
+
+  // The rows of a batch as held, and what else follows from them at x, for a linearisation to come.
+  template <bool kDepth>
+  void put_ahead(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, const V8* rows) {
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot, rows += held_with(kDepth))
+      write<kDepth>(rows, slot, ahead_);
+    put(batch, x, sums, ahead_);
+  }
+
+  // Linearise where the last polishing ended.
+  void go_ahead(Pool& pool) {
+    std::swap(static_cast<AtPoints&>(*this), ahead_);
+    sum_keyframes(pool);
+  }
+
  private:
+  // Bytes of records up to which a second set stays in the caches with the first; beyond, it costs what it saves.
+  static constexpr std::int64_t kMostAhead = 4 << 20;
+
+  std::int64_t resize(AtPoints& at) const {
+    at.record.resize((kLanes * l_.n_slots() + 1) * lines);
+    clear(&at.record[kLanes * l_.n_slots() * lines], lines);
+    at.point.resize(3 * l_.n_batches);
+    at.c.resize(6 * l_.n_batches);
+    at.gradient_p.resize(3 * l_.n_batches);
+    return static_cast<std::int64_t>(at.record.size() * sizeof(V8));
+  }
+
+  void sum_keyframes(Pool& pool) {
+    pool.each(l_.n_free, [&](std::int64_t k, int) {
+      if (l_.has_depth) {
+        sum_keyframe<true>(k);
+      } else {
+        sum_keyframe<false>(k);
+      }
+    });
+    double norm2 = 0;
+    for (const auto& x : gradient_c) norm2 += dot(x, x);
+    V8 squares{};
+    for (const V8& x : this->gradient_p) squares += x * x;
+    gradient_norm = std::sqrt(norm2 + sum(squares));
+  }
+
   template <Lens kLens, bool kDepth>
   double linearise_chunk(const Rows& rows, const StateView& s, std::int64_t chunk) {
     V8 total{};
@@ -102,42 +167,42 @@ class Equations {
       for (std::int64_t slot = l_.slot_begin[i]; slot < l_.slot_begin[i + 1]; ++slot) {
         Images images;
         Seen seen;
+        V8 held[held_with(kDepth)];
         rows.gather<kLens>(slot, images);
-        rows.see<kLens, kDepth, true, true>(slot, images, x, seen);
+        rows.see<kLens, kDepth, true>(slot, images, x, seen);
         add_point_rows<kDepth ? 3 : 2>(seen, sums);
-        keep<kDepth>(seen, slot);
+        hold<kDepth>(seen, held);
+        write<kDepth>(held, slot, *this);
       }
-      for (int j = 0; j < 3; ++j) point[3 * i + j] = x[j];
-      for (int j = 0; j < 6; ++j) c[6 * i + j] = sums.c[j];
-      for (int j = 0; j < 3; ++j) gradient_p[3 * i + j] = sums.g[j];
+      put(i, x, sums, *this);
       total += sums.cost;
     }
     return 0.5 * sum(total);
   }
 
+  static void put(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, AtPoints& to) {
+    for (int j = 0; j < 3; ++j) to.point[3 * batch + j] = x[j];
+    for (int j = 0; j < 6; ++j) to.c[6 * batch + j] = sums.c[j];
+    for (int j = 0; j < 3; ++j) to.gradient_p[3 * batch + j] = sums.g[j];
+  }
+
+  // Records of a slot, of its rows as held: weighted, by observation.
   template <bool kDepth>
-  [[gnu::always_inline]] void keep(const Seen& seen, std::int64_t slot) {
-    const auto write = [&](int line, V8(&r)[8]) {
+  [[gnu::always_inline]] static void write(const V8* held, std::int64_t slot, AtPoints& to) {
+    constexpr int kLines = lines_with(kDepth);
+    V8* record = &to.record[kLanes * slot * kLines];
+    const auto put_line = [&](int line, int count, const V8& weight) {
+      V8 r[8];
+#pragma GCC unroll 8
+      for (int i = 0; i < 8; ++i) r[i] = i < count ? weight * held[kLanes * line + i] : V8{};
       transpose(r);
-      for (int l = 0; l < kLanes; ++l) record[(kLanes * slot + l) * lines + line] = r[l];
+#pragma GCC unroll 8
+      for (int l = 0; l < kLanes; ++l) record[l * kLines + line] = r[l];
     };
-    const V8 w = seen.root[0];
-    V8 r[8];
-    for (int i = 0; i < 6; ++i) r[i] = w * seen.d_point[i / 3][i % 3];
-    r[6] = w * seen.residual[0];
-    r[7] = w * seen.residual[1];
-    write(0, r);
-    if constexpr (D == 9) {
-      for (int i = 0; i < 6; ++i) r[i] = w * seen.d_intrinsics[i / 3][i % 3];
-      r[6] = r[7] = V8{};
-      write(1, r);
-    }
-    if constexpr (kDepth) {
-      for (int i = 0; i < 3; ++i) r[i] = seen.root[1] * seen.d_point[2][i];
-      r[3] = seen.root[1] * seen.residual[2];
-      for (int i = 4; i < 8; ++i) r[i] = V8{};
-      write(lines - 1, r);
-    }
+    const V8 weight = root(held[kLanes * kLines]);
+    put_line(0, 8, weight);
+    if constexpr (D == 9) put_line(1, 6, weight);
+    if constexpr (kDepth) put_line(kLines - 1, 4, root(held[kLanes * kLines + 1]));
   }
 
   // B and g of free keyframe k.
@@ -177,20 +242,14 @@ class Equations {
   template <bool kDepth>
   [[gnu::always_inline]] void load_rows(std::int64_t first, V8 (&j)[3][D], V8 (&r)[3]) const {
     V8 x[3], t[8];
-    alignas(64) double columns[3][kLanes];
     const auto read = [&](int line) {
 #pragma GCC unroll 8
-      for (int l = 0; l < kLanes; ++l) {
-        const std::int32_t o = l_.seen[first + l];
-        t[l] = o < 0 ? V8{} : record[o * static_cast<std::int64_t>(lines) + line];
-      }
+      for (int l = 0; l < kLanes; ++l) t[l] = record[l_.seen[first + l] * static_cast<std::int64_t>(lines) + line];
       transpose(t);
     };
-    for (int l = 0; l < kLanes; ++l) {
-      const std::int32_t p = l_.seen_point[first + l];
-      for (int i = 0; i < 3; ++i) columns[i][l] = point[3 * (p / kLanes) + i][p % kLanes];
-    }
-    for (int i = 0; i < 3; ++i) x[i] = load(columns[i]);
+    const double* points = reinterpret_cast<const double*>(point.data());
+    const std::int32_t* of_lane = &l_.seen_point[first];
+    for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[of_lane[l] + kLanes * i]; });
     read(0);
     r[0] = t[6];
     r[1] = t[7];
@@ -222,6 +281,7 @@ class Equations {
   }
   const Layout& l_;
   std::vector<double> part_;
+  AtPoints ahead_;
 };
 
 }  // namespace ba

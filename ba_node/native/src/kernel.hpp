@@ -47,6 +47,7 @@ class Kernel {
     part_.resize(l_.n_chunks());
     const std::int64_t most = l_.n_batches ? l_.slot_begin[1] : 0;
     for (int i = 0; i < pool_.threads(); ++i) images_.emplace_back(most);
+    for (int i = 0; i < pool_.threads(); ++i) held_.emplace_back(equations_.looks_ahead() ? most * equations_.held_with(l_.has_depth) : 0);
   }
   // The parts refer to one another.
   Kernel(const Kernel&) = delete;
@@ -77,26 +78,30 @@ class Kernel {
   // Improve each point alone, keyframes held. points: out.
   Polished polish_points(const StateView& s, double* points, int steps) {
     rows_.load_images(s);
+    is_ahead_ = equations_.looks_ahead();
     rows_.with_kind([&](auto lens, auto depth) {
       pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int thread) {
-        Images* images = images_[thread].data();
-        V8 before{}, after{};
-        for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-          V8 x[3], first, best;
-          rows_.load_points(i, s.points, x);
-          polish_batch<decltype(lens)::value, decltype(depth)::value>(rows_, l_.slot_begin[i], l_.slot_begin[i + 1], steps,
-                                                                      images, x, first, best);
-          rows_.store_points(i, x, points);
-          before += first;
-          after += select(best < std::numeric_limits<double>::infinity(), best, V8{});
-        }
-        part_[chunk] = {0.5 * sum(before), 0.5 * sum(after)};
+        constexpr Lens kLens = decltype(lens)::value;
+        constexpr bool kDepth = decltype(depth)::value;
+        part_[chunk] = is_ahead_ ? polish_chunk<kLens, kDepth, true>(chunk, thread, s, points, steps)
+                                 : polish_chunk<kLens, kDepth, false>(chunk, thread, s, points, steps);
       });
     });
     return total();
   }
 
-  double linearise(const StateView& s) { return equations_.linearise(rows_, s, pool_); }
+  double linearise(const StateView& s) {
+    is_ahead_ = false;
+    return equations_.linearise(rows_, s, pool_);
+  }
+
+  // Linearise where the last polishing ended; false if too little is known of it.
+  bool linearise_polished() {
+    if (!is_ahead_) return false;
+    is_ahead_ = false;
+    equations_.go_ahead(pool_);
+    return true;
+  }
 
   // diag(B) (n_free x D) and diag(C) (n_points x 3).
   void diagonals(double* d_c, double* d_p) const {
@@ -262,6 +267,7 @@ class Kernel {
   // polish the points after it. Objectives are not numbers where the state after the step is not finite.
   Moved move(const StateView& from, const double* step_c, int steps, const StateSpan& to) {
     Moved out;
+    is_ahead_ = false;
     out.predicted = back_substitute(step_c, from.points, to.points);
     out.damping = damping_cost_;
     retract_keyframes(l_, from, step_c, D, to);
@@ -279,6 +285,29 @@ class Kernel {
   }
 
  private:
+  // kAhead: keep what a linearisation where it ends would begin with.
+  template <Lens kLens, bool kDepth, bool kAhead>
+  Polished polish_chunk(std::int64_t chunk, int thread, const StateView& s, double* points, int steps) {
+    V8 before{}, after{};
+    for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+      const std::int64_t slot_begin = l_.slot_begin[i];
+      V8 x[3], first, best;
+      PointSums sums;
+      V8* held = held_[thread].data();
+      const auto keep = [&](std::int64_t slot, const Seen& seen) {
+        if (kAhead) Equations<D>::template hold<kDepth>(seen, held + (slot - slot_begin) * Equations<D>::held_with(kDepth));
+      };
+      rows_.load_points(i, s.points, x);
+      polish_batch<kLens, kDepth>(rows_, slot_begin, l_.slot_begin[i + 1], steps, images_[thread].data(), keep, x, sums, first,
+                                  best);
+      rows_.store_points(i, x, points);
+      if (kAhead) equations_.template put_ahead<kDepth>(i, x, sums, held);
+      before += first;
+      after += select(best < std::numeric_limits<double>::infinity(), best, V8{});
+    }
+    return {0.5 * sum(before), 0.5 * sum(after)};
+  }
+
   // damping(batch, out): of the points of a batch.
   template <class Damping>
   void factor_points(Damping damping) {
@@ -383,7 +412,9 @@ class Kernel {
   Buffer<V8> scaled_gradient_, damping_p_;
   std::vector<double> damping_c_;
   std::vector<Polished> part_;
-  std::vector<Buffer<Images>> images_;
+  bool is_ahead_ = false;
+  std::vector<Buffer<Images>> images_;  // of each thread
+  std::vector<Buffer<V8>> held_;        // the same: rows of a batch
   std::unique_ptr<SparseSchur<D>> schur_;
   std::unique_ptr<SparseCholesky<D>> factor_;
 };

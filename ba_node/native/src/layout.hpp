@@ -71,7 +71,8 @@ class Layout {
   // The same by keyframe: edges_of_keyframe[keyframe_edge[k]] to [keyframe_edge[k + 1]].
   Buffer<std::int64_t> keyframe_edge;
   Buffer<std::int32_t> edges_of_keyframe;
-  // Observations (8 slot + lane) by free keyframe, and their points (of ours), filled up to whole registers by -1.
+  // Observations (8 slot + lane) by free keyframe, filled up to whole registers by one after the last; and where the x
+  // of their points stand in registers by batch (three each).
   Buffer<std::int64_t> keyframe_seen;
   Buffer<std::int32_t> seen, seen_point;
   // The caller's number of each free keyframe.
@@ -272,7 +273,7 @@ class Layout {
     const auto each = [this](auto take) {
       for (std::int64_t b = 0; b < n_batches; ++b)
         for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at)
-          if (inverse_sigma[at] != 0.0) take(column_[images[slot_image[at]] / n_cameras], at, kLanes * b + at % kLanes);
+          if (inverse_sigma[at] != 0.0) take(column_[images[slot_image[at]] / n_cameras], at, 3 * kLanes * b + at % kLanes);
     };
     keyframe_seen.assign(n_free + 1, 0);
     each([this](std::int32_t k, std::int64_t, std::int64_t) {
@@ -280,13 +281,13 @@ class Layout {
     });
     for (std::int64_t k = 0; k < n_free; ++k)
       keyframe_seen[k + 1] = keyframe_seen[k] + (keyframe_seen[k + 1] + kLanes - 1) / kLanes * kLanes;
-    seen.assign(keyframe_seen[n_free], -1);
+    seen.assign(keyframe_seen[n_free], static_cast<std::int32_t>(kLanes * n_slots()));
     seen_point.assign(seen.size(), 0);
     Buffer<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
-    each([this, &next](std::int32_t k, std::int64_t at, std::int64_t p) {
+    each([this, &next](std::int32_t k, std::int64_t at, std::int64_t x) {
       if (k < 0) return;
       seen[next[k]] = static_cast<std::int32_t>(at);
-      seen_point[next[k]++] = static_cast<std::int32_t>(p);
+      seen_point[next[k]++] = static_cast<std::int32_t>(x);
     });
   }
 

@@ -119,6 +119,11 @@ void bind(py::module_& m, const char* name) {
              py::gil_scoped_release release;
              return k.linearise(view(s));
            })
+      .def("linearise_polished",
+           [](K& k) {
+             py::gil_scoped_release release;
+             return k.linearise_polished();
+           })
       .def("objective",
            [](K& k, const StateArrays& s) {
              py::gil_scoped_release release;

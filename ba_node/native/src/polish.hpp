@@ -19,27 +19,33 @@ struct Polished {
   double before = 0, after = 0;
 };
 
-// Improve the points of a batch, keyframes held. images: room for those of all its slots, filled here.
-template <Lens kLens, bool kDepth>
-inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, V8 (&x)[3],
-                         V8& before, V8& best_cost) {
+// Improve the points of a batch, keyframes held. images: room for those of all its slots, filled here. keep(slot, seen):
+// called for all slots, the last time at the x that is returned; sums: of the same.
+template <Lens kLens, bool kDepth, class Keep>
+inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, Keep keep,
+                         V8 (&x)[3], PointSums& sums, V8& before, V8& best_cost) {
   V8 best[3] = {x[0], x[1], x[2]};
-  Mask active = ~Mask{};
+  Mask active = ~Mask{}, worse{};
   double mu = kFirstDamping;
   best_cost = splat(std::numeric_limits<double>::infinity());
-  for (int step = 0; step <= steps; ++step) {
-    PointSums sums{};
+  const auto see = [&](bool again) {
+    sums = PointSums{};
     for (std::int64_t slot = first; slot < end; ++slot) {
       Seen seen;
-      if (step == 0) rows.gather<kLens>(slot, images[slot - first]);
+      if (!again) rows.gather<kLens>(slot, images[slot - first]);
       rows.see<kLens, kDepth, true>(slot, images[slot - first], x, seen);
       add_point_rows<kDepth ? 3 : 2>(seen, sums);
+      keep(slot, seen);
     }
+  };
+  for (int step = 0; step <= steps; ++step) {
+    see(step > 0);
     if (step == 0) before = sums.cost;
     const Mask better = active & (sums.cost < best_cost);  // not if worse, or not a number
     const Mask arrived = best_cost - sums.cost < kMinGain * sums.cost;
     best_cost = select(better, sums.cost, best_cost);
     for (int i = 0; i < 3; ++i) best[i] = select(better, x[i], best[i]);
+    worse = active & ~better;
     active = better & ~arrived;
     if (step == steps || !any(active)) break;
     V8 damping[3], y[3], move[3];
@@ -56,6 +62,7 @@ inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end,
     mu *= 0.1;
   }
   for (int i = 0; i < 3; ++i) x[i] = best[i];
+  if (any(worse)) see(true);
 }
 
 }  // namespace ba

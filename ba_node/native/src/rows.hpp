@@ -42,7 +42,6 @@ struct Seen {
   V8 d_point[3][3];
   V8 d_intrinsics[2][3];
   V8 weight[2];  // of the pixel rows, of the depth row
-  V8 root[2];    // its square root
   V8 cost;
 };
 
@@ -148,7 +147,7 @@ class Rows {
   }
 
   // Everything about the observations of a slot; without derivatives residual and cost alone.
-  template <Lens kLens, bool kDepth, bool kDerivatives, bool kRoot = false>
+  template <Lens kLens, bool kDepth, bool kDerivatives>
   [[gnu::always_inline]] void see(std::int64_t slot, const Images& im, const V8 (&x)[3], Seen& out) const {
     const std::int64_t at = kLanes * slot;
     V8 y[3];
@@ -166,14 +165,14 @@ class Rows {
     const V8 scale = select(off, V8{}, whiten);
     out.residual[0] = (q.uv[0] - load(&l_.u[at])) * scale;
     out.residual[1] = (q.uv[1] - load(&l_.v[at])) * scale;
-    robust<kRoot>(out.residual[0] * out.residual[0] + out.residual[1] * out.residual[1], out.cost, out.weight[0], out.root[0]);
+    robust(out.residual[0] * out.residual[0] + out.residual[1] * out.residual[1], out.cost, out.weight[0]);
     if (!keep) out.cost = select(behind & ~none, splat(cost_of(kBehindNorm)), out.cost);
     V8 depth_scale{};
     if constexpr (kDepth) {
       V8 cost;
       depth_scale = select(off, V8{}, load(&l_.inverse_depth_sigma[at]));
       out.residual[2] = (y[2] - load(&l_.depth[at])) * depth_scale;
-      robust<kRoot>(out.residual[2] * out.residual[2], cost, out.weight[1], out.root[1]);
+      robust(out.residual[2] * out.residual[2], cost, out.weight[1]);
       out.cost += cost;
     }
     if constexpr (kDerivatives) {
@@ -190,12 +189,8 @@ class Rows {
 
   // The points of a batch, from the caller's array.
   void load_points(std::int64_t batch, const double* points, V8 (&x)[3]) const {
-    alignas(64) double columns[3][kLanes];
-    for (int l = 0; l < kLanes; ++l) {
-      const double* p = points + 3 * static_cast<std::int64_t>(l_.point[kLanes * batch + l]);
-      for (int i = 0; i < 3; ++i) columns[i][l] = p[i];
-    }
-    for (int i = 0; i < 3; ++i) x[i] = load(columns[i]);
+    const std::int32_t* of_lane = &l_.point[kLanes * batch];
+    for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[3 * static_cast<std::int64_t>(of_lane[l]) + i]; });
   }
   void store_points(std::int64_t batch, const V8 (&x)[3], double* points) const {
     for (int l = 0; l < l_.lanes(batch); ++l) {
@@ -240,11 +235,10 @@ class Rows {
     return rules_.scale * (2 * norm - rules_.scale);
   }
 
-  // Psi and the IRLS weight of residuals of a squared norm, and the weight's root if it is wanted.
-  template <bool kRoot>
-  [[gnu::always_inline]] void robust(V8 norm2, V8& cost, V8& weight, V8& root_weight) const {
+  // Psi and the IRLS weight of residuals of a squared norm.
+  [[gnu::always_inline]] void robust(V8 norm2, V8& cost, V8& weight) const {
     cost = norm2;
-    weight = root_weight = splat(1.0);
+    weight = splat(1.0);
     if (rules_.loss == Loss::kSquared) return;
     const double c = rules_.scale;
     const Mask outside = norm2 > c * c;
@@ -253,7 +247,6 @@ class Rows {
     const V8 falling = c / norm;
     cost = select(outside, c * (2 * norm - c), norm2);
     weight = select(outside, falling, splat(1.0));
-    if constexpr (kRoot) root_weight = root(weight);
   }
 
   // Observations of points that start behind their camera count for nothing.

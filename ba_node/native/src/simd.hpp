@@ -124,6 +124,35 @@ struct Loaded<Twice<H, M>> {
 };
 BA_INLINE V8 load(const double* p) { return Loaded<V8>::from(p); }
 
+// The numbers f(0), f(1), ... by lane. What is stored number by number and read as a register waits for the stores.
+template <class V>
+struct Each;
+template <>
+struct Each<Native2> {
+  template <class F>
+  BA_INLINE static Native2 of(F f) { return Native2{f(0), f(1)}; }
+};
+template <>
+struct Each<Native4> {
+  template <class F>
+  BA_INLINE static Native4 of(F f) { return Native4{f(0), f(1), f(2), f(3)}; }
+};
+template <>
+struct Each<Native8> {
+  template <class F>
+  BA_INLINE static Native8 of(F f) { return Native8{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)}; }
+};
+template <class H, class M>
+struct Each<Twice<H, M>> {
+  template <class F>
+  BA_INLINE static Twice<H, M> of(F f) {
+    constexpr int kHalf = sizeof(H) / sizeof(double);
+    return {Each<H>::of(f), Each<H>::of([&f](int l) { return f(kHalf + l); })};
+  }
+};
+template <class F>
+BA_INLINE V8 each(F f) { return Each<V8>::of(f); }
+
 // The same number in all lanes.
 template <class V>
 struct Splat;
