@@ -5,13 +5,14 @@
 Each way is charged its flops at the rate that its kernel reaches, and the bytes that it must move (n unknowns in blocks
 of d, P pairs of keyframes over all points, F block products of the sparse factor, N edges = point and free keyframe):
 
-- dense:  6 d^2 P to form S, 24 n^2 bytes to lay it out, n^3 / 3 for Cholesky (LAPACK);
+- dense:  6 d^2 P to form S, 12 n^2 bytes to lay it out, n^3 / 3 for Cholesky;
 - sparse: the same for S, 2 d^3 F for the factor, at a lower rate where a column and what it needs leave the cache;
 - pcg:    N blocks of d x 3 read in each of _PCG_STEPS steps; nothing is formed.
 
-The sparse factor is our own (native/src/sparse_cholesky.hpp): by blocks of the size of a camera it took 0.02 s where
-Eigen's SimplicialLLT took 0.20 s and CHOLMOD's supernodal one 0.15 s (1000 cameras on a circle, one core), and on 49
-cameras that all see each other 0.8 ms where LAPACK took 1.1, CHOLMOD 3.8 and Eigen 9 ms.
+Both factors are our own. The sparse one (native/src/sparse_cholesky.hpp), by blocks of the size of a camera, took 0.02 s
+where Eigen's SimplicialLLT took 0.20 s and CHOLMOD's supernodal one 0.15 s (1000 cameras on a circle, one core), and on
+49 cameras that all see each other 0.8 ms where LAPACK took 1.1, CHOLMOD 3.8 and Eigen 9 ms. The dense one
+(native/src/cholesky.hpp) takes as long as the sparse one there, and gains more from a second thread.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from dataclasses import dataclass
 
 # Rates of one core, flop/s and byte/s: measured on an AMD EPYC (AVX2). Their ratios count.
 _FORM_FLOPS = 20e9
-_DENSE_FLOPS = 25e9
-_SPARSE_FLOPS = 28e9
+_DENSE_FLOPS = 32e9
+_SPARSE_FLOPS = 24e9
 _SPARSE_FLOPS_LARGE = 10e9
 _BYTES = 12e9
 # Bytes that a column of the factor and its sources may take before the lower rate holds.
@@ -82,7 +83,7 @@ def dense_s(sizes: Sizes) -> float:
     n = float(sizes.unknowns)
     if 8.0 * n * n > MAX_BYTES:
         return math.inf
-    return _form_s(sizes) + 24.0 * n * n / _BYTES + n**3 / 3.0 / _DENSE_FLOPS
+    return _form_s(sizes) + 12.0 * n * n / _BYTES + n**3 / 3.0 / _DENSE_FLOPS
 
 
 def sparse_s(sizes: Sizes, factor: Factor) -> float:

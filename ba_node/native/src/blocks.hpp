@@ -196,6 +196,13 @@ inline void set_entry(Block<9>& s, int r, int c, double value) {
   }
 }
 
+template <int D>
+inline void add(Block<D>& to, const Block<D>& b) {
+  double* sum = reinterpret_cast<double*>(&to);
+  const double* other = reinterpret_cast<const double*>(&b);
+  for (std::size_t i = 0; i < sizeof(b) / sizeof(double); ++i) sum[i] += other[i];
+}
+
 // y += b x or y -= b x, by the sign.
 template <int kSign, int D>
 inline void add_multiplied(const Block<D>& b, const double* x, double* y) {

@@ -4,13 +4,15 @@
 // Dense Cholesky, S = L L', and the solution of S x = b.
 //
 // The lower triangle is kept by panels of eight rows, each by columns: one register holds the eight rows of a column.
-// So a product of panels takes both its factors as they lie. Columns are eliminated in blocks; the rows below a block
-// are brought up to date by all columns before it at once, eight columns of up to 24 rows in registers.
+// So a product of panels takes both its factors as they lie. Columns are eliminated in blocks, and what is right of a
+// block is brought up to date with it at once: the panels of a block stay in the nearest caches meanwhile.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
+#include <type_traits>
 
 #include "memory.hpp"
 #include "pool.hpp"
@@ -24,7 +26,8 @@ class DenseCholesky {
   void resize(std::int64_t n) {
     n_ = n;
     panels_ = (n + kLanes - 1) / kLanes;
-    tiles_.assign(kLanes * panels_ * (panels_ + 1) / 2, V8{});
+    tiles_.resize(kLanes * panels_ * (panels_ + 1) / 2);
+    if (n > 0) std::memset(static_cast<void*>(tiles_.data()), 0, tiles_.size() * sizeof(V8));
     inverse_.resize(kLanes * panels_);
     y_.resize(kLanes * panels_);
     w_.resize(kLanes * panels_);
@@ -44,18 +47,17 @@ class DenseCholesky {
     for (std::int64_t first = 0; first < panels_; first += kBlock) {
       const std::int64_t end = std::min(panels_, first + kBlock);
       for (std::int64_t j = first; j < end; ++j) {
-        for (std::int64_t i = first; i < j; ++i) finish<1>(j, i);
-        update<1>(j, j);
+        finish<1>(j, first, j);
+        update<1>(j, j, first, j);
         if (!factor_tile(j)) return false;
       }
-      const std::int64_t groups = (panels_ - end + kGroup - 1) / kGroup;
-      pool.each(groups, [&](std::int64_t g, int) {
-        const std::int64_t i = end + kGroup * g, count = std::min<std::int64_t>(kGroup, panels_ - i);
-        for (std::int64_t j = first; j < end; ++j) {
-          if (count == 3) finish<3>(i, j);
-          if (count == 2) finish<2>(i, j);
-          if (count == 1) finish<1>(i, j);
-        }
+      const auto each_group = [&](auto take) { each_rows(pool, end, take); };
+      each_group([&](std::int64_t i, auto count) { finish<decltype(count)::value>(i, first, end); });
+      each_group([&](std::int64_t i, auto count) {
+        constexpr int kCount = decltype(count)::value;
+        for (std::int64_t j = end; j <= i; ++j) update<kCount>(i, j, first, end);
+        for (std::int64_t j = i + 1; j < i + kCount; ++j)
+          for (std::int64_t k = j; k < i + kCount; ++k) update<1>(k, j, first, end);
       });
     }
     return true;
@@ -93,39 +95,75 @@ class DenseCholesky {
   }
 
  private:
-  // Panels whose columns are eliminated before the rows below follow; panels of rows that are worked on together.
-  static constexpr std::int64_t kBlock = 8, kGroup = 3;
+  // Panels whose columns are eliminated together; panels of rows that are worked on together, and columns of them that
+  // are in registers at once: as many as fit.
+  static constexpr std::int64_t kBlock = 4, kGroup = sizeof(Register) == sizeof(V8) ? 3 : 1;
+  static constexpr int kColumns = sizeof(Register) == sizeof(V8) ? 8 : 4;
 
   V8* panel(std::int64_t r) { return tiles_.data() + kLanes * r * (r + 1) / 2; }
 
-  // Tiles (i .. i + P - 1, j) less the product of their rows and those of j over the columns before j.
-  template <int P>
-  void update(std::int64_t i, std::int64_t j) {
-    const V8 *a[P], *b = panel(j);
-    for (int p = 0; p < P; ++p) a[p] = panel(i + p);
-    V8 acc[P][kLanes] = {};
-    for (std::int64_t k = 0; k < kLanes * j; ++k) {
-#pragma GCC unroll 8
-      for (int c = 0; c < kLanes; ++c) {
-        const double factor = b[k][c];
-#pragma GCC unroll 3
-        for (int p = 0; p < P; ++p) acc[p][c] += a[p][k] * factor;
-      }
-    }
-    for (int p = 0; p < P; ++p)
-      for (int c = 0; c < kLanes; ++c) panel(i + p)[kLanes * j + c] -= acc[p][c];
+  // Call take(i, count) for groups of panels from `first` on. They are dealt to the threads one by one from the last, the
+  // longest, so that each has its own in every block, and as much to do as the others.
+  template <class Take>
+  void each_rows(Pool& pool, std::int64_t first, Take take) {
+    const std::int64_t groups = (panels_ - first + kGroup - 1) / kGroup;
+    pool.each(groups, [&](std::int64_t piece, int) {
+      int of = 0;
+      while (pool.share(groups, of + 1) <= piece) ++of;
+      const std::int64_t dealt = (piece - pool.share(groups, of)) * pool.threads() + of;
+      const std::int64_t end = panels_ - kGroup * dealt, i = std::max(first, end - kGroup);
+      with_count(end - i, [&](auto count) { take(i, count); });
+    });
   }
 
-  // The same, then times L_jj^-T: rows of the factor.
+  template <class F>
+  static void with_count(std::int64_t count, F f) {
+    if (count == 1) f(std::integral_constant<int, 1>());
+    if constexpr (kGroup > 1) {
+      if (count == 2) f(std::integral_constant<int, 2>());
+      if (count == 3) f(std::integral_constant<int, 3>());
+    }
+  }
+
+  // Tiles (i .. i + P - 1, j) less the product of their rows and those of j over the columns of panels [first, end).
   template <int P>
-  void finish(std::int64_t i, std::int64_t j) {
-    update<P>(i, j);
-    const V8* t = panel(j) + kLanes * j;
-    for (int p = 0; p < P; ++p) {
-      V8* x = panel(i + p) + kLanes * j;
-      for (int c = 0; c < kLanes; ++c) {
-        x[c] *= inverse_[kLanes * j + c];
-        for (int d = c + 1; d < kLanes; ++d) x[d] -= x[c] * t[c][d];
+  void update(std::int64_t i, std::int64_t j, std::int64_t first, std::int64_t end) {
+    const V8 *a[P], *b = panel(j);
+    for (int p = 0; p < P; ++p) a[p] = panel(i + p);
+    for (int column = 0; column < kLanes; column += kColumns) {
+      V8 acc[P][kColumns];
+#pragma GCC unroll 3
+      for (int p = 0; p < P; ++p)
+#pragma GCC unroll 8
+        for (int c = 0; c < kColumns; ++c) acc[p][c] = a[p][kLanes * j + column + c];
+      for (std::int64_t k = kLanes * first; k < kLanes * end; ++k) {
+        const double* row = reinterpret_cast<const double*>(b + k) + column;
+#pragma GCC unroll 8
+        for (int c = 0; c < kColumns; ++c) {
+          const V8 factor = splat(row[c]);
+#pragma GCC unroll 3
+          for (int p = 0; p < P; ++p) acc[p][c] -= a[p][k] * factor;
+        }
+      }
+#pragma GCC unroll 3
+      for (int p = 0; p < P; ++p)
+#pragma GCC unroll 8
+        for (int c = 0; c < kColumns; ++c) panel(i + p)[kLanes * j + column + c] = acc[p][c];
+    }
+  }
+
+  // Rows of the factor in the panels [first, end), of a block whose tiles there are factored: times L_jj^-T each.
+  template <int P>
+  void finish(std::int64_t i, std::int64_t first, std::int64_t end) {
+    for (std::int64_t j = first; j < end; ++j) {
+      update<P>(i, j, first, j);
+      const V8* t = panel(j) + kLanes * j;
+      for (int p = 0; p < P; ++p) {
+        V8* x = panel(i + p) + kLanes * j;
+        for (int c = 0; c < kLanes; ++c) {
+          x[c] *= inverse_[kLanes * j + c];
+          for (int d = c + 1; d < kLanes; ++d) x[d] -= x[c] * t[c][d];
+        }
       }
     }
   }

@@ -151,9 +151,13 @@ class Kernel {
   bool solve(double* x) {
     const std::int64_t n = l_.n_free * D;
     cholesky_.resize(n);
-    each_block([&](std::int64_t i, std::int64_t j, const Block<D>& block) {
-      for (int r = 0; r < D; ++r)
-        for (int c = (j == i ? r : 0); c < D; ++c) cholesky_.at(j * D + c, i * D + r) = entry(block, r, c);
+    const SparseSchur<D>& s = assemble();
+    pool_.each(l_.n_free, [&](std::int64_t i, int) {
+      for (std::int64_t k = s.pattern().start[i]; k < s.pattern().start[i + 1]; ++k) {
+        const std::int64_t j = s.pattern().index[k];
+        for (int r = 0; r < D; ++r)
+          for (int c = (j == i ? r : 0); c < D; ++c) cholesky_.at(j * D + c, i * D + r) = entry(s.blocks()[k], r, c);
+      }
     });
     if (!cholesky_.factor(pool_)) return false;
     rhs(x);
@@ -372,10 +376,8 @@ class Kernel {
 
   // B and the damping of keyframe k, onto its diagonal block.
   void add_diagonal(std::int64_t k, Block<D>& block) const {
-    for (int c = 0; c < D; ++c) {
-      for (int r = 0; r < D; ++r) set_entry(block, r, c, entry(block, r, c) + entry(equations_.b[k], r, c));
-      set_entry(block, c, c, entry(block, c, c) + damping_c_[k * D + c]);
-    }
+    add(block, equations_.b[k]);
+    for (int c = 0; c < D; ++c) set_entry(block, c, c, entry(block, c, c) + damping_c_[k * D + c]);
   }
 
   void add_sums(Column<D>* out) const {

@@ -101,7 +101,7 @@ class SparseSchur {
   // Groups of points are summed apart, each by one thread, and then added in turn: the problem alone decides how many.
   static constexpr std::int64_t kMaxGroups = 4, kPieces = 16;
   // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
-  static constexpr std::int64_t kWorkOfBlock = 100, kGroupBytes = 20 << 20;
+  static constexpr std::int64_t kWorkOfBlock = 200, kGroupBytes = 20 << 20;
   // Z of as many points as stay in the nearer caches.
   static constexpr std::int64_t kStretchBytes = 256 << 10;
 
