@@ -15,7 +15,8 @@ direction that no observation determines: its row of L^-1 is set to zero, which 
 point does not move in it).
 
 Cost for K free keyframes, P points, N observations, and k_p keyframes that see point p: linearising O(N); Z is
-N blocks of d x 3; S takes sum k_p^2 block products (d x 3)(3 x d). Without S, a product with it takes 2N of them.
+N blocks of d x 3; S takes sum k_p^2 block products (d x 3)(3 x d), or dense ones where these cost less
+(dense_products.py). Without S, a product with it takes 2N of them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ba_node.core import columns
+from ba_node.core import columns, dense_products
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem
 
@@ -37,6 +38,8 @@ IntArray = NDArray[np.intp]
 
 # S is formed while it takes at most this many block products an observation.
 _PRODUCTS_PER_OBSERVATION = 60.0
+# Seconds of a product of two blocks in scipy, over d^2: as the rates of dense_products.py, of one core.
+_PRODUCT_S = 2e-9
 
 
 class Structure:
@@ -59,16 +62,17 @@ class Structure:
         row_column = column[obs.keyframe]
         rows = np.flatnonzero(row_column >= 0)
         self._keyframe_rows, self._keyframe_bounds = _runs(row_column, rows, self.n_free)
-        # Edges: distinct (point, free keyframe); a stereo pair is one edge.
+        # Edges: distinct (point, free keyframe); a stereo pair is one edge. In the order of dense_products.py.
         key = obs.point[rows] * max(self.n_free, 1) + row_column[rows]
         order = np.argsort(key, kind="stable")
         rows, start = rows[order], columns.starts(key[order])
         count = np.diff(start, append=len(rows))
         point, keyframe = obs.point[rows[start]], row_column[rows[start]]
-        self.edge_point, self.edge_keyframe = point, keyframe
+        order = dense_products.edge_order(point, keyframe)
+        self.edge_point, self.edge_keyframe, start, count = (a[order] for a in (point, keyframe, start, count))
         # First the first row of every edge, then the second one of those that have two, and so on.
         self._edge_rows = [(np.flatnonzero(count > i), rows[start[count > i] + i]) for i in range(count.max(initial=1))]
-        self._edge_by_point, self._indptr_point = _runs(self.edge_point, np.arange(len(point)), self.n_points)
+        self._edge_by_point, self._indptr_point = _runs(self.edge_point, np.arange(len(order)), self.n_points)
         self._edge_by_keyframe, self._indptr_keyframe = _runs(self.edge_keyframe, self._edge_by_point, self.n_free)
 
     @property
@@ -134,6 +138,16 @@ class Structure:
         moved = columns.times(lin.d_keyframe, columns.take(full, self._row_keyframe))
         moved += columns.times(lin.d_point, columns.take(step_p, self._row_point))
         return moved
+
+    @cached_property
+    def _dense(self) -> dense_products.DenseProducts:
+        return dense_products.DenseProducts(self.edge_point, self.edge_keyframe, self.size)
+
+    def edge_outer(self, blocks: FloatArray) -> FloatArray | None:
+        """Return ``Z Z'`` (d n_free, d n_free) by dense products; None where block-sparse ones cost less."""
+        if self._dense.seconds > self.schur_products * self.size**2 * _PRODUCT_S:
+            return None
+        return self._dense.outer(blocks, self.n_free)
 
     def edge_matrix(self, blocks: FloatArray) -> scipy.sparse.bsr_matrix:
         """Return edge blocks (n_edges, d, 3) as a block-sparse (d n_free, 3 n_points) matrix."""
@@ -231,7 +245,10 @@ class ReducedSystem:
 
     def dense(self) -> FloatArray:
         """Return S as a dense matrix."""
-        s: FloatArray = -(self.z @ self.z_t).toarray()
+        s = self._structure.edge_outer(self._blocks)
+        if s is None:
+            s = (self.z @ self.z_t).toarray()
+        np.negative(s, out=s)
         d = self._structure.size
         n = self._structure.n_free
         view = s.reshape(n, d, n, d)
