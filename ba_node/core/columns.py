@@ -8,6 +8,8 @@ blocks take a tenth of the time of ``@`` on them. What is here takes arrays in a
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,6 +89,16 @@ def normal_equations(jacobian: FloatArray, residual: FloatArray, begins: IntArra
         for j in range(k + 1):
             blocks[:, k, j] = blocks[:, j, k] = sum_runs(_inner(jacobian[:, :, k], jacobian[:, :, j]), begins)
     return blocks, gradient
+
+
+@cache
+def keep_memory() -> None:
+    """Let the allocator of the C library keep what is freed.
+
+    glibc gives large arrays back to the system, and takes them again page by page, until a larger one has been freed.
+    Without this an eighth of the time of a window went into that.
+    """
+    np.empty(31 * 2**17)
 
 
 def _inner(a: FloatArray, b: FloatArray) -> FloatArray:

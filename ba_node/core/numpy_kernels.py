@@ -35,6 +35,7 @@ class NumpyKernels:
 
     def __init__(self, problem: Problem, rules: Rules, demands: Demands = _POINTS) -> None:
         """Sort the observations once."""
+        columns.keep_memory()
         self._structure = Structure(problem)
         self._objective = Objective(problem, rules)
         self._demands = demands
