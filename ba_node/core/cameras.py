@@ -25,6 +25,8 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.core import columns
+
 FloatArray = NDArray[np.float64]
 ModelArray = NDArray[np.uint8]
 
@@ -96,8 +98,8 @@ def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatAr
 
     Args:
         x_cam: (n, 3) in the optical frame of each row's camera, m. Z = 0 gives infinities: callers sort these out.
-        model: (n,) Model of each row.
-        params: (n, 12) parameters of each row.
+        model: (n,) Model of each row, or (1,) of all.
+        params: (n, 12) parameters of each row, or (1, 12) of all; without distortion beyond k1 and k2 six will do.
 
     Returns:
         (n, 2) u, v, px.
@@ -108,31 +110,33 @@ def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatAr
 
 
 def project_jacobian(
-    x_cam: FloatArray, model: ModelArray, params: FloatArray
+    x_cam: FloatArray, model: ModelArray, params: FloatArray, *, intrinsics: bool = True
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Project points, with derivatives.
 
     Args:
         x_cam: (n, 3), m.
-        model: (n,).
-        params: (n, 12).
+        model: (n,) or (1,).
+        params: (n, 12) or fewer, as of :func:`project`.
+        intrinsics: whether derivatives by f, k1 and k2 are wanted.
 
     Returns:
         uv: (n, 2) px; d uv / d x_cam: (n, 2, 3) px/m; d uv / d (f, k1, k2): (n, 2, 3) where f scales fx and fy
-        alike (fx = fy = f when the camera's own fx and fy are 1).
+        alike (fx = fy = f when the camera's own fx and fy are 1), or (n, 2, 0) where it is not wanted.
     """
-    inverse_z = 1.0 / x_cam[:, 2]
-    normalised = x_cam[:, :2] * inverse_z[:, None]
-    distorted, jacobian, d_k12 = _distort_jacobian(normalised, model, params)
+    inverse_z = 1.0 / x_cam[:, 2:]
+    ray = x_cam[:, :2] * inverse_z
+    distorted, jacobian, by_k12 = _distort_jacobian(ray, model, params)
     focal = params[:, FX : FY + 1]
     uv = focal * distorted + params[:, CX : CY + 1]
-    scaled = jacobian * (focal * inverse_z[:, None])[:, :, None]
-    d_x = np.empty((len(x_cam), 2, 3))
-    d_x[:, :, :2] = scaled
-    d_x[:, :, 2] = -(scaled[:, :, 0] * normalised[:, :1] + scaled[:, :, 1] * normalised[:, 1:])
-    d_intrinsics = np.empty((len(x_cam), 2, 3))
-    d_intrinsics[:, :, 0] = distorted
-    d_intrinsics[:, :, 1:] = d_k12 * focal[:, :, None]
+    d_x = columns.empty(len(x_cam), 2, 3)
+    for i in range(2):
+        np.multiply(jacobian[:, i], focal[:, i, None] * inverse_z, out=d_x[:, i, :2])
+    d_x[:, :, 2] = -(d_x[:, :, 0] * ray[:, :1] + d_x[:, :, 1] * ray[:, 1:])
+    d_intrinsics = columns.empty(len(x_cam), 2, 3 if intrinsics else 0)
+    if intrinsics:
+        d_intrinsics[:, :, 0] = distorted
+        d_intrinsics[:, :, 1:] = (ray * focal)[:, :, None] * by_k12[:, None, :]
     return uv, d_x, d_intrinsics
 
 
@@ -195,28 +199,33 @@ def _distort(ray: FloatArray, model: ModelArray, params: FloatArray) -> FloatArr
 def _distort_jacobian(
     ray: FloatArray, model: ModelArray, params: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return distorted rays (n, 2), their derivatives by the ray (n, 2, 2) and by k1, k2 (n, 2, 2)."""
+    """Return distorted rays (n, 2), their derivatives by the ray (n, 2, 2), and (n, 2) factors of the ray.
+
+    The derivatives by k1 and by k2 are the ray times these factors.
+    """
     fisheye = model == Model.EQUIDISTANT
     if not fisheye.any():
         return _rational(ray, params[:, DISTORTION])
-    distorted, jacobian, d_k12 = np.empty_like(ray), np.empty((len(ray), 2, 2)), np.empty((len(ray), 2, 2))
+    if fisheye.all():
+        return _equidistant(ray, params[:, DISTORTION])
+    distorted, jacobian, by_k12 = np.empty_like(ray), columns.empty(len(ray), 2, 2), np.empty_like(ray)
     for rows, distort in ((~fisheye, _rational), (fisheye, _equidistant)):
-        distorted[rows], jacobian[rows], d_k12[rows] = distort(ray[rows], params[rows, DISTORTION])
-    return distorted, jacobian, d_k12
+        distorted[rows], jacobian[rows], by_k12[rows] = distort(ray[rows], params[rows, DISTORTION])
+    return distorted, jacobian, by_k12
 
 
 def _rational(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distort by the rational model; ``k`` is (n, 8) k1 k2 p1 p2 k3 k4 k5 k6."""
+    """Distort by the rational model; ``k`` is (n, 8) k1 k2 p1 p2 k3 k4 k5 k6, or (n, 2) k1 k2."""
     a, b = ray[:, 0], ray[:, 1]
     s = a * a + b * b
     k1, k2 = k[:, 0], k[:, 1]
     if not k[:, 2:].any():
-        return _radial(ray, s, 1.0 + s * (k1 + s * k2), k1 + 2.0 * s * k2, 1.0)
+        return _radial(ray, 1.0 + s * (k1 + s * k2), k1 + 2.0 * s * k2, (s, s * s))
     p1, p2, k3, k4, k5, k6 = (k[:, i] for i in range(2, 8))
     over = 1.0 / (1.0 + s * (k4 + s * (k5 + s * k6)))
     g = (1.0 + s * (k1 + s * (k2 + s * k3))) * over
     dg = (k1 + s * (2 * k2 + 3 * s * k3) - g * (k4 + s * (2 * k5 + 3 * s * k6))) * over
-    distorted, jacobian, d_k12 = _radial(ray, s, g, dg, over)
+    distorted, jacobian, by_k12 = _radial(ray, g, dg, (s * over, s * s * over))
     distorted[:, 0] += 2 * p1 * a * b + p2 * (s + 2 * a * a)
     distorted[:, 1] += p1 * (s + 2 * b * b) + 2 * p2 * a * b
     cross = 2 * (p1 * a + p2 * b)
@@ -224,25 +233,26 @@ def _rational(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, F
     jacobian[:, 0, 1] += cross
     jacobian[:, 1, 0] += cross
     jacobian[:, 1, 1] += 6 * p1 * b + 2 * p2 * a
-    return distorted, jacobian, d_k12
+    return distorted, jacobian, by_k12
 
 
 def _radial(
-    ray: FloatArray, s: FloatArray, g: FloatArray, dg: FloatArray, over: FloatArray | float
+    ray: FloatArray, g: FloatArray, dg: FloatArray, by_k12: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``g ray`` and its derivatives, for a factor g(s) with derivative dg and numerator share ``over``."""
-    jacobian = 2.0 * dg[:, None, None] * (ray[:, :, None] * ray[:, None, :])
+    """Return ``g ray``, its derivatives for a factor g(s) with derivative dg, and the two factors side by side."""
+    jacobian = columns.empty(len(ray), 2, 2)
+    bent = 2.0 * dg[:, None] * ray
+    np.multiply(bent[:, :1], ray, out=jacobian[:, 0])
+    jacobian[:, 1, 0] = jacobian[:, 0, 1]
+    np.multiply(bent[:, 1], ray[:, 1], out=jacobian[:, 1, 1])
     jacobian[:, 0, 0] += g
     jacobian[:, 1, 1] += g
-    d_k12 = np.empty((len(ray), 2, 2))
-    d_k12[:, :, 0] = ray * (s * over)[:, None]
-    d_k12[:, :, 1] = d_k12[:, :, 0] * s[:, None]
-    return g[:, None] * ray, jacobian, d_k12
+    return g[:, None] * ray, jacobian, np.stack(by_k12).T
 
 
 def _equidistant(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distort by the equidistant model; ``k`` is (n, 8) k1 k2 k3 k4 and zeros."""
-    s = np.sum(ray * ray, axis=1)
+    s = ray[:, 0] * ray[:, 0] + ray[:, 1] * ray[:, 1]
     small = s < _SMALL_RADIUS2
     r = np.sqrt(np.where(small, 1.0, s))
     th = np.arctan(r)
@@ -252,8 +262,5 @@ def _equidistant(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray
     # g = th poly / r;  dg/ds = (slope / (1 + s) - g) / (2 s).
     g = np.where(small, 1.0, th * poly / r)
     dg = np.where(small, k[:, 0] - 1.0 / 3.0, (slope / (1.0 + s) - g) / (2.0 * np.where(small, 1.0, s)))
-    distorted, jacobian, d_k12 = _radial(ray, s, g, dg, 0.0)
     factor = np.where(small, s, th * t2 / r)
-    d_k12[:, :, 0] = ray * factor[:, None]
-    d_k12[:, :, 1] = d_k12[:, :, 0] * np.where(small, s, t2)[:, None]
-    return distorted, jacobian, d_k12
+    return _radial(ray, g, dg, (factor, factor * np.where(small, s, t2)))

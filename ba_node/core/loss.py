@@ -51,9 +51,9 @@ def _squared(norm: FloatArray, _scale: float) -> CostAndWeight:
 
 
 def _huber(norm: FloatArray, scale: float) -> CostAndWeight:
-    inside = norm <= scale
-    cost = np.where(inside, norm * norm, 2.0 * scale * norm - scale * scale)
-    return cost, np.where(inside, 1.0, scale / np.where(inside, 1.0, norm))
+    # With m = min(x, c) both branches are m (2 x - m), and c / max(x, c): no slow choice row by row.
+    near = np.minimum(norm, scale)
+    return near * (2.0 * norm - near), scale / np.maximum(norm, scale)
 
 
 def _truncated_quadratic(norm: FloatArray, scale: float) -> CostAndWeight:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ba_node.core import linear, parameterisation, polish, scaling
+from ba_node.core import columns, linear, parameterisation, polish, scaling
 from ba_node.core.blocks import condition
 from ba_node.core.kernels import DENSE_LIMIT, Demands, Moved, System
 from ba_node.core.linear_costs import MAX_BYTES, Factor
@@ -35,6 +35,7 @@ class NumpyKernels:
 
     def __init__(self, problem: Problem, rules: Rules, demands: Demands = _POINTS) -> None:
         """Sort the observations once."""
+        columns.keep_memory()
         self._structure = Structure(problem)
         self._objective = Objective(problem, rules)
         self._demands = demands
@@ -44,14 +45,17 @@ class NumpyKernels:
         self._linearisation: Linearisation
         self._equations: NormalEquations
         self._damping: tuple[FloatArray, FloatArray]
+        # The rows at the last state that points were polished at: if the step is taken they are asked for again.
+        self._polished: polish.Polished | None = None
 
     def graduate(self, graduation: float) -> None:
         """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself."""
-        self._objective.graduation = graduation
+        self._objective.graduation, self._polished = graduation, None
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        self._linearisation = self._objective.linearise(state)
+        known = self._polished.rows if self._polished is not None and self._polished.state is state else None
+        self._linearisation = self._objective.linearise(state, known)
         self._equations = normal_equations(self._structure, self._linearisation)
         self.gradient_norm = self._equations.gradient_norm
         return self._linearisation.objective
@@ -84,10 +88,11 @@ class NumpyKernels:
         moved = self._retract(state, step_c, step_p)
         if not moved.is_finite():
             return Moved(moved, predicted, damping, np.nan, np.nan)
-        value = polished = self.objective(moved)
-        if polish_steps:
-            polished, moved = self.polish_points(moved, polish_steps)
-        return Moved(moved, predicted, damping, value, polished)
+        if not polish_steps:
+            value = self.objective(moved)
+            return Moved(moved, predicted, damping, value, value)
+        found = self._polished = polish.polish_points(self._objective, self._structure, moved, polish_steps)
+        return Moved(found.state, predicted, damping, found.before, found.after)
 
     def _retract(self, state: State, step_c: FloatArray, step_p: FloatArray) -> State:
         """Return the state after a step (n_free, d) and (n_points, 3)."""
@@ -112,8 +117,8 @@ class NumpyKernels:
         if self.n_free == 0:
             return "points", 1.0
         equations, size = self._equations, self.size
-        b = equations.b + damping_c[:, :, None] * np.eye(size)
-        c = equations.c + damping_p[:, :, None] * np.eye(3)
+        b = columns.plus_diagonal(equations.b, damping_c)
+        c = columns.plus_diagonal(equations.c, damping_p)
         if condition(c) < condition(b):
             return "points", 1.0
         return "cameras", 3.0 * self._structure.n_points / (size * self.n_free)
@@ -124,7 +129,8 @@ class NumpyKernels:
 
     def polish_points(self, state: State, steps: int) -> tuple[float, State]:
         """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
-        return polish.polish_points(self._objective, self._structure, state, steps)
+        found = polish.polish_points(self._objective, self._structure, state, steps)
+        return found.after, found.state
 
 
 class _NumpySystem:

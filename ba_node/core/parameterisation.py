@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core import geometry
+from ba_node.core import columns, geometry
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def pose_jacobian(
     Returns:
         (n, d, 6): rotation, then translation.
     """
-    out = np.empty((*d_point.shape[:2], 6))
+    out = columns.empty(*d_point.shape[:2], 6)
     x, g = point[:, None, :], d_point
     out[..., 0] = x[..., 1] * g[..., 2] - x[..., 2] * g[..., 1]
     out[..., 1] = x[..., 2] * g[..., 0] - x[..., 0] * g[..., 2]
@@ -42,8 +42,8 @@ def pose_jacobian(
         out[..., 3:] = g
     else:
         jr = geometry.right_jacobian(geometry.so3_log(rotation))
-        out[..., :3] = out[..., :3] @ jr[row_pose]
-        out[..., 3:] = g @ np.swapaxes(rotation, 1, 2)[row_pose]
+        out[..., :3] = columns.product(out[..., :3], columns.take(jr, row_pose))
+        out[..., 3:] = columns.product(g, columns.transposed(columns.take(rotation, row_pose)))
     return out
 
 

@@ -3,16 +3,19 @@
 """Improve points alone, keyframes held: the inner iterations after a step of the keyframes.
 
 Each point has its own 3 x 3 damped normal equations (Marquardt) and its own objective. A point whose step does not
-lower its objective goes back to where it was, and stays: no point can make the whole worse.
+lower its objective goes back to where it was, and stays: no point can make the whole worse. Only observations of points
+that still move are looked at again.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.core.objective import Objective
+from ba_node.core import columns
+from ba_node.core.objective import Objective, PointRows
 from ba_node.core.problem import State
 from ba_node.core.schur import Structure, inverse_cholesky3
 
@@ -25,7 +28,24 @@ _MIN_GAIN = 1e-4
 _MIN_PROMISE = 1e-8
 
 
-def polish_points(objective: Objective, structure: Structure, state: State, steps: int) -> tuple[float, State]:
+@dataclass(frozen=True)
+class Polished:
+    """What polishing did.
+
+    Attributes:
+        state: of which only the points differ.
+        before: the objective at the start.
+        after: the objective of ``state``.
+        rows: of all observations at ``state``.
+    """
+
+    state: State
+    before: float
+    after: float
+    rows: PointRows
+
+
+def polish_points(objective: Objective, structure: Structure, state: State, steps: int) -> Polished:
     """Take up to ``steps`` damped Newton steps a point.
 
     Args:
@@ -33,37 +53,38 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         structure: of the problem.
         state: where to begin.
         steps: cap on steps of a point.
-
-    Returns:
-        The objective reached, and the state; only its points differ.
     """
-    points = state.points.copy()
-    best, best_cost = points.copy(), np.full(len(points), np.inf)
-    active = np.ones(len(points), dtype=bool)
+    best, points = state.points.copy(), state.points.copy()
+    best_cost = np.full(len(points), np.inf)
+    # The points that still move, the observations of them, and where those of each begin.
+    ids, rows, start = structure.seen_points, np.arange(structure.n_rows), structure.point_start
     damping = _FIRST_DAMPING
+    seen = kept = objective.point_rows(state)
+    before = 0.5 * float(np.sum(seen.cost))
     for step in range(steps + 1):
-        rows = objective.point_rows(dataclasses.replace(state, points=points))
-        cost = structure.sum_points(rows.cost)
-        better = active & (cost < best_cost)
+        count = np.diff(start, append=len(rows))
+        cost = columns.sum_runs(seen.cost, start)
+        better = cost < best_cost[ids]
+        if step:
+            taken = np.flatnonzero(np.repeat(better, count))
+            kept.put(rows[taken], seen, taken)
         with np.errstate(invalid="ignore"):
-            arrived = best_cost - cost < _MIN_GAIN * cost
-        best[better], best_cost[better] = points[better], cost[better]
-        active = better & ~arrived
-        points = best.copy()
+            active = better & ~(best_cost[ids] - cost < _MIN_GAIN * cost)
+        best[ids[better]], best_cost[ids[better]] = points[ids[better]], cost[better]
         if step == steps or not active.any():
             break
-        transposed = np.swapaxes(rows.d_point, 1, 2)
-        c = structure.sum_points(transposed @ rows.d_point)[active]
-        gradient = structure.sum_points((transposed @ rows.residual[:, :, None])[..., 0])[active]
+        c, gradient = columns.normal_equations(seen.d_point, seen.residual, start)
         diagonal = np.maximum(np.diagonal(c, axis1=1, axis2=2), _MIN_DIAGONAL)
-        inverse = inverse_cholesky3(c + damping * diagonal[:, :, None] * np.eye(3))
-        scaled = inverse @ gradient[:, :, None]
-        promising = np.sum(scaled * scaled, axis=(1, 2)) > _MIN_PROMISE * cost[active]
-        move = (np.swapaxes(inverse, 1, 2) @ scaled)[..., 0]
-        active[active] = promising
+        inverse = inverse_cholesky3(columns.plus_diagonal(c, damping * diagonal))
+        scaled = columns.times(inverse, gradient)
+        active &= np.sum(scaled * scaled, axis=1) > _MIN_PROMISE * cost
         if not active.any():
             break
-        points[active] -= move[promising]
+        points = best.copy()
+        points[ids[active]] -= columns.times(columns.transposed(inverse), scaled)[active]
+        ids, rows = ids[active], rows[np.repeat(active, count)]
+        start = np.cumsum(count[active]) - count[active]
+        seen = objective.point_rows(dataclasses.replace(state, points=points), rows)
         damping *= 0.1
-    total = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)]))
-    return total, dataclasses.replace(state, points=best)
+    after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)]))
+    return Polished(dataclasses.replace(state, points=best), before, after, kept)

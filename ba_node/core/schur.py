@@ -15,17 +15,21 @@ direction that no observation determines: its row of L^-1 is set to zero, which 
 point does not move in it).
 
 Cost for K free keyframes, P points, N observations, and k_p keyframes that see point p: linearising O(N); Z is
-N blocks of d x 3; S takes sum k_p^2 block products (d x 3)(3 x d). Without S, a product with it takes 2N of them.
+N blocks of d x 3; S takes sum k_p^2 block products (d x 3)(3 x d), or dense ones where these cost less
+(dense_products.py). Without S, a product with it takes 2N of them.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ba_node.core import columns, dense_products
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem
 
@@ -34,6 +38,8 @@ IntArray = NDArray[np.intp]
 
 # S is formed while it takes at most this many block products an observation.
 _PRODUCTS_PER_OBSERVATION = 60.0
+# Seconds of a product of two blocks in scipy, over d^2: as the rates of dense_products.py, of one core.
+_PRODUCT_S = 2e-9
 
 
 class Structure:
@@ -44,27 +50,30 @@ class Structure:
         obs = problem.observations
         self.size = 9 if problem.free_intrinsics else 6
         self.free = np.flatnonzero(~problem.fixed)
-        self.n_free, self.n_points = len(self.free), problem.n_points
+        self.n_free, self.n_points, self.n_rows = len(self.free), problem.n_points, len(obs)
         self._row_keyframe, self._row_point = obs.keyframe, obs.point
         self._n_keyframes = problem.n_keyframes
         column = np.full(problem.n_keyframes, -1, dtype=np.intp)
         column[self.free] = np.arange(self.n_free)
         # By point: rows are sorted already; only points with rows take part in the sums.
-        self.seen_points, self._point_start = np.unique(obs.point, return_index=True)
+        self.point_start = columns.starts(obs.point)
+        self.seen_points = obs.point[self.point_start]
         # By keyframe: the rows of free keyframes.
         row_column = column[obs.keyframe]
         rows = np.flatnonzero(row_column >= 0)
-        self._keyframe_rows = rows[np.argsort(row_column[rows], kind="stable")]
-        self._keyframe_bounds = np.searchsorted(row_column[self._keyframe_rows], np.arange(self.n_free + 1))
-        # Edges: distinct (point, free keyframe), sorted by point; a stereo pair is one edge.
+        self._keyframe_rows, self._keyframe_bounds = _runs(row_column, rows, self.n_free)
+        # Edges: distinct (point, free keyframe); a stereo pair is one edge. In the order of dense_products.py.
         key = obs.point[rows] * max(self.n_free, 1) + row_column[rows]
         order = np.argsort(key, kind="stable")
-        self._edge_rows = rows[order]
-        edges, self._edge_start = np.unique(key[order], return_index=True)
-        self.edge_point, self.edge_keyframe = edges // max(self.n_free, 1), edges % max(self.n_free, 1)
-        self._edge_by_keyframe = np.argsort(self.edge_keyframe, kind="stable")
-        self._indptr_keyframe = np.searchsorted(self.edge_keyframe[self._edge_by_keyframe], np.arange(self.n_free + 1))
-        self._indptr_point = np.searchsorted(self.edge_point, np.arange(self.n_points + 1))
+        rows, start = rows[order], columns.starts(key[order])
+        count = np.diff(start, append=len(rows))
+        point, keyframe = obs.point[rows[start]], row_column[rows[start]]
+        order = dense_products.edge_order(point, keyframe)
+        self.edge_point, self.edge_keyframe, start, count = (a[order] for a in (point, keyframe, start, count))
+        # First the first row of every edge, then the second one of those that have two, and so on.
+        self._edge_rows = [(np.flatnonzero(count > i), rows[start[count > i] + i]) for i in range(count.max(initial=1))]
+        self._edge_by_point, self._indptr_point = _runs(self.edge_point, np.arange(len(order)), self.n_points)
+        self._edge_by_keyframe, self._indptr_keyframe = _runs(self.edge_keyframe, self._edge_by_point, self.n_free)
 
     @property
     def n_edges(self) -> int:
@@ -81,51 +90,78 @@ class Structure:
         """Return True if forming S is cheaper than working without it."""
         return self.schur_products <= _PRODUCTS_PER_OBSERVATION * max(self.n_edges, 1)
 
-    def sum_points(self, rows: FloatArray) -> FloatArray:
-        """Sum rows (n_obs, ...) by point: (n_points, ...)."""
-        out = np.zeros((self.n_points, *rows.shape[1:]))
-        if len(self.seen_points):
-            out[self.seen_points] = np.add.reduceat(rows, self._point_start, axis=0)
-        return out
+    def point_blocks(self, d_point: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return C (n_points, 3, 3) and gp (n_points, 3)."""
+        c, gradient = columns.normal_equations(d_point, residual, self.point_start)
+        if len(c) == self.n_points:
+            return c, gradient
+        all_c, all_gradient = np.zeros((self.n_points, 3, 3), order="F"), np.zeros((self.n_points, 3), order="F")
+        all_c[self.seen_points], all_gradient[self.seen_points] = c, gradient
+        return all_c, all_gradient
 
-    def sum_edges(self, rows: FloatArray) -> FloatArray:
-        """Sum rows (n_obs, ...) by edge: (n_edges, ...)."""
-        taken = rows[self._edge_rows]
-        if len(self._edge_start) == len(self._edge_rows):
-            return taken
-        return np.asarray(np.add.reduceat(taken, self._edge_start, axis=0))
+    def edge_products(self, d_keyframe: FloatArray, d_point: FloatArray) -> FloatArray:
+        """Return E (n_edges, d, 3): ``Jc' Jp``, summed over the rows of each edge."""
+
+        def products(rows: IntArray) -> FloatArray:
+            return columns.product(columns.transposed(columns.take(d_keyframe, rows)), columns.take(d_point, rows))
+
+        out = products(self._edge_rows[0][1])
+        for edges, rows in self._edge_rows[1:]:
+            columns.put(out, edges, columns.take(out, edges) + products(rows))
+        return out
 
     def keyframe_blocks(self, d_keyframe: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return B (n_free, d, d) and gc (n_free, d)."""
-        jacobian = d_keyframe[self._keyframe_rows].reshape(-1, d_keyframe.shape[2])
-        r = residual[self._keyframe_rows].reshape(-1)
-        blocks, gradient = np.zeros((self.n_free, self.size, self.size)), np.zeros((self.n_free, self.size))
-        bounds = self._keyframe_bounds * residual.shape[1]
-        for k in range(self.n_free):
-            part = jacobian[bounds[k] : bounds[k + 1]]
-            blocks[k] = part.T @ part
-            gradient[k] = part.T @ r[bounds[k] : bounds[k + 1]]
-        return blocks, gradient
+        rows, bounds = self._keyframe_rows, self._keyframe_bounds
+        both = columns.take(np.concatenate([d_keyframe.T, residual.T[None]]).T, rows)
+        products = _products(both[:, :, :-1], both, bounds)
+        return products[:, :, :-1], products[:, :, -1]
+
+    def edge_squares(self, blocks: FloatArray) -> FloatArray:
+        """Return the sum of ``Z Z'`` over the edges (n_edges, d, 3) of each keyframe, (n_free, d, d)."""
+        by_keyframe = columns.transposed(columns.take(blocks, self._edge_by_keyframe))
+        return _products(by_keyframe, by_keyframe, self._indptr_keyframe)
+
+    def to_keyframes(self, blocks: FloatArray, x: FloatArray) -> FloatArray:
+        """Return ``Z x`` for edges (n_edges, d, 3) and x (n_points, 3): (n_free, d)."""
+        return columns.sums(columns.times(blocks, columns.take(x, self.edge_point)), self.edge_keyframe, self.n_free)
+
+    def to_points(self, blocks: FloatArray, x: FloatArray) -> FloatArray:
+        """Return ``Z' x`` for edges (n_edges, d, 3) and x (n_free, d): (n_points, 3)."""
+        moved = columns.times(columns.transposed(blocks), columns.take(x, self.edge_keyframe))
+        return columns.sums(moved, self.edge_point, self.n_points)
 
     def jacobian_product(self, lin: Linearisation, step_c: FloatArray, step_p: FloatArray) -> FloatArray:
         """Return J p of every observation, (n_obs, 2 or 3), for steps (n_free, d) and (n_points, 3)."""
         full = np.zeros((self._n_keyframes, self.size))
         full[self.free] = step_c
-        moved = (lin.d_keyframe @ full[self._row_keyframe][:, :, None])[..., 0]
-        moved += (lin.d_point @ step_p[self._row_point][:, :, None])[..., 0]
-        return np.asarray(moved)
+        moved = columns.times(lin.d_keyframe, columns.take(full, self._row_keyframe))
+        moved += columns.times(lin.d_point, columns.take(step_p, self._row_point))
+        return moved
+
+    @cached_property
+    def _dense(self) -> dense_products.DenseProducts:
+        return dense_products.DenseProducts(self.edge_point, self.edge_keyframe, self.size)
+
+    def edge_outer(self, blocks: FloatArray) -> FloatArray | None:
+        """Return ``Z Z'`` (d n_free, d n_free) by dense products; None where block-sparse ones cost less."""
+        if self._dense.seconds > self.schur_products * self.size**2 * _PRODUCT_S:
+            return None
+        return self._dense.outer(blocks, self.n_free)
 
     def edge_matrix(self, blocks: FloatArray) -> scipy.sparse.bsr_matrix:
         """Return edge blocks (n_edges, d, 3) as a block-sparse (d n_free, 3 n_points) matrix."""
         shape = (self.size * self.n_free, 3 * self.n_points)
         order = self._edge_by_keyframe
-        return scipy.sparse.bsr_matrix((blocks[order], self.edge_point[order], self._indptr_keyframe), shape=shape)
+        entries = np.ascontiguousarray(blocks)[order], self.edge_point[order], self._indptr_keyframe
+        return scipy.sparse.bsr_matrix(entries, shape=shape)
 
     def edge_matrix_transposed(self, blocks: FloatArray) -> scipy.sparse.bsr_matrix:
         """Return the transpose of :meth:`edge_matrix`, block-sparse too."""
         shape = (3 * self.n_points, self.size * self.n_free)
-        turned = np.ascontiguousarray(np.swapaxes(blocks, 1, 2))
-        return scipy.sparse.bsr_matrix((turned, self.edge_keyframe, self._indptr_point), shape=shape)
+        order = self._edge_by_point
+        turned = np.ascontiguousarray(columns.transposed(blocks))[order]
+        return scipy.sparse.bsr_matrix((turned, self.edge_keyframe[order], self._indptr_point), shape=shape)
 
 
 @dataclass(frozen=True)
@@ -159,10 +195,8 @@ class NormalEquations:
 def normal_equations(structure: Structure, lin: Linearisation) -> NormalEquations:
     """Return H and g of a linearisation."""
     b, gradient_c = structure.keyframe_blocks(lin.d_keyframe, lin.residual)
-    point_t = np.swapaxes(lin.d_point, 1, 2)
-    c = structure.sum_points(point_t @ lin.d_point)
-    gradient_p = structure.sum_points((point_t @ lin.residual[:, :, None])[..., 0])
-    e = structure.sum_edges(np.swapaxes(lin.d_keyframe, 1, 2) @ lin.d_point)
+    c, gradient_p = structure.point_blocks(lin.d_point, lin.residual)
+    e = structure.edge_products(lin.d_keyframe, lin.d_point)
     return NormalEquations(b, c, e, gradient_c, gradient_p)
 
 
@@ -183,14 +217,26 @@ class ReducedSystem:
             damping_p: (n_points, 3) added to diag(C).
         """
         self._structure = structure
-        self.b = equations.b + damping_c[:, :, None] * np.eye(structure.size)
-        self._inverse_l = inverse_cholesky3(equations.c + damping_p[:, :, None] * np.eye(3))
-        self._scaled_gradient_p = (self._inverse_l @ equations.gradient_p[:, :, None])[..., 0]
-        blocks = equations.e @ np.swapaxes(self._inverse_l, 1, 2)[structure.edge_point]
-        self._blocks = blocks
-        self.z = structure.edge_matrix(blocks)
-        self.z_t = structure.edge_matrix_transposed(blocks)
-        self.rhs = -equations.gradient_c.ravel() + self.z @ self._scaled_gradient_p.ravel()
+        self.b = columns.plus_diagonal(equations.b, damping_c)
+        self._inverse_l = inverse_cholesky3(columns.plus_diagonal(equations.c, damping_p))
+        self._scaled_gradient_p = columns.times(self._inverse_l, equations.gradient_p)
+        inverse = columns.take(self._inverse_l, structure.edge_point)
+        self._blocks = np.empty_like(equations.e)
+        for j in range(3):
+            np.multiply(equations.e[:, :, j], inverse[:, j, j, None], out=self._blocks[:, :, j])
+            for i in range(j):
+                self._blocks[:, :, j] += equations.e[:, :, i] * inverse[:, j, i, None]
+        self.rhs = (structure.to_keyframes(self._blocks, self._scaled_gradient_p) - equations.gradient_c).ravel()
+
+    @cached_property
+    def z(self) -> scipy.sparse.bsr_matrix:
+        """Return Z as a block-sparse matrix."""
+        return self._structure.edge_matrix(self._blocks)
+
+    @cached_property
+    def z_t(self) -> scipy.sparse.bsr_matrix:
+        """Return Z' as a block-sparse matrix."""
+        return self._structure.edge_matrix_transposed(self._blocks)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x without forming S."""
@@ -199,7 +245,10 @@ class ReducedSystem:
 
     def dense(self) -> FloatArray:
         """Return S as a dense matrix."""
-        s: FloatArray = -(self.z @ self.z_t).toarray()
+        s = self._structure.edge_outer(self._blocks)
+        if s is None:
+            s = (self.z @ self.z_t).toarray()
+        np.negative(s, out=s)
         d = self._structure.size
         n = self._structure.n_free
         view = s.reshape(n, d, n, d)
@@ -213,10 +262,7 @@ class ReducedSystem:
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d), without forming S."""
-        blocks = self.b.copy()
-        own = self._blocks @ np.swapaxes(self._blocks, 1, 2)
-        np.subtract.at(blocks, self._structure.edge_keyframe, own)
-        return (blocks,)
+        return (self.b - self._structure.edge_squares(self._blocks),)
 
     def own_blocks(self) -> tuple[FloatArray, ...]:
         """Return the blocks of B, damped."""
@@ -228,9 +274,9 @@ class ReducedSystem:
 
     def expand(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the steps of keyframes (n_free, d) and points (n_points, 3) that belong to a solution (n_free d,)."""
-        rhs = -self._scaled_gradient_p - (self.z_t @ x).reshape(-1, 3)
-        step_p = np.asarray((np.swapaxes(self._inverse_l, 1, 2) @ rhs[:, :, None])[..., 0])
-        return x.reshape(-1, self._structure.size), step_p
+        step_c = x.reshape(-1, self._structure.size)
+        rhs = -self._scaled_gradient_p - self._structure.to_points(self._blocks, step_c)
+        return step_c, columns.times(columns.transposed(self._inverse_l), rhs)
 
 
 def block_diagonal(blocks: FloatArray) -> scipy.sparse.bsr_matrix:
@@ -250,11 +296,26 @@ def inverse_cholesky3(c: FloatArray) -> FloatArray:
     i11 = _inverse_root(c[:, 1, 1] - l10 * l10, floor)
     l21 = (c[:, 2, 1] - l20 * l10) * i11
     i22 = _inverse_root(c[:, 2, 2] - l20 * l20 - l21 * l21, floor)
-    out = np.zeros_like(c)
+    out = np.zeros(c.shape, order="F")
     out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = i00, i11, i22
     out[:, 1, 0] = -l10 * i00 * i11
     out[:, 2, 1] = -l21 * i11 * i22
     out[:, 2, 0] = -(l20 * i00 + l21 * out[:, 1, 0]) * i22
+    return out
+
+
+def _runs(key: IntArray, rows: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Return rows sorted by their key, and where those of each key 0, 1, ..., n - 1 begin and end, (n + 1,)."""
+    ordered = rows[np.argsort(key[rows], kind="stable")]
+    return ordered, np.searchsorted(key[ordered], np.arange(n + 1))
+
+
+def _products(a: FloatArray, b: FloatArray, bounds: IntArray) -> FloatArray:
+    """Return the sum of ``A' B`` over each run of blocks A (n, i, j) and B (n, i, k): (n_runs, j, k)."""
+    out = np.zeros((len(bounds) - 1, a.shape[2], b.shape[2]))
+    for k, (begin, end) in enumerate(itertools.pairwise(bounds.tolist())):
+        left, right = (c[begin:end].reshape(-1, c.shape[2], order="F") for c in (a, b))
+        np.matmul(left.T, right, out=out[k])
     return out
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ba_node.core import blocks
+from ba_node.core import blocks, columns
 from ba_node.core.schur import NormalEquations, Structure, block_diagonal
 
 FloatArray = NDArray[np.float64]
@@ -34,10 +34,10 @@ class CameraReduction:
     ) -> None:
         """Factor B and couple it to the points; arguments as of schur.ReducedSystem."""
         self._structure = structure
-        self.c = equations.c + damping_p[:, :, None] * np.eye(3)
-        self._root = blocks.inverse_roots(equations.b + damping_c[:, :, None] * np.eye(structure.size))
+        self.c = columns.plus_diagonal(equations.c, damping_p)
+        self._root = blocks.inverse_roots(columns.plus_diagonal(equations.b, damping_c))
         self._scaled_gradient_c = (self._root @ equations.gradient_c[:, :, None])[..., 0].ravel()
-        self._blocks = self._root[structure.edge_keyframe] @ equations.e
+        self._blocks = columns.product(columns.take(self._root, structure.edge_keyframe), equations.e)
         self.z = structure.edge_matrix(self._blocks)
         self.z_t = structure.edge_matrix_transposed(self._blocks)
         self.rhs: FloatArray = -equations.gradient_p.ravel() + self.z_t @ self._scaled_gradient_c
@@ -62,7 +62,8 @@ class CameraReduction:
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_points, 3, 3), without forming S."""
         own = self.c.copy()
-        np.subtract.at(own, self._structure.edge_point, np.swapaxes(self._blocks, 1, 2) @ self._blocks)
+        squares = columns.product(columns.transposed(self._blocks), self._blocks)
+        np.subtract.at(own, self._structure.edge_point, squares)
         return (own,)
 
     def own_blocks(self) -> tuple[FloatArray, ...]:
@@ -89,8 +90,8 @@ class FullSystem:
     ) -> None:
         """Add the damping; arguments as of schur.ReducedSystem."""
         self._structure = structure
-        self.b = equations.b + damping_c[:, :, None] * np.eye(structure.size)
-        self.c = equations.c + damping_p[:, :, None] * np.eye(3)
+        self.b = columns.plus_diagonal(equations.b, damping_c)
+        self.c = columns.plus_diagonal(equations.c, damping_p)
         self.e = structure.edge_matrix(equations.e)
         self.e_t = structure.edge_matrix_transposed(equations.e)
         self.rhs = -np.concatenate([equations.gradient_c.ravel(), equations.gradient_p.ravel()])

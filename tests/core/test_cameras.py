@@ -85,6 +85,27 @@ def test_models_can_be_mixed() -> None:
     np.testing.assert_array_equal(mixed[1], cameras.project(x, *pairs[1])[1])
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_one_row_of_parameters_serves_all_points(name: str) -> None:
+    x = points(7)
+    model, params = rows(name, 7)
+    for one, all_rows in zip(
+        cameras.project_jacobian(x, model[:1], params[:1]), cameras.project_jacobian(x, model, params), strict=True
+    ):
+        np.testing.assert_array_equal(one, all_rows)
+    assert cameras.project_jacobian(x, model, params, intrinsics=False)[2].shape == (7, 2, 0)
+
+
+def test_six_parameters_are_enough_for_radial_distortion() -> None:
+    x = points(7)
+    model, params = rows("plumb_bob", 7)
+    params[:, 6:] = 0.0
+    for short, whole in zip(
+        cameras.project_jacobian(x, model, params[:, :6]), cameras.project_jacobian(x, model, params), strict=True
+    ):
+        np.testing.assert_array_equal(short, whole)
+
+
 def test_pixels_without_a_ray_are_nan() -> None:
     """A strong barrel distortion folds over: beyond its largest radius nothing projects."""
     model, params = cameras.parameters("plumb_bob", K, np.array([-0.3, 0.0, 0.0, 0.0]))

@@ -281,6 +281,52 @@ def test_polishing_moves_points_only_and_never_makes_one_worse(backend: str, mak
     np.testing.assert_array_equal(state.rotation, problem.start.rotation)
 
 
+@pytest.mark.parametrize("shape", [{}, {"stereo": True, "depth": True}, {"free_intrinsics": True}])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_rows_kept_while_polishing_are_those_of_the_state(
+    shape: dict[str, object], steps: int, make_problem: Make
+) -> None:
+    """After a step the linearisation takes up what polishing has worked out; so it is as good as a fresh one."""
+    problem, _ = make_problem(start_error=0.05, **shape)
+    rules = Rules(loss="huber")
+    kernels = NumpyKernels(problem, rules)
+    kernels.linearise(problem.start)
+    system = kernels.damp("diag", 1e-4)
+    x = system.solve_dense()
+    assert x is not None
+    moved = kernels.move(problem.start, system, x, steps)
+    fresh = NumpyKernels(problem, rules)
+    assert kernels.linearise(moved.state) == pytest.approx(fresh.linearise(moved.state), rel=1e-13)
+    for mine, its in zip(vars(kernels._equations).values(), vars(fresh._equations).values(), strict=True):
+        near(mine, its)
+
+
+def test_rows_of_one_surrogate_do_not_serve_the_next(make_problem: Make) -> None:
+    problem, _ = make_problem(start_error=1e-4)
+    rules = Rules(loss="truncated_quadratic")
+    kernels, fresh = NumpyKernels(problem, rules), NumpyKernels(problem, rules)
+    kernels.graduate(0.1)
+    kernels.linearise(problem.start)
+    system = kernels.damp("diag", 1e-4)
+    x = system.solve_dense()
+    assert x is not None
+    state = kernels.move(problem.start, system, x, 3).state
+    first = kernels.linearise(state)
+    kernels.graduate(10.0)
+    fresh.graduate(10.0)
+    assert kernels.linearise(state) == fresh.linearise(state) != first
+
+
+def test_polishing_what_is_at_its_best_changes_nothing(make_problem: Make) -> None:
+    problem, _ = make_problem()
+    kernels = NumpyKernels(problem, Rules())
+    value, state = kernels.polish_points(problem.start, 20)
+    for _ in range(20):
+        before, (value, state) = value, kernels.polish_points(state, 20)
+    assert value == pytest.approx(before, rel=1e-14)
+    assert kernels.linearise(state) == pytest.approx(value, rel=1e-13)
+
+
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
 @pytest.mark.parametrize("linear_solver", ["cholesky", "pcg"])
 def test_large_systems_are_solved_without_a_dense_s(

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.core import linear
+from ba_node.core import dense_products, linear
 from ba_node.core.objective import Objective, Rules
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import ReducedSystem, Structure, inverse_cholesky3, normal_equations
@@ -73,6 +73,37 @@ def test_all_forms_of_s_agree(shape: dict[str, object], make_problem: Make) -> N
     view = dense.reshape(n, structure.size, n, structure.size)
     blocks = np.stack([view[k, :, k] for k in range(n)])
     np.testing.assert_allclose(system.diagonal_blocks()[0], blocks, rtol=1e-9, atol=1e-12 * np.abs(dense).max())
+
+
+@pytest.mark.parametrize(
+    "shape", [*SHAPES, {"fixed": 5}, {"keyframes": 12, "seen_share": 0.2}, {"keyframes": 50, "points": 9}]
+)
+def test_dense_products_in_batches_are_the_products_of_blocks(
+    shape: dict[str, object], make_problem: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Batches of any size, the last one not full, with keyframes that see none of it."""
+    structure = Structure(make_problem(**shape)[0])
+    blocks = np.random.default_rng(0).normal(size=(structure.n_edges, structure.size, 3))
+    z = structure.edge_matrix(blocks).toarray()
+    for size in (1, 7, 40, 100):
+        monkeypatch.setattr(dense_products, "_BATCH", size)
+        products = dense_products.DenseProducts(structure.edge_point, structure.edge_keyframe, structure.size)
+        np.testing.assert_allclose(products.outer(blocks, structure.n_free), z @ z.T, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(structure.edge_matrix_transposed(blocks).toarray(), z.T)
+    x_p, x_c = np.arange(3.0 * structure.n_points), np.arange(1.0 * len(z))
+    np.testing.assert_allclose(structure.to_keyframes(blocks, x_p.reshape(-1, 3)).ravel(), z @ x_p, atol=1e-10)
+    np.testing.assert_allclose(structure.to_points(blocks, x_c.reshape(-1, structure.size)).ravel(), z.T @ x_c)
+
+
+def test_a_window_takes_dense_products_and_few_common_points_do_not(make_problem: Make) -> None:
+    window = Structure(make_problem(keyframes=20, points=300)[0])
+    blocks = np.random.default_rng(0).normal(size=(window.n_edges, window.size, 3))
+    z = window.edge_matrix(blocks)
+    outer = window.edge_outer(blocks)
+    assert outer is not None
+    np.testing.assert_allclose(outer, (z @ z.T).toarray(), rtol=0, atol=1e-11)
+    far_apart = Structure(make_problem(keyframes=5, points=5)[0])
+    assert far_apart.edge_outer(np.zeros((far_apart.n_edges, 6, 3))) is None
 
 
 @pytest.mark.parametrize("shape", SHAPES)
