@@ -181,7 +181,7 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
     if rows.any():
         of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
         guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        points[new] = initial_points(of_new, guess, config.tracks)
+        points[new] = initial_points(of_new, guess, config.tracks, config.solver.backend)
     return _with_points(part.problem, points)
 
 
