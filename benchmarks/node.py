@@ -144,6 +144,8 @@ def play(peer: Peer, frames: list[list[tuple[str, Any]]], args: argparse.Namespa
         k = len(sent)
         if k < len(frames) - 1 and now >= begin + k / args.rate:
             sent[k] = now
+            if k == args.warm_up:
+                peer.calls_ms.clear()
             for topic, data in frames[k + 1]:
                 peer.inputs[topic].publish(data)
         if now >= next_call:
