@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +12,9 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
+from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
+from rclpy.task import Future
 from std_msgs.msg import Empty
 
 from ba_node.ros.executor import EVENT_PERIOD_S, NodeExecutor
@@ -97,3 +100,56 @@ def test_messages_are_taken_in_waits_without_events(spun: Spun) -> None:
     publisher.publish(Empty())
     spun.until(lambda: messages)
     assert len(messages) == 1
+
+
+@pytest.fixture
+def alarms(spun: Spun, monkeypatch: pytest.MonkeyPatch) -> list[GuardCondition]:
+    """Return a list into which the executor's alarm is put each time that it goes off."""
+    gone_off: list[GuardCondition] = []
+    trigger = GuardCondition.trigger
+
+    def spy(guard: GuardCondition) -> None:
+        if guard is spun.executor._guard:
+            gone_off.append(guard)
+        trigger(guard)
+
+    monkeypatch.setattr(GuardCondition, "trigger", spy)
+    return gone_off
+
+
+def test_a_callback_does_not_end_the_wait_after_it(spun: Spun, alarms: list[GuardCondition]) -> None:
+    calls: list[int] = []
+    guard = spun.node.create_guard_condition(lambda: calls.append(1))
+    spun.until(lambda: not guard.trigger() and len(calls) >= 5)
+    alarms.clear()
+    spun.until(lambda: not guard.trigger() and len(calls) >= 10)
+    assert alarms == []
+
+
+def test_other_threads_end_a_wait(spun: Spun, alarms: list[GuardCondition]) -> None:
+    done: list[str] = []
+    thread = threading.Thread(target=lambda: spun.executor.create_task(lambda: done.append("task")))
+    thread.start()
+    thread.join()
+    assert alarms
+    spun.until(lambda: done)
+
+
+def test_a_coroutine_that_waits_is_looked_at_after_every_callback(spun: Spun, alarms: list[GuardCondition]) -> None:
+    future, done = Future(), list[str]()
+
+    async def wait() -> None:
+        await future
+        done.append("waited")
+
+    spun.executor.create_task(wait)
+    calls: list[int] = []
+    guard = spun.node.create_guard_condition(lambda: calls.append(1))
+    spun.until(lambda: not guard.trigger() and calls)
+    assert not done
+    alarms.clear()
+    calls.clear()
+    spun.until(lambda: not guard.trigger() and calls)
+    assert alarms
+    future.set_result(None)
+    spun.until(lambda: done)
