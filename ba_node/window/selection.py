@@ -143,7 +143,8 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     table = scene.sightings
     ranges = [np.arange(b.begin, b.end) for row in window for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
-    rows = scene.views_of(_distinct(table.landmark[own], len(scene.landmarks)))
+    landmarks = _distinct(table.landmark[own], len(scene.landmarks))
+    rows = scene.views_of(landmarks)
     n = len(scene.keyframes)
     in_window = np.zeros(n, bool)
     in_window[window] = True
@@ -157,7 +158,6 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     in_part[older[np.argsort(-shared[older], kind="stable")[: config.window.max_fixed_keyframes]]] = True
     rows = rows[in_part.take(keyframe)]
     keyframes = scene.order[in_part[scene.order]]
-    landmarks = _distinct(table.landmark[rows], len(scene.landmarks))
     landmarks = landmarks[np.argsort(scene.landmarks.track_id[landmarks])]
     origin = scene.keyframes.position[keyframes[0]] if len(keyframes) else np.zeros(3)
     positions = scene.landmarks.position[landmarks] - origin
