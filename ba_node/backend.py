@@ -305,11 +305,12 @@ class Backend:
     def _estimate(self, refined: IntArray) -> Estimate:
         scene = self.scene
         scene.settle_poses()
+        trajectory = poses_of(scene, scene.order)
         return Estimate(
             stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]) if len(scene.order) else 0,
             frame_id=self.config.frames.map_frame,
-            refined=poses_of(scene, refined),
-            trajectory=poses_of(scene, scene.order),
+            refined=trajectory[scene.places()[refined]],
+            trajectory=trajectory,
             cloud=cloud_of(scene, scene.landmark_order),
             report=self._report,
             correction=self._published(),

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,31 @@ ROOT = Path(__file__).resolve().parents[1]
 _PROBE = ROOT / "benchmarks" / "node_probe.py"
 _FACTORY = RclpyFactory()
 _CALL_PERIOD_S = 0.03
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the front-end sees, and how much of it a window holds.
+
+    Attributes:
+        about: in words.
+        tracks: points that each image of the stereo pair sees.
+        track_keyframes: keyframes after which a track ends; 0: it goes on, and comes back when its point does.
+        landmarks: points of the world, for each keyframe.
+        fixed: older keyframes that take part with fixed poses.
+    """
+
+    about: str
+    tracks: int
+    track_keyframes: int
+    landmarks: int
+    fixed: int
+
+
+CASES = {
+    "window": Case("20 keyframes, 1500 points, 15 000 observations, 2 keyframes fixed", 375, 8, 60, 2),
+    "wide": Case("20 keyframes, 900 points that come back, 23 000 observations, 20 keyframes fixed", 750, 0, 30, 20),
+}
 
 
 class Peer:
@@ -82,10 +109,18 @@ class Peer:
         future.add_done_callback(lambda _: self.calls_ms.append(1e3 * (time.monotonic() - begin)))
 
 
-def recording(args: argparse.Namespace) -> list[list[tuple[str, Any]]]:
+def recording(args: argparse.Namespace, case: Case) -> list[list[tuple[str, Any]]]:
     """Return the messages of each keyframe, (topic, message), the rig before the first."""
     n = args.warm_up + round(args.seconds * args.rate)
-    options = SyntheticOptions(seed=1, keyframes=n, length_m=0.5 * n, tracks=args.tracks, landmarks=30 * n)
+    options = SyntheticOptions(
+        seed=1,
+        keyframes=n,
+        length_m=0.5 * n,
+        tracks=case.tracks,
+        max_track_keyframes=case.track_keyframes,
+        reobserve=not case.track_keyframes,
+        landmarks=case.landmarks * n,
+    )
     data = generate(options)
     begin_ns = time.time_ns() + 10**9
     frames: list[list[tuple[str, Any]]] = [[("camera_rig", conversion.rig_message(_FACTORY, data.rig, 0))]]
@@ -109,6 +144,8 @@ def play(peer: Peer, frames: list[list[tuple[str, Any]]], args: argparse.Namespa
         k = len(sent)
         if k < len(frames) - 1 and now >= begin + k / args.rate:
             sent[k] = now
+            if k == args.warm_up:
+                peer.calls_ms.clear()
             for topic, data in frames[k + 1]:
                 peer.inputs[topic].publish(data)
         if now >= next_call:
@@ -165,11 +202,11 @@ def times_ms(action: Any, repeats: int = 50) -> list[float]:
     return out
 
 
-def run(args: argparse.Namespace, backend: str) -> list[str]:
+def run(args: argparse.Namespace, case: Case, backend: str) -> list[str]:
     """Play into a node with some kernels; return lines of the table."""
-    frames = recording(args)
+    frames = recording(args, case)
     peer = Peer(args.topics)
-    settings = [f"solver.backend:={backend}", *args.set]
+    settings = [f"solver.backend:={backend}", f"window.max_fixed_keyframes:={case.fixed}", *args.set]
     command = [sys.executable, str(_PROBE), "--ros-args", *[word for s in settings for word in ("-p", s)]]
     environ = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     node = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ)
@@ -197,6 +234,7 @@ def run(args: argparse.Namespace, backend: str) -> list[str]:
         row("sent to report received", delays),
         row("in the solver", [1e3 * r.solve_time_s for r in reports]),
         row("iterations", [r.iterations for r in reports], "number"),
+        row("points", [r.landmarks for r in reports], "number"),
         row("observations", [r.observations for r in reports], "number"),
         row("a callback of the executor late by", probe["late_ms"]),
         row("a service call answered in", peer.calls_ms),
@@ -209,7 +247,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.node", description=__doc__)
     parser.add_argument("--rate", type=float, default=10.0, help="keyframes a second (10)")
     parser.add_argument("--seconds", type=float, default=12.0, help="how long, after the window is full (12)")
-    parser.add_argument("--tracks", type=int, default=750, help="points that each image of the stereo pair sees (750)")
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES, help="what to play (all)")
     parser.add_argument("--warm-up", type=int, default=40, help="keyframes that are not counted (40)")
     parser.add_argument("--backends", nargs="+", default=["native", "numpy"], metavar="NAME")
     parser.add_argument("--topics", nargs="+", default=list(OUTPUT_TYPES), help="outputs to listen to (all)")
@@ -218,9 +256,10 @@ def main() -> int:
     args.topics = list({*args.topics, "report"})
     os.environ.update(isolation(free_domain()))
     head = "| | p50 | p95 | max | n |\n|---|---:|---:|---:|---:|"
-    for backend in args.backends:
-        print(f"\n{backend} kernels, {args.rate:g} keyframes a second:\n\n{head}", flush=True)
-        print("\n".join(run(args, backend)), flush=True)
+    for name, backend in itertools.product(args.cases, args.backends):
+        case = CASES[name]
+        print(f"\n{name} ({case.about}), {backend} kernels, {args.rate:g} keyframes a second:\n\n{head}", flush=True)
+        print("\n".join(run(args, case, backend)), flush=True)
         rclpy.try_shutdown()
     rclpy.init(args=[])
     print(f"\nConversion:\n\n{head}\n" + "\n".join(conversion_times()), flush=True)

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run the node with a timer of 5 ms that notes how late it is called: so long is the executor blocked."""
+"""Run the node with a timer of 10 ms that notes how late it is called: so long is the executor blocked."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rclpy.clock_type import ClockType
 from ba_node.ros import main as node_main
 from ba_node.ros.node import BaNode
 
-_PERIOD_S = 0.005
+_PERIOD_S = 0.01
 
 
 class ProbedNode(BaNode):

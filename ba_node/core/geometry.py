@@ -104,16 +104,17 @@ def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
     d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
-    candidates = np.stack(
-        [
-            np.stack([1 + xx - yy - zz, d, e, a], axis=-1),
-            np.stack([d, 1 - xx + yy - zz, f, b], axis=-1),
-            np.stack([e, f, 1 - xx - yy + zz, c], axis=-1),
-            np.stack([a, b, c, 1 + xx + yy + zz], axis=-1),
-        ],
-        axis=-2,
+    candidates = np.empty((*r.shape[:-2], 4, 4))
+    rows = (
+        (1 + xx - yy - zz, d, e, a),
+        (d, 1 - xx + yy - zz, f, b),
+        (e, f, 1 - xx - yy + zz, c),
+        (a, b, c, 1 + xx + yy + zz),
     )
-    squares = np.stack([candidates[..., i, i] for i in range(4)], axis=-1)
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            candidates[..., i, j] = entry
+    squares = np.diagonal(candidates, axis1=-2, axis2=-1)
     best = np.argmax(squares, axis=-1)
     q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)

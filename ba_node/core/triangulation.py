@@ -15,12 +15,14 @@ one batch of 3x3 solves a round.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node import native
 from ba_node.core import cameras
 
 if TYPE_CHECKING:
@@ -103,8 +105,17 @@ def rays_of(problem: Problem) -> Rays:
     )
 
 
-def triangulate(rays: Rays, n_points: int) -> Triangulation:
-    """Return the point of each group of rays. Nothing is judged here: see the parallax before believing one."""
+def triangulate(rays: Rays, n_points: int, backend: str = "auto") -> Triangulation:
+    """Return the point of each group of rays. Nothing is judged here: see the parallax before believing one.
+
+    Args:
+        rays: in any order.
+        n_points: number of points.
+        backend: numpy; otherwise the C++ kernels, where they are built.
+    """
+    if backend != "numpy" and native.kernels is not None:
+        columns = {item.name: getattr(rays, item.name) for item in dataclasses.fields(rays)}
+        return Triangulation(*native.kernels.triangulate(**columns, n_points=n_points))
     measured_row = np.isfinite(rays.distance_m)
     measured = np.bincount(rays.point[measured_row], minlength=n_points) > 0
     count = np.bincount(rays.point, minlength=n_points)

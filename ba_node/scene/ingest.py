@@ -19,7 +19,7 @@ from ba_node.core.problem import Cameras
 from ba_node.scene.rejections import RejectionLog
 
 if TYPE_CHECKING:
-    from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+    from ba_node.measurements import CameraRig, FeatureTracks, IdArray, Keyframe, LandmarkGuesses
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -68,6 +68,9 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
     uv = np.asarray(tracks.uv, float)
     sigma = np.asarray(tracks.sigma_px, float) if len(tracks.sigma_px) else np.ones(n)
     depth = np.array(tracks.depth_m, float) if len(tracks.depth_m) else np.full(n, np.nan)
+    ids = np.asarray(tracks.track_id).astype(np.uint64)
+    if _nothing_to_judge(ids, uv, sigma, depth):
+        return dataclasses.replace(tracks, track_id=ids, uv=uv, sigma_px=sigma, depth_m=depth)
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & ~np.isinf(depth)
     with np.errstate(invalid="ignore"):
         near = (np.abs(uv) <= MAX_PIXEL).all(axis=1)
@@ -87,7 +90,6 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
         log.reject("bad_depth", f"track {tracks.track_id[i]} in {name[10:]}: depth = {depth[i]:g} m", len(failed))
         depth[failed] = np.nan
     good &= _first_of_each(tracks, good, log)
-    ids = np.asarray(tracks.track_id).astype(np.uint64)
     return dataclasses.replace(tracks, track_id=ids[good], uv=uv[good], sigma_px=sigma[good], depth_m=depth[good])
 
 
@@ -142,6 +144,20 @@ def seen_from_first(rig: CameraRig) -> CameraRig:
     seen = geometry.compose(*back, rotation, rig.position)
     return dataclasses.replace(
         rig, frame_id=rig.names[0], position=seen[1], orientation=geometry.quaternion_from_matrix(seen[0])
+    )
+
+
+def _nothing_to_judge(ids: IdArray, uv: FloatArray, sigma: FloatArray, depth: FloatArray) -> bool:
+    """Return True for most messages: ids that rise, sane pixels and sigmas, no depth or only sane ones."""
+    if not len(ids) or not (ids[1:] > ids[:-1]).all():
+        return False
+    lowest, highest = np.fmin.reduce(depth), np.fmax.reduce(depth)
+    # A NaN among u, v and sigma fails its comparison.
+    return bool(
+        max(uv.max(), -uv.min()) <= MAX_PIXEL
+        and SIGMA_RANGE[0] <= sigma.min()
+        and sigma.max() <= SIGMA_RANGE[1]
+        and (np.isnan(lowest) or (DEPTH_RANGE_M[0] <= lowest and highest <= DEPTH_RANGE_M[1]))
     )
 
 

@@ -106,9 +106,13 @@ class IdIndex:
     def insert(self, ids: IdArray, rows: IntArray) -> None:
         """Add ids that are not known yet and differ from each other."""
         order = np.argsort(ids)
-        at = np.searchsorted(self._ids, ids[order])
-        self._ids = np.insert(self._ids, at, ids[order])
-        self._rows = np.insert(self._rows, at, rows[order])
+        ids, rows = ids[order], rows[order]
+        if len(self._ids) and len(ids) and ids[0] < self._ids[-1]:
+            at = np.searchsorted(self._ids, ids)
+            self._ids, self._rows = np.insert(self._ids, at, ids), np.insert(self._rows, at, rows)
+        else:
+            # Most front-ends count: new ids come last.
+            self._ids, self._rows = np.concatenate([self._ids, ids]), np.concatenate([self._rows, rows])
 
     def renumber(self, renumbered: IntArray) -> None:
         """Follow :meth:`Table.keep`: take over the new row numbers and drop ids whose row is gone."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core import loss, objective, triangulation
+from ba_node.core import loss, native_kernels, triangulation
 
 if TYPE_CHECKING:
     from ba_node.config import TracksConfig
@@ -43,24 +43,28 @@ class _Fit:
     robust: FloatArray
 
 
-def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig) -> FloatArray:
+def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig, backend: str = "auto") -> FloatArray:
     """Return first positions (n_pt, 3) of the points of a problem, NaN where none can be had yet.
 
     Args:
         problem: views of the points; its start points are not looked at.
         guess: (n_pt, 3) guesses in the frame of the problem, NaN for none.
         config: the gates.
+        backend: kernels.
     """
-    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points)
-    fit, guess_fit = _fit(problem, found.points), _fit(problem, guess)
+    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points, backend)
+    fit = _fit(problem, found.points, backend)
     wide = found.parallax_rad >= np.deg2rad(config.min_parallax_deg)
     sound = (wide | found.measured) & (fit.in_front == fit.views) & (fit.views > 0)
     gate = widened(config.max_triangulation_px, fit.median[sound])
     good = sound & (fit.median <= gate)
+    points = np.where(good[:, None], found.points, np.nan)
+    if np.isnan(guess).all():
+        return points
+    guess_fit = _fit(problem, guess, backend)
     needed = np.where(found.measured, 1, 2)
     guess_usable = guess_fit.in_front >= needed
     take_guess = guess_usable & ((guess_fit.median <= gate) | ~good | (guess_fit.robust <= fit.robust))
-    points = np.where(good[:, None], found.points, np.nan)
     return np.where(take_guess[:, None], guess, points)
 
 
@@ -82,12 +86,11 @@ def _median_exceeds(gate: float, errors: FloatArray) -> bool:
     return 2 * int(np.count_nonzero(SPREAD * errors > gate)) >= len(errors)
 
 
-def _fit(problem: Problem, points: FloatArray) -> _Fit:
+def _fit(problem: Problem, points: FloatArray, backend: str) -> _Fit:
     obs, n = problem.observations, problem.n_points
     missing: BoolArray = np.asarray(np.isnan(points).any(axis=1))
     state = dataclasses.replace(problem.start, points=np.where(missing[:, None], 0.0, points))
-    error = objective.reprojection_errors(problem, state) / obs.sigma_px[:, None]
-    norm = np.hypot(error[:, 0], error[:, 1])
+    norm = native_kernels.residual_norms(problem, state, backend)
     in_front = np.isfinite(norm) & ~missing[obs.point]
     norm = np.where(in_front, norm, _BEHIND)
     cost, _ = loss.evaluate("huber", norm, 1.0)

@@ -63,8 +63,6 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
         state: the solution.
     """
     obs = selection.problem.observations
-    anchor_of_point = np.full(selection.problem.n_points, -1)
-    anchor_of_point[obs.point] = selection.unscaled[obs.keyframe]
     rotation, position = geometry.inverse(state.rotation, state.translation)
     points = state.points.copy()
     for anchor in np.unique(selection.unscaled[selection.unscaled >= 0]):
@@ -72,7 +70,8 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
         centre = position[anchor].copy()
         scale = gauge.step_ratio(measured[members], position[members])
         position[members] = centre + scale * (position[members] - centre)
-        hanging = anchor_of_point == anchor
+        hanging = np.zeros(len(points), bool)
+        hanging[obs.point[members.take(obs.keyframe)]] = True
         points[hanging] = centre + scale * (points[hanging] - centre)
     _, translation = geometry.inverse(rotation, position)
     return dataclasses.replace(state, translation=translation, points=points)
@@ -105,8 +104,7 @@ def _displace(scene: Scene, landmarks: IntArray) -> None:
 def _rms_by_point(squared: FloatArray, point: IntArray, believed: BoolArray, n_points: int) -> FloatArray:
     """Return the root mean square error per coordinate of each point's believed observations, px."""
     good = np.asarray(believed & np.isfinite(squared))
-    point = point[good]
-    total = np.bincount(point, squared[good], n_points)
-    count = np.bincount(point, minlength=n_points)
+    total = np.bincount(point, np.where(good, squared, 0.0), n_points)
+    count = np.bincount(point, good, n_points)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.sqrt(total / (2 * count)))

@@ -47,7 +47,7 @@ def problem_of(
     point = _number(landmarks, len(scene.landmarks)).take(table.landmark.take(rows))
     camera = table.camera.take(rows).astype(np.intp)
     # No camera sees a point twice in a keyframe, so no two keys are equal and any sort gives the same.
-    order = np.argsort((point * len(keyframes) + keyframe) * len(cameras.model) + camera)
+    order = _sorted((point * len(keyframes) + keyframe) * len(cameras.model) + camera)
     rows[:] = rows.take(order)
     depth = table.depth_m.take(rows).astype(float)
     depth = np.empty(0) if np.isnan(depth).all() else depth
@@ -64,21 +64,21 @@ def problem_of(
     return Problem(State(*poses, positions, np.empty((0, 3))), np.ones(len(keyframes), bool), cameras, observations)
 
 
-def some_observations(problem: Problem, rows: BoolArray) -> Problem:
+def some_observations(problem: Problem, rows: IntArray) -> Problem:
     """Return a problem with some of the observations of another, and all its keyframes and points."""
-    return dataclasses.replace(problem, observations=_taken(problem.observations, np.flatnonzero(rows)))
+    return dataclasses.replace(problem, observations=_taken(problem.observations, rows))
 
 
-def part_of(problem: Problem, rows: BoolArray, keyframes: BoolArray, points: BoolArray) -> Problem:
+def part_of(problem: Problem, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> Problem:
     """Return a problem with some observations, keyframes and points of another.
 
     Args:
         problem: the whole.
-        rows: (n_obs,) observations to keep, all of kept keyframes and points.
+        rows: observations to keep, ascending, all of kept keyframes and points.
         keyframes: (n_kf,) keyframes to keep.
         points: (n_pt,) points to keep.
     """
-    obs, start = _taken(problem.observations, np.flatnonzero(rows)), problem.start
+    obs, start = _taken(problem.observations, rows), problem.start
     return Problem(
         State(start.rotation[keyframes], start.translation[keyframes], start.points[points], start.intrinsics),
         problem.fixed[keyframes],
@@ -102,6 +102,17 @@ def _taken(obs: Observations, rows: IntArray) -> Observations:
         obs.depth_m.take(rows) if has_depth else obs.depth_m,
         obs.depth_sigma_m.take(rows) if has_depth else obs.depth_sigma_m,
     )
+
+
+def _sorted(keys: IntArray) -> IntArray:
+    """Return the rows in the order of their keys, which are not negative and all different."""
+    # Numbers are sorted in half the time that it takes to sort rows by them: so each row goes in the key's low bits.
+    bits = len(keys).bit_length()
+    if not len(keys) or int(keys.max()) >= 1 << (63 - bits):
+        return np.argsort(keys)
+    packed = (keys << bits) | np.arange(len(keys))
+    packed.sort()
+    return packed & ((1 << bits) - 1)
 
 
 def _number(rows: IntArray, n: int) -> IntArray:

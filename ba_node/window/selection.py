@@ -80,10 +80,10 @@ class _Part:
     landmarks: IntArray
     origin: FloatArray
 
-    def only(self, rows: BoolArray, keyframes: BoolArray, points: BoolArray) -> _Part:
+    def only(self, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> _Part:
         """Return some of it, see ``part_of``."""
         problem = part_of(self.problem, rows, keyframes, points)
-        return _Part(problem, self.rows[rows], self.keyframes[keyframes], self.landmarks[points], self.origin)
+        return _Part(problem, self.rows.take(rows), self.keyframes[keyframes], self.landmarks[points], self.origin)
 
 
 def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
@@ -105,13 +105,13 @@ def select(scene: Scene, config: Config, end: int | None = None) -> Selection | 
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     kept, keyframes, points = _determined(part.problem, usable, config.window.max_landmarks)
-    part, norms, usable = part.only(kept, keyframes, points), norms[kept], usable[kept]
+    part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     is_new = np.zeros(len(scene.keyframes), bool)
     is_new[window] = True
     is_old = ~is_new[part.keyframes]
     if is_old.all():
         return "no keyframe of the window sees enough points that a second image sees"
-    active = some_observations(part.problem, usable)
+    active = some_observations(part.problem, np.flatnonzero(usable))
     held = gauge.choose(active, is_old)
     return Selection(
         dataclasses.replace(active, fixed=held.fixed),
@@ -143,7 +143,8 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     table = scene.sightings
     ranges = [np.arange(b.begin, b.end) for row in window for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
-    rows = scene.views_of(_distinct(table.landmark[own], len(scene.landmarks)))
+    landmarks = _distinct(table.landmark[own], len(scene.landmarks))
+    rows = scene.views_of(landmarks)
     n = len(scene.keyframes)
     in_window = np.zeros(n, bool)
     in_window[window] = True
@@ -157,7 +158,6 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     in_part[older[np.argsort(-shared[older], kind="stable")[: config.window.max_fixed_keyframes]]] = True
     rows = rows[in_part.take(keyframe)]
     keyframes = scene.order[in_part[scene.order]]
-    landmarks = _distinct(table.landmark[rows], len(scene.landmarks))
     landmarks = landmarks[np.argsort(scene.landmarks.track_id[landmarks])]
     origin = scene.keyframes.position[keyframes[0]] if len(keyframes) else np.zeros(3)
     positions = scene.landmarks.position[landmarks] - origin
@@ -177,11 +177,11 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
     new = ~scene.landmarks.has_position[part.landmarks]
     points = part.problem.start.points.copy()
     points[new] = np.nan
-    rows = new.take(part.problem.observations.point) & ~scene.sightings.outlier.take(part.rows)
-    if rows.any():
+    rows = np.flatnonzero(new.take(part.problem.observations.point) & ~scene.sightings.outlier.take(part.rows))
+    if len(rows):
         of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
         guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        points[new] = initial_points(of_new, guess, config.tracks)
+        points[new] = initial_points(of_new, guess, config.tracks, config.solver.backend)
     return _with_points(part.problem, points)
 
 
@@ -195,7 +195,10 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     Each is moved by the correction of the earliest keyframe that sees it: a front-end's point hangs on the view that
     it was first seen in, and this choice does not depend on when the message came.
     """
-    guess = np.where(scene.landmarks.has_guess[landmarks, None], scene.landmarks.guess[landmarks], np.nan)
+    has_guess = scene.landmarks.has_guess[landmarks, None]
+    guess = np.where(has_guess, scene.landmarks.guess[landmarks], np.nan)
+    if not has_guess.any():
+        return guess
     rows = scene.views_of(landmarks)
     first = np.full(len(scene.landmarks), len(scene.order) - 1)
     np.minimum.at(first, scene.sightings.landmark[rows], scene.places()[scene.sightings.keyframe[rows]])
@@ -210,13 +213,16 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
         return usable
     obs = part.problem.observations
     gate = _ABSURD * outlier_px
-    far = norms > gate
     placed = ~np.isnan(part.problem.start.points[:, 0])
+    far = (norms > gate) & placed.take(obs.point)
+    if not far.any():
+        return usable
     # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
     judged = usable & placed.take(obs.point)
     n_kf = len(part.keyframes)
-    large = np.bincount(obs.keyframe, judged & (SPREAD * norms > gate), n_kf)
-    suspect = (2 * large >= np.bincount(obs.keyframe, judged, n_kf)) & (np.bincount(obs.keyframe, far, n_kf) > 0)
+    large = np.bincount(obs.keyframe[judged & (SPREAD * norms > gate)], minlength=n_kf)
+    has_far = np.bincount(obs.keyframe[far], minlength=n_kf) > 0
+    suspect = (2 * large >= np.bincount(obs.keyframe, judged, n_kf)) & has_far
     for k in np.flatnonzero(suspect):
         own = np.flatnonzero(obs.keyframe == k)
         far[own] = norms[own] > widened(gate, norms[own[judged[own]]], 1)
@@ -226,36 +232,40 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
 def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     """Return the rows of placed landmarks that absurd residuals leave with too few views, by track id."""
     obs, n = part.problem.observations, len(part.landmarks)
-    weight = np.where(np.isfinite(obs.depth_m), 2, 1) if len(obs.depth_m) else np.ones(len(obs))
-    before = np.bincount(obs.point, weight * ~scene.sightings.outlier.take(part.rows), n)
-    after = np.bincount(obs.point, weight * usable, n)
+    heard = ~scene.sightings.outlier.take(part.rows)
+    doubted = np.zeros(n, bool)
+    doubted[obs.point[heard & ~usable]] = True
+    rows = np.flatnonzero(doubted.take(obs.point))
+    if not len(rows):
+        return part.landmarks[:0]
+    point = obs.point[rows]
+    weight = np.where(np.isfinite(obs.depth_m[rows]), 2, 1) if len(obs.depth_m) else np.ones(len(rows))
+    before = np.bincount(point, weight * heard[rows], n)
+    after = np.bincount(point, weight * usable[rows], n)
     return part.landmarks[scene.landmarks.has_position[part.landmarks] & (before >= 2) & (after < 2)]
 
 
-def _determined(problem: Problem, usable: BoolArray, max_landmarks: int) -> tuple[BoolArray, BoolArray, BoolArray]:
+def _determined(problem: Problem, usable: BoolArray, max_landmarks: int) -> tuple[IntArray, BoolArray, BoolArray]:
     """Return which observations, keyframes and points are left without all that does not determine anything."""
     obs, n_kf, n_pt = problem.observations, problem.n_keyframes, problem.n_points
-    measured = usable & np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
-    known = ~np.isnan(problem.start.points[:, 0])
-    keep_pt = _most_seen(known, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
-    count = -1
+    keep_pt = ~np.isnan(problem.start.points[:, 0])
+    if np.count_nonzero(keep_pt) > max_landmarks:
+        keep_pt = _most_seen(keep_pt, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
     while True:
         used = usable & keep_pt.take(obs.point)
-        keep_kf = np.bincount(obs.keyframe[used], minlength=n_kf) >= MIN_OBSERVATIONS
+        keep_kf = np.bincount(obs.keyframe, used, n_kf) >= MIN_OBSERVATIONS
         used &= keep_kf.take(obs.keyframe)
-        views = np.bincount(obs.point[used], minlength=n_pt)
-        depths = np.bincount(obs.point[used & measured], minlength=n_pt)
-        keep_pt = keep_pt & ((views >= 2) | (depths > 0))
-        previous, count = count, int(np.count_nonzero(keep_pt)) + int(np.count_nonzero(keep_kf))
-        if count == previous:
+        determined = np.bincount(obs.point, used, n_pt) >= 2
+        if len(obs.depth_m):
+            determined |= np.bincount(obs.point, used & np.isfinite(obs.depth_m), n_pt) > 0
+        before, keep_pt = keep_pt, keep_pt & determined
+        if np.array_equal(keep_pt, before):
             break
-    return keep_pt.take(obs.point) & keep_kf.take(obs.keyframe), keep_kf, keep_pt
+    return np.flatnonzero(keep_pt.take(obs.point) & keep_kf.take(obs.keyframe)), keep_kf, keep_pt
 
 
 def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
-    """Return which of the known points to keep: at most ``limit``, those with most views, ties by track id."""
-    if np.count_nonzero(known) <= limit:
-        return known
+    """Return which of the known points to keep: ``limit`` of them, those with most views, ties by track id."""
     keep = np.zeros(len(known), bool)
     keep[np.argsort(np.where(known, -views, 1), kind="stable")[:limit]] = True
     return keep

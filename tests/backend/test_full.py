@@ -78,7 +78,7 @@ def objectives(backend: Backend, of: full.Copy) -> tuple[float, float]:
         scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes] - selection.origin
     )
     points = scene.landmarks.position[landmarks] - selection.origin
-    problem = some_observations(selection.problem, placed[selection.problem.observations.point])
+    problem = some_observations(selection.problem, np.flatnonzero(placed[selection.problem.observations.point]))
     now = dataclasses.replace(problem.start, rotation=poses[0], translation=poses[1], points=points)
     chosen = full.options(backend.config.solver, max_iterations=1)
     before, after = (

@@ -9,10 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ba_node import native
 from ba_node.core import cameras, geometry, objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.core.triangulation import parallax, rays_of, triangulate
 
+both = pytest.mark.parametrize(
+    "backend",
+    ["numpy", pytest.param("native", marks=pytest.mark.skipif(native.kernels is None, reason="no C++ kernels built"))],
+)
 _OFFSET = np.array([4.0e5, 5.0e6, 100.0])
 
 
@@ -49,17 +54,19 @@ def take(problem: Problem, rows: np.ndarray) -> Problem:
     )
 
 
+@both
 @pytest.mark.parametrize("offset", [0.0, 1.0])
-def test_exact_rays_give_the_exact_point(offset: float) -> None:
+def test_exact_rays_give_the_exact_point(backend: str, offset: float) -> None:
     problem = make_problem(1, offset=offset)
-    found = triangulate(rays_of(problem), problem.n_points)
+    found = triangulate(rays_of(problem), problem.n_points, backend)
     error = np.abs(found.points - problem.start.points).max()
     assert error < (1e-6 if offset else 1e-9), f"largest error {error:.2e} m"
 
 
-def test_noise_is_weighed_close_to_the_reprojection_optimum() -> None:
+@both
+def test_noise_is_weighed_close_to_the_reprojection_optimum(backend: str) -> None:
     problem = make_problem(2, noise_px=0.5)
-    points = triangulate(rays_of(problem), problem.n_points).points
+    points = triangulate(rays_of(problem), problem.n_points, backend).points
     cost = _cost(problem, points)
     rng = np.random.default_rng(0)
     # No nearby point is clearly better: the algebraic minimum is the reprojection minimum to within 2 %.
@@ -94,22 +101,24 @@ def test_parallax_of_many_views_is_at_least_half_the_largest_angle() -> None:
     assert (found >= 0.5 * largest).all(), f"smallest share {np.min(found / largest):.3f}"
 
 
-def test_a_measured_depth_places_a_point_from_one_view() -> None:
+@both
+def test_a_measured_depth_places_a_point_from_one_view(backend: str) -> None:
     problem = make_problem(5)
     first = take(problem, (problem.observations.camera == 0) & (problem.observations.keyframe == 0))
     depth = objective.Objective(first, objective.Rules()).in_camera(first.start)[:, 2]
     obs = dataclasses.replace(first.observations, depth_m=depth, depth_sigma_m=0.02 * depth)
-    found = triangulate(rays_of(dataclasses.replace(first, observations=obs)), problem.n_points)
+    found = triangulate(rays_of(dataclasses.replace(first, observations=obs)), problem.n_points, backend)
     assert found.measured.all()
     error = np.abs(found.points - problem.start.points).max()
     assert error < 1e-9, f"largest error {error:.2e} m"
 
 
-def test_one_view_without_depth_gives_no_point_and_others_are_not_disturbed() -> None:
+@both
+def test_one_view_without_depth_gives_no_point_and_others_are_not_disturbed(backend: str) -> None:
     problem = make_problem(6)
     obs = problem.observations
     keep = (obs.point != 3) | ((obs.keyframe == 0) & (obs.camera == 0))
-    found = triangulate(rays_of(take(problem, keep & (obs.point != 5))), problem.n_points)
+    found = triangulate(rays_of(take(problem, keep & (obs.point != 5))), problem.n_points, backend)
     assert np.isnan(found.points[[3, 5]]).all()
     assert found.parallax_rad[3] == 0.0
     others = np.setdiff1d(np.arange(problem.n_points), [3, 5])
@@ -126,20 +135,41 @@ def test_pixels_outside_the_lens_are_left_out() -> None:
     assert np.isfinite(rays.direction).all()
 
 
+@both
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 50.0))
-def test_any_rays_give_finite_points_or_nan_marks(seed: int, noise_px: float) -> None:
+def test_any_rays_give_finite_points_or_nan_marks(backend: str, seed: int, noise_px: float) -> None:
     problem = make_problem(seed, n_kf=3, n_pt=5, noise_px=noise_px)
-    found = triangulate(rays_of(problem), problem.n_points)
+    found = triangulate(rays_of(problem), problem.n_points, backend)
     assert np.isfinite(found.points).all()
     assert np.isfinite(found.parallax_rad).all()
 
 
-def test_identical_rays_do_not_raise() -> None:
+@both
+def test_identical_rays_do_not_raise(backend: str) -> None:
     problem = make_problem(8)
     rays = rays_of(take(problem, (problem.observations.camera == 0) & (problem.observations.keyframe == 0)))
     rows = np.repeat(np.arange(len(rays.point)), 2)
     twice = dataclasses.replace(rays, **{f.name: getattr(rays, f.name)[rows] for f in dataclasses.fields(rays)})
-    found = triangulate(twice, problem.n_points)
+    found = triangulate(twice, problem.n_points, backend)
     assert np.isfinite(found.points).all()
     assert found.parallax_rad.max() == 0.0
+
+
+@pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_kernels_agree(offset: float) -> None:
+    problem = make_problem(9, n_pt=200, noise_px=2.0, offset=offset)
+    rng = np.random.default_rng(9)
+    depth = objective.Objective(problem, objective.Rules()).in_camera(problem.start)[:, 2]
+    depth *= np.where(rng.random(len(depth)) < 0.1, rng.uniform(0.9, 1.1, len(depth)), np.nan)
+    obs = dataclasses.replace(problem.observations, depth_m=depth, depth_sigma_m=0.02 * depth)
+    # One to eight views of each, and some with none; rays in any order.
+    kept = rng.random(len(obs)) < rng.random(200)[obs.point]
+    rays = rays_of(take(dataclasses.replace(problem, observations=obs), rng.permutation(np.flatnonzero(kept))))
+    ours, oracle = triangulate(rays, 200, "native"), triangulate(rays, 200, "numpy")
+    np.testing.assert_array_equal(ours.measured, oracle.measured)
+    np.testing.assert_allclose(ours.parallax_rad, oracle.parallax_rad, rtol=1e-12, atol=1e-12)
+    wide = np.isnan(oracle.points[:, 0]) | oracle.measured | (oracle.parallax_rad > 0.01)
+    assert np.count_nonzero(wide) > 150
+    np.testing.assert_allclose(ours.points[wide], oracle.points[wide], rtol=1e-9, atol=1e-7)

@@ -28,8 +28,8 @@ def test_a_part_is_what_would_have_been_made_of_its_rows(depth_share: float) -> 
     keys = np.stack([obs.point, obs.keyframe, obs.camera])
     assert (np.lexsort(keys[::-1]) == np.arange(len(obs))).all(), "sorted by point, keyframe, camera"
     keyframes, points = rng.random(len(scene.order)) < 0.7, rng.random(len(landmarks)) < 0.7
-    kept = keyframes[obs.keyframe] & points[obs.point]
-    assert 10 < np.count_nonzero(kept) < len(obs) - 10
+    kept = np.flatnonzero(keyframes[obs.keyframe] & points[obs.point])
+    assert 10 < len(kept) < len(obs) - 10
     part = part_of(whole, kept, keyframes, points)
     again = problem_of(
         scene,

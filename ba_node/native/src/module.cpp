@@ -11,6 +11,7 @@
 
 #include "kernel.hpp"
 #include "norms.hpp"
+#include "triangulate.hpp"
 
 namespace py = pybind11;
 
@@ -69,6 +70,22 @@ Doubles residual_norms(const Ints& keyframe, const Ints& camera, const Ints& poi
   py::gil_scoped_release release;
   ba::residual_norms(problem, at, out);
   return norms;
+}
+
+// Points (n_points, 3), parallax and whether a distance was measured, both (n_points,).
+py::tuple triangulate(const Ints& point, const Doubles& centre, const Doubles& direction, const Doubles& px_per_rad,
+                      const Doubles& distance, const Doubles& distance_sigma, py::ssize_t n_points) {
+  const ba::RaysView rays{point.size(),      point.data(),    centre.data(),        direction.data(),
+                          px_per_rad.data(), distance.data(), distance_sigma.data()};
+  Doubles points = empty({n_points, 3}), parallax = empty({n_points});
+  Array<bool> measured({n_points});
+  double *x = points.mutable_data(), *angle = parallax.mutable_data();
+  bool* has_distance = measured.mutable_data();
+  {
+    py::gil_scoped_release release;
+    ba::Triangulator(rays, n_points).run(x, angle, has_distance);
+  }
+  return py::make_tuple(points, parallax, measured);
 }
 
 template <int D>
@@ -264,4 +281,6 @@ PYBIND11_MODULE(_kernels, m) {
   m.def("residual_norms", &residual_norms, py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"),
         py::arg("uv"), py::arg("sigma_px"), py::arg("camera_rotation"), py::arg("camera_translation"),
         py::arg("camera_model"), py::arg("camera_params"), py::arg("state"));
+  m.def("triangulate", &triangulate, py::kw_only(), py::arg("point"), py::arg("centre"), py::arg("direction"),
+        py::arg("px_per_rad"), py::arg("distance_m"), py::arg("distance_sigma_m"), py::arg("n_points"));
 }
