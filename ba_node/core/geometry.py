@@ -32,10 +32,13 @@ def hat(v: FloatArray) -> FloatArray:
 
 def so3_exp(phi: FloatArray) -> FloatArray:
     """Return the rotation of a rotation vector by Rodrigues' formula: (..., 3) rad -> (..., 3, 3)."""
-    angle2 = np.sum(phi * phi, axis=-1)
-    a, b, _ = _sinc_terms(angle2)
-    k = hat(phi)
-    return np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
+    angle2 = np.add.reduce(phi * phi, axis=-1)
+    a, b = _sinc_terms(angle2)
+    # [v]x^2 = v v' - v'v I.
+    out = hat(a[..., None] * phi)
+    out += (b[..., None] * phi)[..., :, None] * phi[..., None, :]
+    out[..., (0, 1, 2), (0, 1, 2)] += (1.0 - b * angle2)[..., None]
+    return out
 
 
 def so3_log(rotation: FloatArray) -> FloatArray:
@@ -57,13 +60,13 @@ def so3_log(rotation: FloatArray) -> FloatArray:
 def right_jacobian(phi: FloatArray) -> FloatArray:
     """Return ``Jr`` with ``Exp(phi + d) = Exp(phi) Exp(Jr d) + O(d^2)`` (3.28): (..., 3) -> (..., 3, 3)."""
     angle2 = np.sum(phi * phi, axis=-1)
-    _, b, c = _sinc_terms(angle2)
+    b, c = _sinc_terms(angle2)[1], _third_term(angle2)
     k = hat(phi)
     return np.eye(3) - b[..., None, None] * k + c[..., None, None] * (k @ k)
 
 
-def _sinc_terms(angle2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``sin(t)/t``, ``(1 - cos t)/t^2`` and ``(t - sin t)/t^3`` for ``angle2 = t^2``."""
+def _sinc_terms(angle2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``sin(t)/t`` and ``(1 - cos t)/t^2`` for ``angle2 = t^2``."""
     small = angle2 < _SMALL**2
     t2 = np.where(small, 1.0, angle2)
     t = np.sqrt(t2)
@@ -71,14 +74,15 @@ def _sinc_terms(angle2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]
     a = np.where(small, 1.0 - angle2 / 6.0, np.sin(t) / t)
     # 2 sin^2(t/2) instead of 1 - cos t: no cancellation.
     b = np.where(small, 0.5 - angle2 / 24.0, 2.0 * half * half / t2)
-    c = np.where(small, 1.0 / 6.0 - angle2 / 120.0, _third_term(t, t2))
-    return a, b, c
+    return a, b
 
 
-def _third_term(t: FloatArray, t2: FloatArray) -> FloatArray:
-    """Return ``(t - sin t) / t^3``; by its series where the difference would cancel."""
-    series = 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0 - t2 * t2 * t2 / 362880.0
-    result: FloatArray = np.where(t < 0.3, series, (t - np.sin(t)) / (t2 * t))
+def _third_term(angle2: FloatArray) -> FloatArray:
+    """Return ``(t - sin t) / t^3`` for ``angle2 = t^2``; by its series where the difference would cancel."""
+    t2 = np.where(angle2 < _SMALL**2, 1.0, angle2)
+    t = np.sqrt(t2)
+    series = 1.0 / 6.0 - angle2 / 120.0 + angle2**2 / 5040.0 - angle2**3 / 362880.0
+    result: FloatArray = np.where(angle2 < 0.09, series, (t - np.sin(t)) / (t2 * t))
     return result
 
 

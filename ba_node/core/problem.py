@@ -141,7 +141,7 @@ class Problem:
             if not np.isfinite(array).all():
                 row = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
                 raise ProblemError(f"{name} of row {row} is not finite: {array[row]}")
-        if np.any(obs.sigma_px <= 0):
+        if (obs.sigma_px <= 0).any():
             row = int(np.argmax(obs.sigma_px <= 0))
             raise ProblemError(f"sigma_px of observation {row} is {obs.sigma_px[row]}: expected > 0")
         if not self.start.is_finite():

@@ -35,15 +35,20 @@ class ReducedSolver:
 
     Attributes:
         kind: dense, sparse or pcg; empty while none has been needed.
-        text: how, for the report, with what it costs.
     """
 
     def __init__(self, options: SolverOptions) -> None:
         """Keep the choices."""
         self._options = options
-        self.kind, self.text = "", ""
+        self.kind = ""
+        self._text: Callable[[], str] = str
         # Steps of PCG to be tried before an exact solver; 0 once they did not get there; None before the first system.
         self._tries: int | None = None
+
+    @property
+    def text(self) -> str:
+        """Return how the systems were solved, for the report, with what it costs."""
+        return self._text()
 
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
@@ -80,7 +85,7 @@ class ReducedSolver:
         sizes = system.sizes() if options.linear_solver == "auto" and options.trust_region == "none" else None
         tries = linear_costs.pcg_tries(sizes) if sizes is not None else 0
         if tries:
-            self.text = f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
+            self._text = lambda: f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
         return tries
 
     def _try(self, system: System, hessian: Hessian, steps: int) -> linear.Solution:
@@ -117,7 +122,7 @@ class ReducedSolver:
                 asked = linear_costs.cheapest(sizes, factor, exact=asked == "cholesky")
         elif asked in ("auto", "cholesky"):
             asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
-        self.kind, self.text = asked, linear_costs.describe(asked, n, sizes, factor)
+        self.kind, self._text = asked, lambda: linear_costs.describe(asked, n, sizes, factor)
 
 
 def preconditioner(kind: str, system: System, scale: FloatArray) -> linear.Product:

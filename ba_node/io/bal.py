@@ -109,7 +109,7 @@ def to_problem(bal: BalProblem) -> Problem:
     """
     n = len(bal.observations)
     # What is sorted already is not copied: it may be most of the memory of a large problem.
-    is_sorted = bool(np.all(bal.point_index[1:] >= bal.point_index[:-1]))
+    is_sorted = bool((bal.point_index[1:] >= bal.point_index[:-1]).all())
     order = slice(None) if is_sorted else np.argsort(bal.point_index, kind="stable")
     params = np.zeros((1, 12))
     params[0, :2] = 1.0

@@ -28,6 +28,7 @@ class Spec:
     noise_px: float = 0.5
     start_error: float = 0.01
     seen_share: float = 0.7
+    spacing_m: float = 0.4
     seed: int = 0
 
 
@@ -62,7 +63,7 @@ def make(spec: Spec) -> tuple[Problem, State]:
 def _truth(spec: Spec, rng: np.random.Generator) -> State:
     k = spec.keyframes
     rotation = geometry.so3_exp(rng.normal(0.0, 0.1, (k, 3)))
-    centre = np.stack([0.4 * np.arange(k), 0.1 * rng.normal(size=k), 0.1 * rng.normal(size=k)], axis=1)
+    centre = np.stack([spec.spacing_m * np.arange(k), 0.1 * rng.normal(size=k), 0.1 * rng.normal(size=k)], axis=1)
     points = rng.uniform([-2.0, -2.0, 4.0], [4.0, 2.0, 9.0], (spec.points, 3))
     own = np.tile([400.0, -0.1, 0.02], (k, 1)) + rng.normal(size=(k, 3)) * [5.0, 0.01, 0.002]
     intrinsics = own if spec.free_intrinsics else np.empty((0, 3))

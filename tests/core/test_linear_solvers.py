@@ -152,12 +152,15 @@ def test_the_kernels_pcg_goes_as_that_of_linear(kind: str, formed: bool, own: bo
 @built
 def test_pcg_is_tried_where_its_steps_cost_next_to_nothing(make_problem: Make) -> None:
     """On a problem where every keyframe sees every point; a problem that needs many steps is then solved exactly."""
-    problem, _ = make_problem(keyframes=80, points=200, seen_share=1.0, fixed=2, start_error=0.003)
+    problem, _ = make_problem(keyframes=80, points=200, seen_share=1.0, fixed=2, start_error=0.003, spacing_m=0.06)
+    begun = solver.solve(problem, SolverOptions(q_eps=0.1, max_iterations=1))
+    assert begun.linear_solver.startswith("PCG") and begun.linear_iterations > 0
     tried = solver.solve(problem, SolverOptions(q_eps=0.1, function_tolerance=1e-9))
     exact = solver.solve(problem, SolverOptions(linear_solver="cholesky", function_tolerance=1e-9))
-    assert tried.linear_solver.startswith("PCG") and "PCG" not in exact.linear_solver
-    assert tried.linear_iterations > 0
-    np.testing.assert_allclose(tried.objective_after, exact.objective_after, rtol=1e-6)
+    assert tried.linear_iterations > 0 and exact.linear_iterations == 0
+    assert "PCG" not in tried.linear_solver and "PCG" not in exact.linear_solver
+    np.testing.assert_allclose(tried.objective_after, exact.objective_after, rtol=1e-9)
+    assert exact.objective_after < 1e-3 * exact.objective_before
     few = Sizes(unknowns=228, block=6, edges=600, pairs=1200)
     assert linear_costs.pcg_tries(few) == 0
 

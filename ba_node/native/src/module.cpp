@@ -274,6 +274,7 @@ void bind(py::module_& m, const char* name) {
 
 PYBIND11_MODULE(_kernels, m) {
   ba::Slabs::shared().warm();
+  empty({0});  // has pybind11 find what it needs of numpy, which the first solve would wait for
   m.doc() = "Kernels of bundle adjustment in C++; see ba_node/core/kernels.py.";
   bind<6>(m, "Kernel6");
   bind<9>(m, "Kernel9");
