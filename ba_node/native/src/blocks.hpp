@@ -196,11 +196,12 @@ inline void set_entry(Block<9>& s, int r, int c, double value) {
   }
 }
 
-template <int D>
-inline void add(Block<D>& to, const Block<D>& b) {
+// Columns or blocks.
+template <class T>
+inline void add(T& to, const T& x) {
   double* sum = reinterpret_cast<double*>(&to);
-  const double* other = reinterpret_cast<const double*>(&b);
-  for (std::size_t i = 0; i < sizeof(b) / sizeof(double); ++i) sum[i] += other[i];
+  const double* other = reinterpret_cast<const double*>(&x);
+  for (std::size_t i = 0; i < sizeof(x) / sizeof(double); ++i) sum[i] += other[i];
 }
 
 // y += b x or y -= b x, by the sign.

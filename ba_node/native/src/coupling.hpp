@@ -220,9 +220,10 @@ class Coupling {
   // Which free keyframe each image is of.
   void find_columns() {
     image_column_.assign(l_.images.size(), -1);
-    for (std::int64_t k = 0; k < l_.n_free; ++k)
-      for (std::int64_t i = l_.keyframe_seen[k]; i < l_.keyframe_seen[k + 1]; ++i)
-        if (l_.seen[i] < kLanes * l_.n_slots()) image_column_[l_.slot_image[l_.seen[i]]] = static_cast<std::int32_t>(k);
+    const std::int64_t none = kLanes * l_.n_slots(), lists = static_cast<std::int64_t>(l_.keyframe_seen.size()) - 1;
+    for (std::int64_t list = 0; list < lists; ++list)
+      for (std::int64_t i = l_.keyframe_seen[list]; i < l_.keyframe_seen[list + 1]; ++i)
+        if (l_.seen[i] < none) image_column_[l_.slot_image[l_.seen[i]]] = static_cast<std::int32_t>(list % l_.n_free);
   }
 
   const Layout& l_;

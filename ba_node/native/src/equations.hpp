@@ -70,6 +70,9 @@ class Equations : public AtPoints {
     b.resize(l_.n_free);
     gradient_c.resize(l_.n_free);
     part_.resize(l_.n_chunks());
+    const std::int64_t lists = l_.n_seen_parts() > 1 ? l_.n_seen_parts() * l_.n_free : 0;
+    part_b_.resize(lists);
+    part_gradient_.resize(lists);
   }
 
   double gradient_norm = 0;
@@ -132,6 +135,8 @@ class Equations : public AtPoints {
  private:
   // Bytes of records up to which a second set stays in the caches with the first; beyond, it costs what it saves.
   static constexpr std::int64_t kMostAhead = 4 << 20;
+  // Pieces of the keyframes of a part.
+  static constexpr std::int64_t kRanges = 4;
 
   std::int64_t resize(AtPoints& at) const {
     at.record.resize((kLanes * l_.n_slots() + 1) * lines);
@@ -143,13 +148,32 @@ class Equations : public AtPoints {
   }
 
   void sum_keyframes(Pool& pool) {
-    pool.each(l_.n_free, [&](std::int64_t k, int) {
+    const std::int64_t parts = l_.n_seen_parts(), n = l_.n_free;
+    const auto sum_list = [this](std::int64_t list, Block<D>& block, Column<D>& gradient) {
       if (l_.has_depth) {
-        sum_keyframe<true>(k);
+        sum_keyframe<true>(list, block, gradient);
       } else {
-        sum_keyframe<false>(k);
+        sum_keyframe<false>(list, block, gradient);
       }
-    });
+    };
+    if (parts == 1) {
+      pool.each(n, [&](std::int64_t k, int) { sum_list(k, b[k], gradient_c[k]); });
+    } else {
+      // Each thread what it has seen itself.
+      pool.each(parts * kRanges, [&](std::int64_t piece, int) {
+        const std::int64_t part = piece / kRanges, range = piece % kRanges;
+        for (std::int64_t i = part * n + n * range / kRanges; i < part * n + n * (range + 1) / kRanges; ++i)
+          sum_list(i, part_b_[i], part_gradient_[i]);
+      });
+      for (std::int64_t k = 0; k < n; ++k) {
+        b[k] = part_b_[k];
+        gradient_c[k] = part_gradient_[k];
+        for (std::int64_t i = k + n; i < parts * n; i += n) {
+          add(b[k], part_b_[i]);
+          add(gradient_c[k], part_gradient_[i]);
+        }
+      }
+    }
     double norm2 = 0;
     for (const auto& x : gradient_c) norm2 += dot(x, x);
     V8 squares{};
@@ -205,12 +229,12 @@ class Equations : public AtPoints {
     if constexpr (kDepth) put_line(kLines - 1, 4, root(held[kLanes * kLines + 1]));
   }
 
-  // B and g of free keyframe k.
+  // B and g of the observations of a list.
   template <bool kDepth>
-  void sum_keyframe(std::int64_t k) {
+  void sum_keyframe(std::int64_t list, Block<D>& block, Column<D>& gradient) {
     constexpr int kRows = kDepth ? 3 : 2;
     V8 h[D * (D + 1) / 2] = {}, g[D] = {};
-    for (std::int64_t first = l_.keyframe_seen[k]; first < l_.keyframe_seen[k + 1]; first += kLanes) {
+    for (std::int64_t first = l_.keyframe_seen[list]; first < l_.keyframe_seen[list + 1]; first += kLanes) {
       V8 j[3][D], r[3];
       load_rows<kDepth>(first, j, r);
       int t = 0;
@@ -224,12 +248,11 @@ class Equations : public AtPoints {
           for (int row = 0; row < kRows; ++row) h[t] += j[row][m] * j[row][n];
       }
     }
-    Block<D>& block = b[k];
     clear(&block, 1);
-    clear(&gradient_c[k], 1);
+    clear(&gradient, 1);
     int t = 0;
     for (int m = 0; m < D; ++m) {
-      set(gradient_c[k], m, sum(g[m]));
+      set(gradient, m, sum(g[m]));
       for (int n = 0; n <= m; ++n, ++t) {
         const double value = sum(h[t]);
         set_entry(block, m, n, value);
@@ -281,6 +304,8 @@ class Equations : public AtPoints {
   }
   const Layout& l_;
   std::vector<double> part_;
+  Buffer<Block<D>> part_b_;  // by part, if there are several
+  Buffer<Column<D>> part_gradient_;
   AtPoints ahead_;
 };
 

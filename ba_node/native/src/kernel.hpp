@@ -218,14 +218,10 @@ class Kernel {
         coupling_.add_coupling(i, p, y);
       }
     });
-    for (std::int64_t k = 0; k < l_.n_free; ++k) {
-      Column<D> y = multiply(equations_.b[k], coupling_.step(k));
-      for (std::int64_t chunk = 0; chunk < l_.n_chunks(); ++chunk) {
-        y.a -= sums_[chunk * l_.n_free + k].a;
-        if constexpr (D == 9) y.b -= sums_[chunk * l_.n_free + k].b;
-      }
-      for (int i = 0; i < D; ++i) out[k * D + i] = at(y, i) + damping_c_[k * D + i] * x[k * D + i];
-    }
+    each_sum([&](std::int64_t k, const Column<D>& sum) {
+      const Column<D> y = multiply(equations_.b[k], coupling_.step(k));
+      for (int i = 0; i < D; ++i) out[k * D + i] = at(y, i) - at(sum, i) + damping_c_[k * D + i] * x[k * D + i];
+    });
   }
 
   void diagonal_blocks(double* out) {
@@ -325,11 +321,10 @@ class Kernel {
       }
     });
     // -gc + Z L^-1 gp.
-    for (std::int64_t k = 0; k < l_.n_free; ++k) {
-      rhs_[k].a = -equations_.gradient_c[k].a;
-      if constexpr (D == 9) rhs_[k].b = -equations_.gradient_c[k].b;
-    }
-    add_sums(rhs_.data());
+    each_sum([&](std::int64_t k, const Column<D>& sum) {
+      rhs_[k].a = sum.a - equations_.gradient_c[k].a;
+      if constexpr (D == 9) rhs_[k].b = sum.b - equations_.gradient_c[k].b;
+    });
   }
 
   // L^-1 and y = L^-1 gp of a batch; adds Z y to `sums`.
@@ -380,13 +375,16 @@ class Kernel {
     for (int c = 0; c < D; ++c) set_entry(block, c, c, entry(block, c, c) + damping_c_[k * D + c]);
   }
 
-  void add_sums(Column<D>* out) const {
-    for (std::int64_t chunk = 0; chunk < l_.n_chunks(); ++chunk) {
-      for (std::int64_t k = 0; k < l_.n_free; ++k) {
-        out[k].a += sums_[chunk * l_.n_free + k].a;
-        if constexpr (D == 9) out[k].b += sums_[chunk * l_.n_free + k].b;
+  // Call put(k, sum) for each free keyframe with the sum of what the chunks have for it in sums_.
+  template <class Put>
+  void each_sum(Put put) {
+    pool_.each(kSumPieces, [&](std::int64_t piece, int) {
+      for (std::int64_t k = l_.n_free * piece / kSumPieces; k < l_.n_free * (piece + 1) / kSumPieces; ++k) {
+        Column<D> sum = sums_[k];
+        for (std::int64_t chunk = 1; chunk < l_.n_chunks(); ++chunk) add(sum, sums_[chunk * l_.n_free + k]);
+        put(k, sum);
       }
-    }
+    });
   }
 
   Polished total() const {
@@ -397,6 +395,8 @@ class Kernel {
     }
     return out;
   }
+
+  static constexpr std::int64_t kSumPieces = 8;
 
   double damping_cost_ = 0;
 

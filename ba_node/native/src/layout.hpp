@@ -71,22 +71,27 @@ class Layout {
   // The same by keyframe: edges_of_keyframe[keyframe_edge[k]] to [keyframe_edge[k + 1]].
   Buffer<std::int64_t> keyframe_edge;
   Buffer<std::int32_t> edges_of_keyframe;
-  // Observations (8 slot + lane) by free keyframe, filled up to whole registers by one after the last; and where the x
-  // of their points stand in registers by batch (three each).
+  // Observations (8 slot + lane) by free keyframe, those of keyframe k in quarter q (or all, if there are few) from
+  // keyframe_seen[q n_free + k] on, filled up to whole registers by one after the last; and where the x of their points
+  // stand in registers by batch (three each).
   Buffer<std::int64_t> keyframe_seen;
   Buffer<std::int32_t> seen, seen_point;
   // The caller's number of each free keyframe.
   Buffer<std::int64_t> free_keyframe;
   // Images: distinct keyframe * n_cameras + camera.
   Buffer<std::int64_t> images;
-  // Parts of the batches, about equal, that can be worked on at the same time; the problem alone decides them.
-  Buffer<std::int64_t> chunks;
+  // Parts of the batches that can be worked on at the same time; the problem alone decides them. Quarters take about as
+  // long as one another in all that is done (a small problem has one part alone), chunks are about equal parts of them.
+  Buffer<std::int64_t> quarters, chunks;
   Buffer<double> camera_rotation, camera_translation, params;
   Buffer<std::uint8_t> model;
 
   std::int64_t n_slots() const { return slot_begin.back(); }
   std::int64_t n_edges() const { return static_cast<std::int64_t>(edge_column.size()); }
   std::int64_t n_chunks() const { return static_cast<std::int64_t>(chunks.size()) - 1; }
+  std::int64_t n_quarters() const { return static_cast<std::int64_t>(quarters.size()) - 1; }
+  // In how many parts the observations of each keyframe are listed.
+  std::int64_t n_seen_parts() const { return n_obs >= kSeenTogether * n_free ? n_quarters() : 1; }
   // Lanes of a batch that are points, not padding.
   int lanes(std::int64_t batch) const {
     return static_cast<int>(std::min<std::int64_t>(kLanes, n_points - kLanes * batch));
@@ -95,7 +100,11 @@ class Layout {
  private:
   // Up to this many (keyframe, camera) pairs images are numbered by a table, beyond it by searching.
   static constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
-  static constexpr std::int64_t kMaxChunks = 32, kMinChunkSlots = 64;
+  static constexpr std::int64_t kQuarters = 4, kMaxChunks = 32, kMinChunkSlots = 32;
+  // Batches are dealt to quarters in so many runs of neighbours at most, which meet the same keyframes.
+  static constexpr std::int64_t kMaxRuns = 256;
+  // Observations a keyframe up to which its list is not cut: each piece of it is filled up to a whole register.
+  static constexpr std::int64_t kSeenTogether = 128;
 
   Buffer<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
   Buffer<std::int32_t> table_;   // image of each (keyframe, camera), if there are few
@@ -164,6 +173,7 @@ class Layout {
     for (std::int64_t i = 0; i < n_points; ++i) ++place[most - begin[i + 1] + 1];
     std::partial_sum(place.begin(), place.end(), place.begin());
     for (std::int32_t i : by_keyframe) point[place[most - begin[i + 1]]++] = i;
+    deal_batches();
     for (std::int64_t i = n_points; i < kLanes * n_batches; ++i) point[i] = point[n_points - 1];
     slot_begin.assign(n_batches + 1, 0);
     for (std::int64_t b = 0; b < n_batches; ++b) slot_begin[b + 1] = slot_begin[b] + begin[point[kLanes * b] + 1];
@@ -174,6 +184,24 @@ class Layout {
       first[2 * i + 1] = begin[point[i] + 1] - begin[point[i]];
     }
     return first;
+  }
+
+  // Cut the batches into quarters that have as many points of many observations as one another. The last batch, which may
+  // be incomplete, stays the last.
+  void deal_batches() {
+    quarters.push_back(0);
+    const std::int64_t whole = n_points / kLanes, run = std::max<std::int64_t>(1, whole / kMaxRuns);
+    if (n_obs >= kQuarters * kMinChunkSlots * kLanes) {
+      Buffer<std::int32_t> dealt;
+      dealt.reserve(point.size());
+      for (std::int64_t quarter = 0; quarter < kQuarters; ++quarter) {
+        for (std::int64_t first = quarter * run; first < whole; first += kQuarters * run)
+          dealt.insert(dealt.end(), point.begin() + kLanes * first, point.begin() + kLanes * std::min(whole, first + run));
+        if (quarter + 1 < kQuarters) quarters.push_back(static_cast<std::int64_t>(dealt.size()) / kLanes);
+      }
+      std::copy(dealt.begin(), dealt.end(), point.begin());
+    }
+    quarters.push_back(n_batches);
   }
 
   std::int64_t image_key(const ProblemView& p, std::int64_t o) const { return p.keyframe[o] * n_cameras + p.camera[o]; }
@@ -270,35 +298,42 @@ class Layout {
   }
 
   void list_seen() {
-    const auto each = [this](auto take) {
-      for (std::int64_t b = 0; b < n_batches; ++b)
-        for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at)
-          if (inverse_sigma[at] != 0.0) take(column_[images[slot_image[at]] / n_cameras], at, 3 * kLanes * b + at % kLanes);
+    const std::int64_t parts = n_seen_parts(), lists = parts * n_free;
+    // take(list, observation, where its point is)
+    const auto each = [this, parts](auto take) {
+      for (std::int64_t part = 0; part < parts; ++part)
+        for (std::int64_t b = quarters[part]; b < (parts > 1 ? quarters[part + 1] : n_batches); ++b)
+          for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at) {
+            if (inverse_sigma[at] == 0.0) continue;
+            const std::int64_t k = column_[images[slot_image[at]] / n_cameras];
+            if (k >= 0) take(part * n_free + k, at, 3 * kLanes * b + at % kLanes);
+          }
     };
-    keyframe_seen.assign(n_free + 1, 0);
-    each([this](std::int32_t k, std::int64_t, std::int64_t) {
-      if (k >= 0) ++keyframe_seen[k + 1];
-    });
-    for (std::int64_t k = 0; k < n_free; ++k)
-      keyframe_seen[k + 1] = keyframe_seen[k] + (keyframe_seen[k + 1] + kLanes - 1) / kLanes * kLanes;
-    seen.assign(keyframe_seen[n_free], static_cast<std::int32_t>(kLanes * n_slots()));
+    keyframe_seen.assign(lists + 1, 0);
+    each([this](std::int64_t list, std::int64_t, std::int64_t) { ++keyframe_seen[list + 1]; });
+    for (std::int64_t i = 0; i < lists; ++i)
+      keyframe_seen[i + 1] = keyframe_seen[i] + (keyframe_seen[i + 1] + kLanes - 1) / kLanes * kLanes;
+    seen.assign(keyframe_seen[lists], static_cast<std::int32_t>(kLanes * n_slots()));
     seen_point.assign(seen.size(), 0);
     Buffer<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
-    each([this, &next](std::int32_t k, std::int64_t at, std::int64_t x) {
-      if (k < 0) return;
-      seen[next[k]] = static_cast<std::int32_t>(at);
-      seen_point[next[k]++] = static_cast<std::int32_t>(x);
+    each([this, &next](std::int64_t list, std::int64_t at, std::int64_t x) {
+      seen[next[list]] = static_cast<std::int32_t>(at);
+      seen_point[next[list]++] = static_cast<std::int32_t>(x);
     });
   }
 
   void cut_chunks() {
-    const std::int64_t count = std::clamp<std::int64_t>(n_slots() / kMinChunkSlots, 1, kMaxChunks);
+    const std::int64_t most = kMaxChunks / n_quarters(), least = n_quarters() * kMinChunkSlots;
+    const std::int64_t count = n_quarters() == 1 ? 1 : std::clamp<std::int64_t>(n_slots() / least, 1, most);
     chunks.push_back(0);
-    for (std::int64_t i = 1; i <= count; ++i) {
-      const auto end = std::lower_bound(slot_begin.begin(), slot_begin.end(), n_slots() * i / count);
-      chunks.push_back(std::max<std::int64_t>(chunks.back(), end - slot_begin.begin()));
+    for (std::int64_t quarter = 0; quarter < n_quarters(); ++quarter) {
+      const std::int64_t first = slot_begin[quarters[quarter]], slots = slot_begin[quarters[quarter + 1]] - first;
+      for (std::int64_t i = 1; i <= count; ++i) {
+        const auto end = std::lower_bound(slot_begin.begin(), slot_begin.end(), first + slots * i / count);
+        chunks.push_back(std::max<std::int64_t>(chunks.back(), end - slot_begin.begin()));
+      }
+      chunks.back() = quarters[quarter + 1];
     }
-    chunks.back() = n_batches;
   }
 };
 

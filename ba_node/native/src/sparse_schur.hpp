@@ -98,8 +98,9 @@ class SparseSchur {
   }
 
  private:
-  // Groups of points are summed apart, each by one thread, and then added in turn: the problem alone decides how many.
-  static constexpr std::int64_t kMaxGroups = 4, kPieces = 16;
+  // Groups of points (quarters, halves or all) are summed apart, each by one thread, and then added in turn: the problem
+  // alone decides how many.
+  static constexpr std::int64_t kPieces = 16;
   // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
   static constexpr std::int64_t kWorkOfBlock = 200, kGroupBytes = 20 << 20;
   // Z of as many points as stay in the nearer caches.
@@ -111,26 +112,15 @@ class SparseSchur {
   std::int64_t n_blocks() const { return static_cast<std::int64_t>(pattern_.index.size()); }
   std::int64_t groups() const { return static_cast<std::int64_t>(cut_.size()) - 1; }
 
-  // Where groups begin, as batches, with about as much work in each: Z of an edge takes as long as a pair and a half.
+  // Where groups begin, as batches. Z of an edge takes as long as a pair and a half.
   void cut_points() {
-    const auto work = [this](std::int64_t batch) {
-      std::int64_t twice = 0;
-      for (std::int32_t e = l_.point_edge[kLanes * batch]; e < l_.point_edge[kLanes * (batch + 1)]; ++e)
-        twice += 3 + 2 * (l_.edge_end[e] - e);
-      return twice;
-    };
-    std::int64_t all = 0, done = 0;
-    for (std::int64_t i = 0; i < l_.n_batches; ++i) all += work(i);
+    std::int64_t twice = 0;
+    for (std::int64_t e = 0; e < l_.n_edges(); ++e) twice += 3 + 2 * (l_.edge_end[e] - e);
     const std::int64_t n = std::max<std::int64_t>(n_blocks(), 1);
     const std::int64_t fit = kGroupBytes / (n * static_cast<std::int64_t>(sizeof(Block<D>)));
-    const std::int64_t count = std::clamp<std::int64_t>(std::min(1 + all / (kWorkOfBlock * n), fit), 1, kMaxGroups);
-    cut_.push_back(0);
-    for (std::int64_t i = 0; i < l_.n_batches; ++i) {
-      done += work(i);
-      const std::int64_t next = static_cast<std::int64_t>(cut_.size());
-      if (next < count && done * count >= all * next) cut_.push_back(i + 1);
-    }
-    cut_.push_back(l_.n_batches);
+    const std::int64_t most = std::min({1 + twice / (kWorkOfBlock * n), fit, l_.n_quarters()});
+    const std::int64_t count = most >= 4 ? 4 : most >= 2 ? 2 : 1;
+    for (std::int64_t i = 0; i <= count; ++i) cut_.push_back(l_.quarters[i * l_.n_quarters() / count]);
   }
 
   // Cut groups into stretches, and put the edges of each in the order of their rows: a row stays in the nearest cache
