@@ -90,30 +90,27 @@ def case_problem(case: Case) -> Problem:
     fixed = np.arange(problem.n_keyframes) < case.n_fixed
     if case.size == 9:
         return replace(problem, fixed=fixed)
+    start, cameras, observations = problem.start, problem.cameras, problem.observations
     intrinsics = case.bal.cameras[:, 6:]
-    if (intrinsics == intrinsics[:1]).all():
-        own, camera_of = intrinsics[:1], np.zeros(len(intrinsics), dtype=np.intp)
-    else:
+    own = intrinsics[:1]
+    if not (intrinsics == own).all():
         own, camera_of = np.unique(intrinsics, axis=0, return_inverse=True)
+        observations = replace(observations, camera=camera_of.reshape(-1)[observations.keyframe].astype(np.intp))
+        cameras = replace(
+            cameras,
+            rotation=np.repeat(cameras.rotation, len(own), axis=0),
+            translation=np.repeat(cameras.translation, len(own), axis=0),
+            model=np.repeat(cameras.model, len(own)),
+        )
     params = np.zeros((len(own), 12))
     params[:, 0] = params[:, 1] = own[:, 0]
     params[:, 4:6] = own[:, 1:]
-    one = problem.cameras
-    start = problem.start
     return replace(
         problem,
         start=State(start.rotation, start.translation, start.points, np.empty((0, 3))),
         fixed=fixed,
-        cameras=replace(
-            one,
-            rotation=np.repeat(one.rotation, len(own), axis=0),
-            translation=np.repeat(one.translation, len(own), axis=0),
-            model=np.repeat(one.model, len(own)),
-            params=params,
-        ),
-        observations=replace(
-            problem.observations, camera=camera_of.reshape(-1)[problem.observations.keyframe].astype(np.intp)
-        ),
+        cameras=replace(cameras, params=params),
+        observations=observations,
     )
 
 

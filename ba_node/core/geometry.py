@@ -67,14 +67,11 @@ def right_jacobian(phi: FloatArray) -> FloatArray:
 
 def _sinc_terms(angle2: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``sin(t)/t`` and ``(1 - cos t)/t^2`` for ``angle2 = t^2``."""
-    small = angle2 < _SMALL**2
-    t2 = np.where(small, 1.0, angle2)
-    t = np.sqrt(t2)
-    half = np.sin(0.5 * t)
-    a = np.where(small, 1.0 - angle2 / 6.0, np.sin(t) / t)
+    # Neither loses digits however small t is, as long as it is not zero.
+    t = np.sqrt(angle2 + 1e-300)
     # 2 sin^2(t/2) instead of 1 - cos t: no cancellation.
-    b = np.where(small, 0.5 - angle2 / 24.0, 2.0 * half * half / t2)
-    return a, b
+    half = np.sin(0.5 * t) / t
+    return np.sin(t) / t, 2.0 * half * half
 
 
 def _third_term(angle2: FloatArray) -> FloatArray:
