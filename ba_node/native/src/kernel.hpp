@@ -179,7 +179,7 @@ class Kernel {
 
   // Solve S x = rhs by sparse Cholesky, after analyse; false if S is not positive definite.
   bool solve_sparse(double* x) {
-    if (!factor_->factor(assemble().blocks(), pool_)) return false;
+    if (!factor_->factor(assemble().blocks())) return false;
     rhs(x);
     factor_->solve(x);
     return true;

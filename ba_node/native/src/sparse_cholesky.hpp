@@ -15,7 +15,6 @@
 
 #include "block_fill.hpp"
 #include "blocks.hpp"
-#include "pool.hpp"
 #include "simd.hpp"
 
 namespace ba {
@@ -40,23 +39,17 @@ class SparseCholesky {
 
   // Factor; s: blocks of the upper triangle in the order of the pattern. False if it is not positive definite.
   //
-  // Threads share the rows of a long column. A row is always the same thread's, so that what the columns before take
-  // from it is in its own cache.
-  bool factor(const Block<D>* s, Pool& pool) {
+  // On one thread: columns follow one another, and what two threads gain in one they lose in handing it over.
+  bool factor(const Block<D>* s) {
     const std::int64_t n = static_cast<std::int64_t>(diagonal_.size());
     for (std::int64_t j = 0; j < n; ++j) {
-      const std::int64_t begin = fill_.below.start[j], end = fill_.below.start[j + 1];
-      for (std::int64_t k = begin; k < end; ++k) target_[fill_.below.index[k]] = static_cast<std::int32_t>(k);
+      for (std::int64_t k = fill_.below.start[j]; k < fill_.below.start[j + 1]; ++k)
+        target_[fill_.below.index[k]] = static_cast<std::int32_t>(k);
       load_diagonal(j, s);
       for (std::int64_t r = rows_.start[j]; r < rows_.start[j + 1]; ++r)
         subtract_transposed(diagonal_[j], column_[rows_.index[r]], column_[rows_.index[r]]);
       if (!factor_diagonal(diagonal_[j], inverse_[j])) return false;
-      const bool is_long = (rows_.start[j + 1] - rows_.start[j]) * (end - begin) > kShared;
-      if (is_long && pool.threads() > 1) {
-        pool.each(pool.threads(), [&](std::int64_t part, int) { finish_rows<false>(j, s, part, pool.threads()); });
-      } else {
-        finish_rows<true>(j, s, 0, 1);
-      }
+      finish_rows(j, s);
     }
     return true;
   }
@@ -82,9 +75,6 @@ class SparseCholesky {
   }
 
  private:
-  // From so many products in a column on threads share its rows.
-  static constexpr std::int64_t kShared = 48;
-
   struct Source {
     std::int64_t block;
     std::int32_t target;  // place in the column, -1 for the diagonal
@@ -145,24 +135,19 @@ class SparseCholesky {
       if (sources_[k].target < 0) diagonal_[j] = s[sources_[k].block];
   }
 
-  // Every parts-th row of the factor's column j, below the diagonal.
-  template <bool kAll>
-  void finish_rows(std::int64_t j, const Block<D>* s, std::int64_t part, std::int64_t parts) {
-    const auto is_own = [&](std::int64_t k) { return kAll || fill_.below.index[k] % parts == part; };
+  // The factor's column j below the diagonal.
+  void finish_rows(std::int64_t j, const Block<D>* s) {
     const std::int64_t begin = fill_.below.start[j], end = fill_.below.start[j + 1];
-    for (std::int64_t k = begin; k < end; ++k)
-      if (is_own(k)) clear(&column_[k], 1);
+    clear(column_.data() + begin, end - begin);
     for (std::int64_t k = source_start_[j]; k < source_start_[j + 1]; ++k)
-      if (sources_[k].target >= 0 && is_own(sources_[k].target))
-        copy(s[sources_[k].block], sources_[k].turned, column_[sources_[k].target]);
+      if (sources_[k].target >= 0) copy(s[sources_[k].block], sources_[k].turned, column_[sources_[k].target]);
     for (std::int64_t r = rows_.start[j]; r < rows_.start[j + 1]; ++r) {
       const std::int64_t at = rows_.index[r], last = row_end_[r];
       const Block<D> own = column_[at];
       for (std::int64_t k = at + 1; k < last; ++k)
-        if (is_own(k)) subtract_transposed(column_[target_[fill_.below.index[k]]], column_[k], own);
+        subtract_transposed(column_[target_[fill_.below.index[k]]], column_[k], own);
     }
     for (std::int64_t k = begin; k < end; ++k) {
-      if (!is_own(k)) continue;
       const Block<D> c = column_[k];
       clear(&column_[k], 1);
       subtract_transposed(column_[k], c, inverse_[j]);  // of the negative inverse

@@ -102,7 +102,7 @@ class SparseSchur {
   // alone decides how many.
   static constexpr std::int64_t kPieces = 16;
   // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
-  static constexpr std::int64_t kWorkOfBlock = 200, kGroupBytes = 20 << 20;
+  static constexpr std::int64_t kWorkOfBlock = 200, kGroupBytes = 20 << 20, kGroupBytesOfObservation = 32;
   // Z of as many points as stay in the nearer caches.
   static constexpr std::int64_t kStretchBytes = 256 << 10;
 
@@ -117,7 +117,8 @@ class SparseSchur {
     std::int64_t twice = 0;
     for (std::int64_t e = 0; e < l_.n_edges(); ++e) twice += 3 + 2 * (l_.edge_end[e] - e);
     const std::int64_t n = std::max<std::int64_t>(n_blocks(), 1);
-    const std::int64_t fit = kGroupBytes / (n * static_cast<std::int64_t>(sizeof(Block<D>)));
+    const std::int64_t most_bytes = std::max(kGroupBytes, kGroupBytesOfObservation * l_.n_obs);
+    const std::int64_t fit = most_bytes / (n * static_cast<std::int64_t>(sizeof(Block<D>)));
     const std::int64_t most = std::min({1 + twice / (kWorkOfBlock * n), fit, l_.n_quarters()});
     const std::int64_t count = most >= 4 ? 4 : most >= 2 ? 2 : 1;
     for (std::int64_t i = 0; i <= count; ++i) cut_.push_back(l_.quarters[i * l_.n_quarters() / count]);
