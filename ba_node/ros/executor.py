@@ -49,8 +49,10 @@ class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is no
         self._has_events = False
         self._next_events_s = clock()
         self._spinning: int | None = None
-        self._guard.destroy()
-        self._guard = _Alarm(self._knows, self._context)
+        # A version of rclpy that is made otherwise waits twice a callback, as it does by itself.
+        if isinstance(getattr(self, "_guard", None), GuardCondition) and hasattr(self, "_tasks"):
+            self._guard.destroy()
+            self._guard = _Alarm(self._knows, self._context)
 
     def spin_once(self, timeout_sec: float | None = EVENT_PERIOD_S) -> None:
         """Wait for a callback and run it."""

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.task import Future
@@ -153,3 +154,29 @@ def test_a_coroutine_that_waits_is_looked_at_after_every_callback(spun: Spun, al
     assert alarms
     future.set_result(None)
     spun.until(lambda: done)
+
+
+@pytest.mark.usefixtures("domain")
+def test_an_rclpy_made_otherwise_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = SingleThreadedExecutor.__init__
+
+    def other(self: Any, **kwargs: Any) -> None:
+        plain(self, **kwargs)
+        self._guard = Alien(self._guard)
+
+    class Alien:
+        def __init__(self, inner: Any) -> None:
+            self.inner = inner
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.inner, name)
+
+    monkeypatch.setattr(SingleThreadedExecutor, "__init__", other)
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    executor = NodeExecutor(context)
+    try:
+        assert isinstance(executor._guard, Alien)
+    finally:
+        executor.shutdown()
+        rclpy.try_shutdown(context=context)
