@@ -55,12 +55,7 @@ class Kernel {
 
   std::int64_t n_free() const { return l_.n_free; }
   std::int64_t n_edges() const { return l_.n_edges(); }
-  // Pairs of edges of a point, each edge with itself too: what S is summed from.
-  std::int64_t n_pairs() const {
-    std::int64_t total = 0;
-    for (std::int64_t e = 0; e < l_.n_edges(); ++e) total += l_.edge_end[e] - e;
-    return total;
-  }
+  std::int64_t n_pairs() const { return l_.n_pairs(); }
   std::int64_t n_points() const { return l_.n_points; }
   std::int64_t n_chunks() const { return l_.n_chunks(); }
   double gradient_norm() const { return equations_.gradient_norm; }

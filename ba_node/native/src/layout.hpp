@@ -88,6 +88,12 @@ class Layout {
 
   std::int64_t n_slots() const { return slot_begin.back(); }
   std::int64_t n_edges() const { return static_cast<std::int64_t>(edge_column.size()); }
+  // Pairs of edges of a point, each edge with itself too: what S is summed from.
+  std::int64_t n_pairs() const {
+    std::int64_t total = 0;
+    for (std::int64_t e = 0; e < n_edges(); ++e) total += edge_end[e] - e;
+    return total;
+  }
   std::int64_t n_chunks() const { return static_cast<std::int64_t>(chunks.size()) - 1; }
   std::int64_t n_quarters() const { return static_cast<std::int64_t>(quarters.size()) - 1; }
   // In how many parts the observations of each keyframe are listed.

@@ -114,8 +114,7 @@ class SparseSchur {
 
   // Where groups begin, as batches. Z of an edge takes as long as a pair and a half.
   void cut_points() {
-    std::int64_t twice = 0;
-    for (std::int64_t e = 0; e < l_.n_edges(); ++e) twice += 3 + 2 * (l_.edge_end[e] - e);
+    const std::int64_t twice = 3 * l_.n_edges() + 2 * l_.n_pairs();
     const std::int64_t n = std::max<std::int64_t>(n_blocks(), 1);
     const std::int64_t most_bytes = std::max(kGroupBytes, kGroupBytesOfObservation * l_.n_obs);
     const std::int64_t fit = most_bytes / (n * static_cast<std::int64_t>(sizeof(Block<D>)));
