@@ -19,7 +19,6 @@
 #include <functional>
 #include <memory>
 #include <mutex>
-#include <system_error>
 #include <thread>
 #include <utility>
 #include <vector>
@@ -40,11 +39,14 @@ class Worker {
       if (CPU_COUNT(&others) > 0) pthread_attr_setaffinity_np(&attributes, sizeof(others), &others);
     }
 #endif
-    const int error = pthread_create(&thread_, &attributes, &Worker::run, this);
+    // Anywhere, if the other cores have been taken away meanwhile. With no thread at all the pool does without it.
+    runs_ = pthread_create(&thread_, &attributes, &Worker::run, this) == 0 ||
+            pthread_create(&thread_, nullptr, &Worker::run, this) == 0;
     pthread_attr_destroy(&attributes);
-    if (error != 0) throw std::system_error(error, std::generic_category(), "no thread for the kernels");
   }
-  ~Worker() { pthread_join(thread_, nullptr); }
+  ~Worker() {
+    if (runs_) pthread_join(thread_, nullptr);
+  }
   Worker(const Worker&) = delete;
   Worker& operator=(const Worker&) = delete;
 
@@ -63,7 +65,8 @@ class Worker {
 #if defined(__linux__)
   cpu_set_t cores_{};
 #endif
-  pthread_t thread_;
+  pthread_t thread_{};
+  bool runs_ = false;
 };
 
 class Pool {
