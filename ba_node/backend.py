@@ -300,6 +300,7 @@ class Backend:
             newest_keyframe_id=newest,
             method=self.config.solver.method,
             rejected=dict(sorted(self.rejected.items())),
+            warnings=tuple(self.scene.log.warnings.values()),
         )
 
     def _estimate(self, refined: IntArray) -> Estimate:

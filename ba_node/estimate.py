@@ -73,6 +73,7 @@ class SolveReport:
     newest_keyframe_id: int = 0
     status: Status = Status.SKIPPED
     reason: str = ""
+    warnings: tuple[str, ...] = ()
     method: str = ""
     iterations: int = 0
     accepted_iterations: int = 0
@@ -87,6 +88,13 @@ class SolveReport:
     landmarks: int = 0
     observations: int = 0
     outliers: int = 0
+    inlier_share: float = 0.0
+    parallax_deg: float = 0.0
+    held_out_px_before: float = 0.0
+    held_out_px_after: float = 0.0
+    weakest_m: float = 0.0
+    weakest_rad: float = 0.0
+    held_keyframes: int = 0
     rejected: Mapping[str, int] = field(default_factory=dict)
     solve_time_s: float = 0.0
     queue_wait_s: float = 0.0

@@ -69,7 +69,7 @@ def build_parser(command: str | None) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; return its exit code: 0, 2 for wrong input, 130 when interrupted."""
+    """Run a command; return its exit code: 0, 2 for wrong input, 3 if results need a look, 130 when interrupted."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = next((word for word in arguments if not word.startswith("-")), "")
     args = build_parser(command).parse_args(arguments)

@@ -5,6 +5,10 @@
 Writes into DIR: trajectory.tum, trajectory_input.tum (the front-end's), points.ply, refined.mcap (the node's output
 topics), report.json, effective.yaml (all parameters), and ground_truth.tum if the recording has a ground truth.
 Older sessions of the recording go to DIR/session_<id>/.
+
+Exit code: 0 all is well, 2 nothing was written, 3 written, but something has to be looked at: input that was turned
+away, solutions that were not taken, a set-up that looks wrong. Each is said in a line of its own and under "attention"
+in report.json.
 """
 
 from __future__ import annotations
@@ -19,6 +23,9 @@ from typing import Any
 from ba_node.cli.console import facts, progress_bar, require_folder
 
 SUMMARY = "run the back-end on a recording, without a middleware"
+# Results were written, and something in them has to be looked at.
+ATTENTION = 3
+
 EXAMPLE = "ba replay bags/stereo_loop.mcap --out out/replay --set window.max_keyframes=30"
 
 _ERRORS = (
@@ -64,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     print(facts(_rows(report)))
     _tell(report)
     print(f"written to {args.out}")
-    return 0
+    return ATTENTION if report["attention"] else 0
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -96,7 +103,9 @@ def _rejected(report: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _tell(report: Mapping[str, Any]) -> None:
-    """Print the last rejection in words; all of them are in report.json."""
+    """Print what has to be looked at, and the last rejection in words; all of them are in report.json."""
+    for line in report["attention"]:
+        print(f"ba: warning: {line}", file=sys.stderr)
     notes = [*report["bag_notes"], *report["rejection_notes"]]
     if notes:
         print(f"ba: {notes[-1]}{' (more in report.json)' if len(notes) > 1 else ''}", file=sys.stderr)

@@ -18,6 +18,7 @@ class Status(enum.IntEnum):
     STALLED = 2
     SKIPPED = 3
     FAILED = 4
+    HELD = 5
 
     @property
     def usable(self) -> bool:

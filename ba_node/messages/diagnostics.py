@@ -176,8 +176,12 @@ def _solver(health: Health, limits: DiagnosticsConfig) -> Finding:
             "observations": str(report.observations),
         },
     )
+    for warning in report.warnings:
+        found.find(Level.WARN, warning)
     if report.status is Status.FAILED:
         found.find(Level.ERROR, f"the last solve failed: {report.reason}")
+    elif report.status is Status.HELD:
+        found.find(Level.WARN, f"the last solution was not taken: {report.reason}")
     elif report.status is Status.SKIPPED:
         found.find(Level.WARN, f"the last solve was skipped: {report.reason}")
     else:

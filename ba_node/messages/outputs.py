@@ -108,5 +108,5 @@ def _report(factory: MessageFactory, estimate: Estimate) -> Any:
         header=header_message(factory, estimate.stamp_ns, estimate.frame_id),
         rejected_reason=reasons,
         rejected_count=factory.array(np.array([report.rejected[reason] for reason in reasons], dtype=np.uint64)),
-        **(fields | {"status": int(report.status)}),
+        **(fields | {"status": int(report.status), "warnings": list(report.warnings)}),
     )

@@ -29,6 +29,7 @@ from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.messages.conversion import output_messages
+from ba_node.offline.attention import attention
 from ba_node.offline.recording import read_truth
 from ba_node.offline.session_record import SessionRecord
 from ba_node.scene.scene import Scene
@@ -110,6 +111,7 @@ def replay(
         report = {"bag": bag.name, **_write(out, run.sessions, truth)}
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
+        report["attention"] = attention(report)
     if options.save is not None:
         write_map(options.save, run.backend.snapshot())
     with whole_file(out / "effective.yaml") as stream:

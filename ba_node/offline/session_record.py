@@ -71,6 +71,7 @@ class SessionRecord:
             "rejected": dict(sorted(scene.log.rejected.items())),
             "notices": dict(sorted(scene.log.notices.items())),
             "rejection_notes": list(scene.log.notes),
+            "warnings": dict(scene.log.warnings),
         }
 
     @property

@@ -99,4 +99,8 @@ class Publishing(Component):
         ):
             log = self.host.node.get_logger()
             text = f"keyframe {report.newest_keyframe_id} was not refined: {report.reason}"
-            (log.info if report.status is Status.SKIPPED else log.warning)(text)
+            # Two call sites, as rclpy remembers the severity of each and refuses another.
+            if report.status is Status.SKIPPED:
+                log.info(text)
+            else:
+                log.warning(text)

@@ -32,6 +32,12 @@ NOTICES: dict[str, str] = {
     "repeated_guess": "A second guess for a track; the first one stays.",
 }
 
+# What somebody has to know or mend: kind -> what it is about. Said on the terminal, in report.json, on /diagnostics and
+# in ba_msgs/SolverReport; a replay that has any ends with another exit code than 0.
+WARNINGS: dict[str, str] = {
+    "held": "Solutions that were found and not taken; the front-end's poses stand.",
+}
+
 NOTES_KEPT = 50
 
 
@@ -42,6 +48,7 @@ class RejectionLog:
         rejected: what was turned away; keys from REASONS. Whole messages count as one, observations one by one.
         notices: what was unusual but used; keys from NOTICES.
         notes: the last cases in words, oldest first.
+        warnings: the newest case of each kind in words; keys from WARNINGS.
     """
 
     def __init__(self) -> None:
@@ -49,6 +56,7 @@ class RejectionLog:
         self.rejected: Counter[str] = Counter()
         self.notices: Counter[str] = Counter()
         self.notes: deque[str] = deque(maxlen=NOTES_KEPT)
+        self.warnings: dict[str, str] = {}
 
     def reject(self, reason: str, what: str, count: int = 1) -> None:
         """Count a rejection; ``what`` names the first case: thing, id, value, what was expected."""
@@ -62,3 +70,8 @@ class RejectionLog:
         assert kind in NOTICES, kind
         if count:
             self.notices[kind] += count
+
+    def warn(self, kind: str, text: str) -> None:
+        """Keep a warning: what is wrong, which value, and what to do; it replaces an earlier one of its kind."""
+        assert kind in WARNINGS, kind
+        self.warnings[kind] = text

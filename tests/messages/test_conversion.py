@@ -255,6 +255,7 @@ def test_report_carries_every_field(estimate: Estimate, report: SolveReport) -> 
     names = {f.name for f in dataclasses.fields(SolveReport)} - {"rejected"}
     values = {name: getattr(report, name) for name in names}
     assert len({(type(v), v) for v in values.values()}) >= len(values) - 2, "values too alike to tell fields apart"
+    values["warnings"] = list(report.warnings)
     for name in names:
         assert getattr(message, name) == values[name], name
     assert type(message.status) is int
@@ -263,7 +264,7 @@ def test_report_carries_every_field(estimate: Estimate, report: SolveReport) -> 
     assert vars(message).keys() == names | {"type_name", "header", "rejected_reason", "rejected_count"}
 
 
-@pytest.mark.parametrize("status", [Status.FAILED, Status.SKIPPED])
+@pytest.mark.parametrize("status", [Status.FAILED, Status.SKIPPED, Status.HELD])
 def test_a_failed_solve_gives_the_report_only(estimate: Estimate, status: Status) -> None:
     failed = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, status=status))
     out = outputs(failed, OutputConfig())

@@ -1,0 +1,35 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Say what somebody has to look at after a replay; with anything of it the command ends with a code of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# What arrives twice changes nothing.
+_HARMLESS = ("duplicate_keyframe", "duplicate_observation")
+
+
+def attention(report: Mapping[str, Any]) -> list[str]:
+    """Return what a user has to know, one sentence each; empty when all is well.
+
+    Args:
+        report: the content of report.json: warnings, solves that gave nothing, and what was turned away, of the newest
+            session and of the older ones.
+    """
+    lines: list[str] = [*report.get("bag_warnings", {}).values()]
+    for session in (*report["older_sessions"], report):
+        lines += session["warnings"].values()
+        of = f"session {session['session_id']}: " if report["older_sessions"] else ""
+        for name in ("FAILED", "HELD"):
+            count = session["solves_by_status"].get(name, 0)
+            if count:
+                lines.append(f"{of}{count} of {session['solves']} solves {name.lower()}: their result was not taken")
+        lines += _turned_away(session["rejected"], of)
+    return lines + _turned_away(report["bag_rejected"], "")
+
+
+def _turned_away(rejected: Mapping[str, int], of: str) -> list[str]:
+    counts = {reason: count for reason, count in rejected.items() if reason not in _HARMLESS}
+    return [f"{of}turned away: {', '.join(f'{n} {reason}' for reason, n in counts.items())}"] if counts else []

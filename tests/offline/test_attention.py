@@ -1,0 +1,43 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What has to be looked at after a replay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ba_node.offline.attention import attention
+
+
+def _session(number: int = 0, **changes: Any) -> dict[str, Any]:
+    return {
+        "session_id": number,
+        "solves": 9,
+        "solves_by_status": {"CONVERGED": 9},
+        "warnings": {},
+        "rejected": {},
+        **changes,
+    }
+
+
+def _report(*older: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    return {**_session(**changes), "older_sessions": list(older), "bag_rejected": changes.get("bag_rejected", {})}
+
+
+def test_sound_data_needs_no_look() -> None:
+    assert attention(_report(_session(7))) == []
+
+
+def test_what_comes_twice_is_harmless() -> None:
+    assert attention(_report(rejected={"duplicate_keyframe": 3})) == []
+
+
+def test_each_thing_is_a_line() -> None:
+    held = _session(4, solves_by_status={"CONVERGED": 7, "HELD": 2}, warnings={"held": "step of 60 m"})
+    lines = attention(_report(held, rejected={"bad_pose": 1, "duplicate_keyframe": 2}, bag_rejected={"corrupt": 5}))
+    assert lines == [
+        "step of 60 m",
+        "session 4: 2 of 9 solves held: their result was not taken",
+        "session 0: turned away: 1 bad_pose",
+        "turned away: 5 corrupt",
+    ]
