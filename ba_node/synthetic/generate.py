@@ -17,7 +17,7 @@ from ba_node.synthetic.tracker import IndexArray, Lens, Tracker, build_rig, lens
 from ba_node.synthetic.world import Path, World, build
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from ba_node.synthetic.options import SyntheticOptions
 
@@ -74,11 +74,20 @@ class SyntheticData:
                 yield "feature_tracks", keyframe.stamp_ns, image
 
 
-def generate(options: SyntheticOptions) -> SyntheticData:
-    """Make a recording. The same options give the same numbers."""
+def generate(
+    options: SyntheticOptions, change: Callable[[World, Path], tuple[World, Path]] | None = None
+) -> SyntheticData:
+    """Make a recording. The same options give the same numbers.
+
+    Args:
+        options: what to record.
+        change: puts another world or another motion in the place of those that the options ask for.
+    """
     # One stream a purpose: a change of the noise must not move the points.
     world_rng, track_rng, drift_rng, noise_rng, id_rng = np.random.default_rng(options.seed).spawn(5)
     world, path = build(options, world_rng)
+    if change is not None:
+        world, path = change(world, path)
     rig = build_rig(options)
     recorder = _Recorder(options, world, path, lenses(rig), noise_rng)
 
