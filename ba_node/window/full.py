@@ -215,7 +215,6 @@ def _corrections(
     rotation, position, found = result
     before = (scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes])
     turn = rotation @ np.swapaxes(before[0], -1, -2)
-    scale = np.ones(len(keyframes))
     obs = taken.selection.problem.observations
     known = (landmarks >= 0) & taken.placed & scene.landmarks.has_position[landmarks]
     usable = known[obs.point] & (keyframes >= 0)[obs.keyframe] & (taken.selection.unscaled >= 0)[obs.keyframe]
@@ -223,11 +222,19 @@ def _corrections(
     far = np.linalg.norm(found[point] - position[at], axis=1)
     was = np.linalg.norm(scene.landmarks.position[landmarks[point]] - before[1][at], axis=1)
     sound = (far > 0) & (was > 0)
-    for k in np.unique(at[sound]):
-        ratio = (far / np.where(was > 0, was, 1.0))[sound & (at == k)]
-        if len(ratio) >= _MIN_POINTS:
-            scale[k] = np.median(ratio)
+    scale = _medians(far[sound] / was[sound], at[sound], len(keyframes))
     return _Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
+
+
+def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
+    """Return the median of each group's values, 1 where there are too few to tell."""
+    values = values[np.lexsort((values, group))]
+    count = np.bincount(group, minlength=n_groups)
+    middle = (np.cumsum(count) - count + (count - 1) // 2)[count >= _MIN_POINTS]
+    even = count[count >= _MIN_POINTS] % 2 == 0
+    median = np.ones(n_groups)
+    median[count >= _MIN_POINTS] = np.where(even, 0.5 * (values[middle] + values[middle + even]), values[middle])
+    return median
 
 
 def _anchors(member: IntArray) -> IntArray:

@@ -105,11 +105,12 @@ def _shows_scale(problem: Problem) -> BoolArray:
     """
     obs = problem.observations
     scale = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
-    centres = _camera_centres(problem)
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2) > _MIN_BASELINE_M
     # Rows are sorted by point, keyframe, camera: the views of one point from one keyframe are neighbours.
-    second = (obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1])
-    scale[1:] |= second & apart.ravel().take(obs.camera[1:] * len(apart) + obs.camera[:-1])
+    second = 1 + np.flatnonzero((obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1]))
+    if len(second):
+        centres = _camera_centres(problem)
+        baseline = centres[obs.camera[second]] - centres[obs.camera[second - 1]]
+        scale[second] |= np.linalg.norm(baseline, axis=1) > _MIN_BASELINE_M
     return scale
 
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,20 @@ def test_what_is_fixed(baseline_m: float, old: list[int], fixed: list[int], unsc
 def test_two_cameras_that_never_see_the_same_point_at_once_show_no_scale() -> None:
     views = [(k, k % 2, p) for k in range(4) for p in range(12)]
     assert choose(problem_of(4, views, 0.5), []) == ([0], [0] * 4)
+
+
+def test_a_rig_of_many_cameras_needs_no_table_of_all_pairs() -> None:
+    """Its distances alone would be 3 GB."""
+    problem = problem_of(5, chain(range(5), cameras=(0, 1)), 0.1)
+    cams, n = problem.cameras, 10_000
+    many = Cameras(
+        np.tile(cams.rotation, (n, 1, 1)),
+        np.tile(cams.translation, (n, 1)),
+        np.tile(cams.model, n),
+        np.tile(cams.params, (n, 1)),
+    )
+    problem = dataclasses.replace(problem, cameras=many)
+    assert choose(problem, []) == ([0], [-1] * 5)
 
 
 def test_one_depth_shows_scale() -> None:
