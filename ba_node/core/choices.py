@@ -170,7 +170,7 @@ _PARTS = (
         "Which kernels work.",
         (
             Choice("auto", "native where it has everything that is asked for, else numpy"),
-            Choice("native", "C++: local parameterisation, squared or Huber, points eliminated"),
+            Choice("native", "C++: local parameterisation, squared, Huber or Cauchy, points eliminated"),
             Choice("numpy", "numpy and scipy: everything"),
         ),
     ),

@@ -23,7 +23,7 @@ from ba_node.core.problem import Problem, State
 FloatArray = NDArray[np.float64]
 
 # As in the enums of kernel.hpp.
-_LOSSES = ("squared", "huber")
+_LOSSES = ("squared", "huber", "cauchy")
 _CHEIRALITY = ("keep", "constant", "drop")
 _PRECONDITIONERS = ("none", "schur_block", "schur_diag", "b_block", "b_diag")
 

@@ -15,7 +15,7 @@ try:
 except ImportError:
     kernels = None
 
-_LOSSES = ("squared", "huber")
+_LOSSES = ("squared", "huber", "cauchy")
 
 
 def missing(parameterisation: str, loss: str) -> str:

@@ -34,6 +34,7 @@ RULES = [
     Rules(loss="huber", loss_scale=1.5),
     Rules(loss="huber", cheirality="constant"),
     Rules(cheirality="drop"),
+    Rules(loss="cauchy", loss_scale=1.5, cheirality="constant"),
 ]
 built = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
 

@@ -17,7 +17,7 @@
 
 namespace ba {
 
-enum class Loss : std::uint8_t { kSquared, kHuber };
+enum class Loss : std::uint8_t { kSquared, kHuber, kCauchy };
 enum class Cheirality : std::uint8_t { kKeep, kConstant, kDrop };
 
 struct Rules {
@@ -231,6 +231,8 @@ class Rows {
   }
 
   double cost_of(double norm) const {
+    if (rules_.loss == Loss::kCauchy)
+      return rules_.scale * rules_.scale * std::log1p(norm * norm / (rules_.scale * rules_.scale));
     if (rules_.loss == Loss::kSquared || norm <= rules_.scale) return norm * norm;
     return rules_.scale * (2 * norm - rules_.scale);
   }
@@ -241,6 +243,12 @@ class Rows {
     weight = splat(1.0);
     if (rules_.loss == Loss::kSquared) return;
     const double c = rules_.scale;
+    if (rules_.loss == Loss::kCauchy) {
+      const V8 ratio = norm2 * (1.0 / (c * c));
+      cost = (c * c) * log1p(ratio);
+      weight = 1.0 / (1.0 + ratio);
+      return;
+    }
     const Mask outside = norm2 > c * c;
     if (!any(outside)) return;
     const V8 norm = root(select(outside, norm2, splat(1.0)));

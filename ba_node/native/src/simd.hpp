@@ -200,6 +200,35 @@ BA_INLINE Twice<H, M> root(const Twice<H, M>& v) {
   return {root(v.lo), root(v.hi)};
 }
 
+// log(1 + x) of numbers that are not negative, to some 1e-15 of the value; NaN stays NaN. 1 + x = 2^e m, and with
+// f = (m - 1) / (m + 1) log(m) = 2 (f + f^3/3 + f^5/5 + ...); m lies between sqrt(1/2) and sqrt(2), so |f| < 0.172.
+template <class V, class I>
+BA_INLINE V log1p_of(const V& x) {
+  constexpr long long kOne = 0x3ff0000000000000, kFraction = 0x000fffffffffffff;
+  const V whole = 1.0 + x;
+  I bits;
+  std::memcpy(&bits, &whole, sizeof(bits));
+  const I rounded = bits + (kOne - 0x3fe6a09e667f3bcd);  // from sqrt(1/2) on, the next power of two counts
+  const I power = (rounded >> 52) - 1023;
+  const I scaled = (rounded & kFraction) + 0x3fe6a09e667f3bcd;
+  V m;
+  std::memcpy(&m, &scaled, sizeof(m));
+  // Without a power the sum need not be rounded.
+  const V above = power == 0 ? x : m - 1.0;
+  const V f = above / (2.0 + above), s = f * f;
+  V series = s * (1.0 / 21.0) + 1.0 / 19.0;
+  for (int odd = 17; odd >= 1; odd -= 2) series = series * s + 1.0 / odd;
+  const V sum = __builtin_convertvector(power, V) * 0.6931471805599453 + 2.0 * f * series;
+  return x < 1e300 ? sum : x;
+}
+BA_INLINE Native2 log1p(Native2 x) { return log1p_of<Native2, Native2Mask>(x); }
+BA_INLINE Native4 log1p(Native4 x) { return log1p_of<Native4, Native4Mask>(x); }
+BA_INLINE Native8 log1p(Native8 x) { return log1p_of<Native8, Native8Mask>(x); }
+template <class H, class M>
+BA_INLINE Twice<H, M> log1p(const Twice<H, M>& x) {
+  return {log1p(x.lo), log1p(x.hi)};
+}
+
 BA_INLINE bool any(Native2Mask m) { return (m[0] | m[1]) != 0; }
 #if defined(__AVX__)
 BA_INLINE bool any(Native4Mask m) { return _mm256_movemask_pd(reinterpret_cast<__m256d>(m)) != 0; }
