@@ -8,9 +8,9 @@ complement of the points (3.64-3.67), which is small::
 
     Sigma_c = sigma^2 S^-1,    S = B - E C^-1 E',    sigma^2 = r' W r / (m - n)
 
-W are the IRLS weights of the loss at the solution, m the rows of residuals and n the unknowns: sigma^2 is the
+W are the IRLS weights of the losses at the solution, m the rows of residuals and n the unknowns: sigma^2 is the
 a-posteriori variance of unit weight, near 1 where sigma_px is right. So uncertain points count (they are integrated
-out), and everything is relative to what the problem holds fixed.
+out); factors count in S and in both sums like all else, and everything is relative to what the problem holds fixed.
 
 Where scale is held by a condition ``g'x = 0`` on the step of all keyframes instead of by a fixed pose, S is inverted on
 the directions that the condition leaves: with an orthonormal basis Q of them, ``S^-1 -> Q (Q' S Q)^-1 Q'``.

@@ -65,6 +65,17 @@ def right_jacobian(phi: FloatArray) -> FloatArray:
     return np.eye(3) - b[..., None, None] * k + c[..., None, None] * (k @ k)
 
 
+def inverse_right_jacobian(phi: FloatArray) -> FloatArray:
+    """Return ``Jr^-1``: ``Log(Exp(phi) Exp(d)) = phi + Jr^-1 d + O(d^2)``, |phi| up to pi: (..., 3) -> (..., 3, 3)."""
+    angle2 = np.sum(phi * phi, axis=-1)
+    half = 0.5 * np.sqrt(np.where(angle2 < _SMALL**2, 1.0, angle2))
+    # (1 - t/2 cot(t/2)) / t^2
+    series = 1.0 / 12.0 + angle2 / 720.0
+    factor = np.where(angle2 < _SMALL**2, series, (1.0 - half * np.cos(half) / np.sin(half)) / (4.0 * half * half))
+    k = hat(phi)
+    return np.asarray(np.eye(3) + 0.5 * k + factor[..., None, None] * (k @ k))
+
+
 def _sinc_terms(angle2: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``sin(t)/t`` and ``(1 - cos t)/t^2`` for ``angle2 = t^2``."""
     # Neither loses digits however small t is, as long as it is not zero.

@@ -16,6 +16,7 @@ from ba_node.core import scaling
 from ba_node.core.kernels import Demands, Kernels, Moved, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
+from ba_node.core.native_factors import NativeFactorSum
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Rules, reprojection_errors
 from ba_node.core.problem import Problem, State
@@ -33,6 +34,7 @@ class KernelsError(ValueError):
 
 
 _POINTS = Demands()
+_NO_PAIRS = (np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 def make(problem: Problem, rules: Rules, backend: str = "auto", demands: Demands = _POINTS) -> Kernels:
@@ -85,6 +87,7 @@ class NativeKernels:
         """Hand the problem over; it is copied and sorted once. threads: 0 for one a core."""
         obs, cams = problem.observations, problem.cameras
         self.size = 9 if problem.free_intrinsics else 6
+        self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
         make_kernel = native.kernels.Kernel9 if problem.free_intrinsics else native.kernels.Kernel6
         self._kernel: Any = make_kernel(
             keyframe=obs.keyframe,
@@ -102,6 +105,7 @@ class NativeKernels:
             loss=_LOSSES.index(rules.loss),
             loss_scale=rules.loss_scale,
             cheirality=_CHEIRALITY.index(rules.cheirality),
+            factor_pairs=_NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns),
             threads=threads or len(os.sched_getaffinity(0)),
             start=_arrays(problem.start),
         )
@@ -122,7 +126,11 @@ class NativeKernels:
         if moved is not None and state is moved.state and self._kernel.linearise_polished():
             value = moved.objective
         else:
-            value = self._kernel.linearise(_arrays(state))
+            moved, value = None, self._kernel.linearise(_arrays(state))
+        if self._factors is not None:
+            terms = self._factors.linearise(state)
+            self._kernel.add_factors(terms.diagonal, terms.gradient, terms.pairs.blocks)
+            value += terms.value if moved is None else 0.0
         self.gradient_norm = self._kernel.gradient_norm
         return value
 
@@ -148,6 +156,9 @@ class NativeKernels:
         """Take the step whose part in the system is x, and polish the points after it; see Kernels."""
         target = self._states[self._states[0] is state]
         predicted, damping, value, polished = self._kernel.move(_arrays(state), x, polish_steps, _arrays(target))
+        if self._factors is not None and np.isfinite(value):
+            factors = self._factors.value(target)
+            value, polished = value + factors, polished + factors
         moved = Moved(target, predicted, damping, value, polished)
         self._moved = moved if polish_steps and np.isfinite(polished) else None
         return moved
@@ -155,13 +166,17 @@ class NativeKernels:
     def objective(self, state: State) -> float:
         """Return the robust objective."""
         value: float = self._kernel.objective(_arrays(state))
-        return value
+        return value + self._value_of_factors(state)
 
     def polish_points(self, state: State, steps: int) -> tuple[float, State]:
         """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
         self._moved = None
         _before, value, points = self._kernel.polish_points(_arrays(state), steps)
+        value += self._value_of_factors(state)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
+
+    def _value_of_factors(self, state: State) -> float:
+        return 0.0 if self._factors is None else self._factors.value(state)
 
 
 def _arrays(state: State) -> tuple[FloatArray, ...]:

@@ -114,7 +114,7 @@ class NumpyKernels:
         inverted. The worst block of C grows from 6e3 to above 1e8 on Ladybug-49 as mu falls, and overtakes that of B
         after some 30 iterations. Those of B and C as whole matrices compare the units of unlike parameters.
         """
-        if self.n_free == 0:
+        if self.n_free == 0 or self._equations.pairs is not None:
             return "points", 1.0
         equations, size = self._equations, self.size
         b = columns.plus_diagonal(equations.b, damping_c)
@@ -182,4 +182,7 @@ class _NumpySystem:
         step_c, step_p = self._reduction.expand(x)
         moved = self._structure.jacobian_product(self._linearisation, step_c, step_p)
         slope = np.sum(self._equations.gradient_c * step_c) + np.sum(self._equations.gradient_p * step_p)
-        return step_c, step_p, -float(slope) - 0.5 * float(np.sum(moved * moved))
+        curvature = float(np.sum(moved * moved))
+        if self._linearisation.factors is not None:
+            curvature += self._linearisation.factors.curvature(step_c)
+        return step_c, step_p, -float(slope) - 0.5 * curvature

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.core import cameras, columns, loss, parameterisation
+from ba_node.core.factors import FactorSum, FactorTerms
 from ba_node.core.problem import Problem, State
 
 FloatArray = NDArray[np.float64]
@@ -54,12 +55,14 @@ class Linearisation:
         residual: (n_obs, d), d = 2 or 3.
         d_keyframe: (n_obs, d, 6 or 9).
         d_point: (n_obs, d, 3).
+        factors: what the factors add; None if there are none.
     """
 
     objective: float
     residual: FloatArray
     d_keyframe: FloatArray
     d_point: FloatArray
+    factors: FactorTerms | None = None
 
 
 @dataclass(frozen=True)
@@ -116,12 +119,17 @@ class _Known:
 
 
 class Objective:
-    """The objective of one problem under given rules; knows which image each observation belongs to."""
+    """The objective of one problem under given rules; knows which image each observation belongs to.
+
+    Attributes:
+        factors: the sum of the problem's factors; None if it has none.
+    """
 
     def __init__(self, problem: Problem, rules: Rules) -> None:
         """Prepare what stays the same over all iterations."""
         self.problem = problem
         self.rules = rules
+        self.factors = FactorSum(problem.factors, problem.fixed, rules.parameterisation) if problem.factors else None
         # mu of the surrogate that stands in for a truncated quadratic; infinite for the loss itself.
         self.graduation = np.inf
         obs, cams = problem.observations, problem.cameras
@@ -162,7 +170,11 @@ class Objective:
 
     def value(self, state: State) -> float:
         """Return the objective 1/2 sum Psi."""
-        return _total(self.costs(state))
+        return _total(self.costs(state)) + self.factors_value(state)
+
+    def factors_value(self, state: State) -> float:
+        """Return what the factors have of the objective."""
+        return 0.0 if self.factors is None else self.factors.value(state)
 
     def costs(self, state: State, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Return Psi of some observations, (n,)."""
@@ -175,7 +187,8 @@ class Objective:
         rows = 2 * (len(residual) - len(masked))
         if self._has_depth:
             rows += int(np.count_nonzero(np.isfinite(np.delete(self.problem.observations.depth_m, masked))))
-        return float(np.sum(weighted * weighted)), rows
+        squares, more = (0.0, 0) if self.factors is None else self.factors.weighted_squares(state)
+        return float(np.sum(weighted * weighted)) + squares, rows + more
 
     def linearise(self, state: State, rows: PointRows | None = None) -> Linearisation:
         """Return residuals and Jacobians at a state; what is known of all rows there is not worked out again."""
@@ -188,7 +201,9 @@ class Objective:
         )
         if intrinsics:
             d_keyframe = np.concatenate([d_keyframe.T, d_intrinsics.T]).T
-        return Linearisation(_total(rows.cost), rows.residual, d_keyframe, rows.d_point)
+        terms = None if self.factors is None else self.factors.linearise(state)
+        value = _total(rows.cost) + (0.0 if terms is None else terms.value)
+        return Linearisation(value, rows.residual, d_keyframe, rows.d_point, terms)
 
     def point_rows(self, state: State, rows: IntArray | slice = slice(None)) -> PointRows:
         """Return costs, residuals and derivatives by the points of some observations."""

@@ -60,7 +60,8 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
     ids, rows, start = structure.seen_points, np.arange(structure.n_rows), structure.point_start
     damping = _FIRST_DAMPING
     seen = kept = objective.point_rows(state)
-    before = 0.5 * float(np.sum(seen.cost))
+    factors = objective.factors_value(state)
+    before = 0.5 * float(np.sum(seen.cost)) + factors
     for step in range(steps + 1):
         count = np.diff(start, append=len(rows))
         cost = columns.sum_runs(seen.cost, start)
@@ -86,5 +87,5 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         start = np.cumsum(count[active]) - count[active]
         seen = objective.point_rows(dataclasses.replace(state, points=points), rows)
         damping *= 0.1
-    after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)]))
+    after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)])) + factors
     return Polished(dataclasses.replace(state, points=best), before, after, kept)

@@ -16,9 +16,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from ba_node.core.factors import KeyframeFactors
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -103,12 +107,14 @@ class Problem:
         fixed: (n_kf,) True where the pose (and intrinsics) of a keyframe is held.
         cameras: the rig.
         observations: sorted by point.
+        factors: all terms of the objective that are not reprojections, see factors.py.
     """
 
     start: State
     fixed: BoolArray
     cameras: Cameras
     observations: Observations
+    factors: tuple[KeyframeFactors, ...] = ()
 
     @property
     def n_keyframes(self) -> int:
@@ -125,8 +131,15 @@ class Problem:
         """Return True if each keyframe has its own f, k1, k2 (9 parameters a keyframe instead of 6)."""
         return len(self.start.intrinsics) > 0
 
+    @property
+    def n_factors(self) -> int:
+        """Return the number of factors of all kinds."""
+        return sum(len(kind.keyframes) for kind in self.factors)
+
     def check(self) -> None:
         """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
+        for kind in self.factors:
+            kind.check(self.n_keyframes)
         obs = self.observations
         n_obs = len(obs)
         _check_shapes(self, n_obs)

@@ -3,8 +3,8 @@
 """Normal equations and the Schur complement of the points.
 
 With ``J = [Jc Jp]`` (rows already weighted), ``g = J'r``, and ``H = J'J = [[B, E], [E', C]]`` (3.43-3.54), B is block
-diagonal by keyframe (d x d, d = 6 or 9) and C by point (3 x 3). The damped step ``(H + mu D) p = -g`` is found by
-eliminating the points (3.64-3.67)::
+diagonal by keyframe (d x d, d = 6 or 9; but for what factors add, see factors.py) and C by point (3 x 3). The damped
+step ``(H + mu D) p = -g`` is found by eliminating the points (3.64-3.67)::
 
     S pc = -gc + E C^-1 gp,    S = B - E C^-1 E'
     pp   = C^-1 (-gp - E' pc)
@@ -30,6 +30,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ba_node.core import columns, dense_products
+from ba_node.core.factors import Pairs
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem
 
@@ -174,6 +175,7 @@ class NormalEquations:
         e: (n_edges, d, 3) coupling.
         gradient_c: (n_free, d).
         gradient_p: (n_points, 3).
+        pairs: blocks of B between two keyframes; None without factors.
     """
 
     b: FloatArray
@@ -181,6 +183,7 @@ class NormalEquations:
     e: FloatArray
     gradient_c: FloatArray
     gradient_p: FloatArray
+    pairs: Pairs | None = None
 
     @property
     def gradient_norm(self) -> float:
@@ -197,7 +200,11 @@ def normal_equations(structure: Structure, lin: Linearisation) -> NormalEquation
     b, gradient_c = structure.keyframe_blocks(lin.d_keyframe, lin.residual)
     c, gradient_p = structure.point_blocks(lin.d_point, lin.residual)
     e = structure.edge_products(lin.d_keyframe, lin.d_point)
-    return NormalEquations(b, c, e, gradient_c, gradient_p)
+    if lin.factors is None:
+        return NormalEquations(b, c, e, gradient_c, gradient_p)
+    b[:, :6, :6] += lin.factors.diagonal
+    gradient_c[:, :6] += lin.factors.gradient
+    return NormalEquations(b, c, e, gradient_c, gradient_p, lin.factors.pairs)
 
 
 class ReducedSystem:
@@ -218,6 +225,7 @@ class ReducedSystem:
         """
         self._structure = structure
         self.b = columns.plus_diagonal(equations.b, damping_c)
+        self._pairs = equations.pairs
         self._inverse_l = inverse_cholesky3(columns.plus_diagonal(equations.c, damping_p))
         self._scaled_gradient_p = columns.times(self._inverse_l, equations.gradient_p)
         inverse = columns.take(self._inverse_l, structure.edge_point)
@@ -241,6 +249,8 @@ class ReducedSystem:
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x without forming S."""
         own = (self.b @ x.reshape(-1, self._structure.size, 1)).ravel()
+        if self._pairs is not None:
+            own += self._pairs.product(x.reshape(-1, self._structure.size)).ravel()
         return np.asarray(own - self.z @ (self.z_t @ x))
 
     def dense(self) -> FloatArray:
@@ -254,11 +264,18 @@ class ReducedSystem:
         view = s.reshape(n, d, n, d)
         index = np.arange(n)
         view[index, :, index, :] += self.b
+        if self._pairs is not None:
+            rows, between = self._pairs.rows, self._pairs.columns
+            view[rows, :6, between, :6] += self._pairs.blocks
+            view[between, :6, rows, :6] += np.swapaxes(self._pairs.blocks, 1, 2)
         return s
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S as a block-sparse matrix."""
-        return block_diagonal(self.b) - self.z @ self.z_t
+        own = block_diagonal(self.b)
+        if self._pairs is not None:
+            own = own + self._pairs.matrix(self._structure.n_free, self._structure.size)
+        return own - self.z @ self.z_t
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d), without forming S."""

@@ -8,6 +8,7 @@ Eliminating the keyframes, with ``B = K^-1 K^-T`` and ``Z = K E``::
     pc   = B^-1 (-gc - E pp)
 
 Directions of a keyframe that nothing determines have a row of zeros in K, the pseudo-inverse's answer (5.2).
+That takes B to be block diagonal: problems with factors are eliminated by points, or not at all.
 S has 3 rows a point and couples all points that one keyframe sees: a product with it without forming it costs as much
 as one on the other side, 2 block products an observation, but forming it takes sum n_k^2 of them, n_k points seen by k.
 """
@@ -92,6 +93,7 @@ class FullSystem:
         self._structure = structure
         self.b = columns.plus_diagonal(equations.b, damping_c)
         self.c = columns.plus_diagonal(equations.c, damping_p)
+        self._pairs = equations.pairs
         self.e = structure.edge_matrix(equations.e)
         self.e_t = structure.edge_matrix_transposed(equations.e)
         self.rhs = -np.concatenate([equations.gradient_c.ravel(), equations.gradient_p.ravel()])
@@ -102,6 +104,8 @@ class FullSystem:
         x_c, x_p = x[: self._split], x[self._split :]
         own_c = (self.b @ x_c.reshape(-1, self._structure.size, 1)).ravel()
         own_p = (self.c @ x_p.reshape(-1, 3, 1)).ravel()
+        if self._pairs is not None:
+            own_c += self._pairs.product(x_c.reshape(-1, self._structure.size)).ravel()
         return np.concatenate([own_c + self.e @ x_p, own_p + self.e_t @ x_c])
 
     def dense(self) -> FloatArray:
@@ -110,7 +114,10 @@ class FullSystem:
 
     def sparse(self) -> scipy.sparse.csr_matrix:
         """Return H as a sparse matrix."""
-        rows = [[block_diagonal(self.b), self.e], [self.e_t, block_diagonal(self.c)]]
+        own_c = block_diagonal(self.b)
+        if self._pairs is not None:
+            own_c = own_c + self._pairs.matrix(self._structure.n_free, self._structure.size)
+        rows = [[own_c, self.e], [self.e_t, block_diagonal(self.c)]]
         return scipy.sparse.bmat(rows, format="csr")
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:

@@ -31,6 +31,7 @@ import numpy as np
 
 from ba_node.core import linear, native_kernels
 from ba_node.core.annealing import Annealing
+from ba_node.core.choices import ChoiceError
 from ba_node.core.kernels import Kernels
 from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem
@@ -73,7 +74,12 @@ def solve(
     """
     options.check()
     problem.check()
-    if len(problem.observations) == 0 or (problem.fixed.all() and problem.n_points == 0):
+    if problem.factors and options.schur == "cameras":
+        raise ChoiceError(
+            f"schur = cameras with {problem.n_factors} factors, which couple keyframes with each other: take"
+            " schur = points, none or adaptive"
+        )
+    if len(problem.observations) + problem.n_factors == 0 or (problem.fixed.all() and problem.n_points == 0):
         return Result(problem.start, Status.SKIPPED, "no observations: nothing to solve", options.method, ())
     try:
         run = _Run(problem, options, clock, on_iteration, kernels)

@@ -94,6 +94,16 @@ class Equations : public AtPoints {
     return total;
   }
 
+  // Add to B and to the gradient what factors have: n_free x 36 and n_free x 6.
+  void add_factors(const double* diagonal, const double* gradient) {
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      for (int i = 0; i < 6; ++i) {
+        set(gradient_c[k], i, at(gradient_c[k], i) + gradient[6 * k + i]);
+        for (int j = 0; j < 6; ++j) set_entry(b[k], i, j, entry(b[k], i, j) + diagonal[36 * k + 6 * i + j]);
+      }
+    find_gradient_norm();
+  }
+
   // Polishing ends with what a linearisation at its end begins with; that is kept if it is small.
   bool looks_ahead() const { return ahead_.record.size() == this->record.size(); }
   // Registers a record, and those that hold() needs for a slot.
@@ -174,6 +184,10 @@ class Equations : public AtPoints {
         }
       }
     }
+    find_gradient_norm();
+  }
+
+  void find_gradient_norm() {
     double norm2 = 0;
     for (const auto& x : gradient_c) norm2 += dot(x, x);
     V8 squares{};

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <limits>
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "blocks.hpp"
@@ -37,8 +38,15 @@ struct Moved {
 template <int D>
 class Kernel {
  public:
-  Kernel(const ProblemView& problem, const Rules& rules, const StateView& start, int threads)
-      : l_(problem, D == 9), rows_(l_, rules, start), pool_(threads), equations_(l_), coupling_(l_, equations_) {
+  // factors: pairs of free keyframes that have a block of B between them.
+  Kernel(const ProblemView& problem, const Rules& rules, const StateView& start, CoupledPairs factors, int threads)
+      : l_(problem, D == 9),
+        factors_(std::move(factors)),
+        rows_(l_, rules, start),
+        pool_(threads),
+        equations_(l_),
+        coupling_(l_, equations_) {
+    pairs_.assign(factors_.size(), Block<D>{});
     rhs_.resize(l_.n_free);
     sums_.resize(l_.n_chunks() * l_.n_free);
     scaled_gradient_.resize(3 * l_.n_batches);
@@ -96,6 +104,14 @@ class Kernel {
     is_ahead_ = false;
     equations_.go_ahead(pool_);
     return true;
+  }
+
+  // Add what factors have at the state of the last linearisation: to B (n_free x 36), to the gradient (n_free x 6), and the
+  // blocks of the coupled pairs (n_pairs x 36).
+  void add_factors(const double* diagonal, const double* gradient, const double* pairs) {
+    equations_.add_factors(diagonal, gradient);
+    for (std::size_t k = 0; k < factors_.size(); ++k)
+      for (int i = 0; i < 36; ++i) set_entry(pairs_[k], i / 6, i % 6, pairs[36 * k + i]);
   }
 
   // diag(B) (n_free x D) and diag(C) (n_points x 3).
@@ -168,7 +184,7 @@ class Kernel {
 
   // S by blocks.
   const SparseSchur<D>& assemble() {
-    schur().assemble(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); });
+    schur().assemble(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); }, pairs_);
     return schur();
   }
 
@@ -217,6 +233,11 @@ class Kernel {
       const Column<D> y = multiply(equations_.b[k], coupling_.step(k));
       for (int i = 0; i < D; ++i) out[k * D + i] = at(y, i) - at(sum, i) + damping_c_[k * D + i] * x[k * D + i];
     });
+    for (std::size_t k = 0; k < factors_.size(); ++k) {
+      const std::int64_t i = factors_.row[k], j = factors_.column[k];
+      add_multiplied<1>(pairs_[k], x + j * D, out + i * D);
+      add_multiplied_transposed<1>(pairs_[k], x + i * D, out + j * D);
+    }
   }
 
   void diagonal_blocks(double* out) {
@@ -255,6 +276,11 @@ class Kernel {
     for (std::int64_t i = 0; i < l_.n_free * D; ++i) damping_cost_ += 0.5 * damping_c_[i] * step_c[i] * step_c[i];
     for (std::int64_t k = 0; k < l_.n_free; ++k)
       reduction -= dot(equations_.gradient_c[k], coupling_.step(k)) + 0.5 * dot(multiply(equations_.b[k], coupling_.step(k)), coupling_.step(k));
+    for (std::size_t k = 0; k < factors_.size(); ++k) {
+      double moved[D] = {};
+      add_multiplied<1>(pairs_[k], step_c + factors_.column[k] * D, moved);
+      for (int i = 0; i < D; ++i) reduction -= step_c[factors_.row[k] * D + i] * moved[i];
+    }
     return reduction;
   }
 
@@ -360,7 +386,7 @@ class Kernel {
   }
 
   SparseSchur<D>& schur() {
-    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, pool_.threads());
+    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, factors_, pool_.threads());
     return *schur_;
   }
 
@@ -396,6 +422,8 @@ class Kernel {
   double damping_cost_ = 0;
 
   Layout l_;
+  CoupledPairs factors_;
+  Buffer<Block<D>> pairs_;
   Rows rows_;
   Pool pool_;
   Equations<D> equations_;

@@ -11,6 +11,7 @@
 
 #include "kernel.hpp"
 #include "norms.hpp"
+#include "relative_poses.hpp"
 #include "triangulate.hpp"
 
 namespace py = pybind11;
@@ -92,8 +93,8 @@ template <int D>
 ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point, const Doubles& uv, const Doubles& sigma,
                     const Doubles& depth, const Doubles& depth_sigma, const Doubles& camera_rotation,
                     const Doubles& camera_translation, const Array<std::uint8_t>& model, const Doubles& params,
-                    const Array<bool>& fixed, int loss, double loss_scale, int cheirality, int threads,
-                    const StateArrays& start) {
+                    const Array<bool>& fixed, int loss, double loss_scale, int cheirality,
+                    const std::tuple<Ints, Ints>& factor_pairs, int threads, const StateArrays& start) {
   ba::ProblemView problem =
       view(keyframe, camera, point, uv, sigma, camera_rotation, camera_translation, model, params, start);
   problem.depth = depth.size() ? depth.data() : nullptr;
@@ -101,8 +102,12 @@ ba::Kernel<D>* make(const Ints& keyframe, const Ints& camera, const Ints& point,
   problem.fixed = fixed.data();
   const ba::Rules rules{static_cast<ba::Loss>(loss), loss_scale, static_cast<ba::Cheirality>(cheirality)};
   const ba::StateView state = view(start);
+  const auto& [row, column] = factor_pairs;
+  ba::CoupledPairs pairs;
+  pairs.row.assign(row.data(), row.data() + row.size());
+  pairs.column.assign(column.data(), column.data() + column.size());
   py::gil_scoped_release release;
-  return new ba::Kernel<D>(problem, rules, state, threads);
+  return new ba::Kernel<D>(problem, rules, state, std::move(pairs), threads);
 }
 
 // The upper triangle of S: blocks, rows, columns.
@@ -127,7 +132,8 @@ void bind(py::module_& m, const char* name) {
       .def(py::init(&make<D>), py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"), py::arg("uv"),
            py::arg("sigma_px"), py::arg("depth_m"), py::arg("depth_sigma_m"), py::arg("camera_rotation"),
            py::arg("camera_translation"), py::arg("camera_model"), py::arg("camera_params"), py::arg("fixed"),
-           py::arg("loss"), py::arg("loss_scale"), py::arg("cheirality"), py::arg("threads"), py::arg("start"))
+           py::arg("loss"), py::arg("loss_scale"), py::arg("cheirality"), py::arg("factor_pairs"), py::arg("threads"),
+           py::arg("start"))
       .def_property_readonly("n_free", &K::n_free)
       .def_property_readonly("n_chunks", &K::n_chunks)
       .def_property_readonly("gradient_norm", &K::gradient_norm)
@@ -140,6 +146,10 @@ void bind(py::module_& m, const char* name) {
            [](K& k) {
              py::gil_scoped_release release;
              return k.linearise_polished();
+           })
+      .def("add_factors",
+           [](K& k, const Doubles& diagonal, const Doubles& gradient, const Doubles& pairs) {
+             k.add_factors(diagonal.data(), gradient.data(), pairs.data());
            })
       .def("objective",
            [](K& k, const StateArrays& s) {
@@ -270,6 +280,31 @@ void bind(py::module_& m, const char* name) {
       });
 }
 
+ba::RelativePoses* make_relative_poses(const Ints& keyframes, const Doubles& rotation, const Doubles& translation,
+                                       const Doubles& root_information, int loss, double loss_scale, const Ints& column,
+                                       const Ints& pair) {
+  return new ba::RelativePoses({pair.size(), keyframes.data(), rotation.data(), translation.data(), root_information.data(),
+                                static_cast<ba::FactorLoss>(loss), loss_scale},
+                               column.data(), column.size(), pair.data());
+}
+
+void bind_relative_poses(py::module_& m) {
+  using R = ba::RelativePoses;
+  py::class_<R>(m, "RelativePoses")
+      .def(py::init(&make_relative_poses), py::kw_only(), py::arg("keyframes"), py::arg("rotation"), py::arg("translation"),
+           py::arg("root_information"), py::arg("loss"), py::arg("loss_scale"), py::arg("column"), py::arg("pair"))
+      .def("value",
+           [](const R& r, const Doubles& rotation, const Doubles& translation) {
+             return r.value({rotation.data(), translation.data(), nullptr, nullptr});
+           })
+      // Adds to gradient, diagonal and pairs.
+      .def("linearise", [](const R& r, const Doubles& rotation, const Doubles& translation, Doubles gradient,
+                           Doubles diagonal, Doubles pairs) {
+        return r.linearise({rotation.data(), translation.data(), nullptr, nullptr},
+                           {gradient.mutable_data(), diagonal.mutable_data(), pairs.mutable_data()});
+      });
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_kernels, m) {
@@ -278,6 +313,7 @@ PYBIND11_MODULE(_kernels, m) {
   m.doc() = "Kernels of bundle adjustment in C++; see ba_node/core/kernels.py.";
   bind<6>(m, "Kernel6");
   bind<9>(m, "Kernel9");
+  bind_relative_poses(m);
   m.def("allocations", [] { return ba::allocations.load(); });
   m.def("residual_norms", &residual_norms, py::kw_only(), py::arg("keyframe"), py::arg("camera"), py::arg("point"),
         py::arg("uv"), py::arg("sigma_px"), py::arg("camera_rotation"), py::arg("camera_translation"),

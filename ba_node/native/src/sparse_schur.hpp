@@ -17,10 +17,18 @@
 
 namespace ba {
 
-// Pairs (i, j >= i) of free keyframes that share a point, the diagonal first in each row.
-inline Rows32 shared_points(const Layout& l) {
+// Pairs (i, j > i) of free keyframes, sorted, that factors couple.
+struct CoupledPairs {
+  std::vector<std::int32_t> row, column;
+
+  std::size_t size() const { return row.size(); }
+};
+
+// Pairs (i, j >= i) of free keyframes that share a point or a factor, the diagonal first in each row.
+inline Rows32 coupled(const Layout& l, const CoupledPairs& factors) {
   Rows32 upper;
   std::vector<std::int32_t> seen_by(l.n_free, -1);
+  std::size_t next = 0;
   for (std::int64_t i = 0; i < l.n_free; ++i) {
     const auto row = static_cast<std::int32_t>(i);
     upper.index.push_back(row);
@@ -34,6 +42,8 @@ inline Rows32 shared_points(const Layout& l) {
         upper.index.push_back(j);
       }
     }
+    for (; next < factors.size() && factors.row[next] == row; ++next)
+      if (seen_by[factors.column[next]] != row) upper.index.push_back(factors.column[next]);
     upper.close_row();
     std::sort(upper.index.begin() + upper.start[i] + 1, upper.index.end());
   }
@@ -43,13 +53,18 @@ inline Rows32 shared_points(const Layout& l) {
 template <int D>
 class SparseSchur {
  public:
-  SparseSchur(const Layout& l, int threads) : l_(l), pattern_(shared_points(l)) {
+  SparseSchur(const Layout& l, const CoupledPairs& factors, int threads) : l_(l), pattern_(coupled(l, factors)) {
     cut_points();
     order_edges();
     scratch_.resize(most_edges_ * threads);
     blocks_.resize(n_blocks() * groups());
     diagonal_.resize(l_.n_free * groups());
     index_rows();
+    for (std::size_t k = 0; k < factors.size(); ++k) {
+      const std::int32_t* index = pattern_.index.data();
+      const std::int32_t *first = index + pattern_.start[factors.row[k]], *stop = index + pattern_.start[factors.row[k] + 1];
+      place_of_pair_.push_back(std::lower_bound(first, stop, factors.column[k]) - index);
+    }
   }
 
   const Rows32& pattern() const { return pattern_; }
@@ -68,9 +83,10 @@ class SparseSchur {
     }
   }
 
-  // S = B + damping - Z Z'. add_diagonal(k, block): add B and damping of keyframe k.
+  // S = B + damping - Z Z'. add_diagonal(k, block): add B and damping of keyframe k. pairs: blocks of B of the pairs that
+  // factors couple.
   template <class Add>
-  void assemble(Pool& pool, const Coupling<D>& coupling, Add add_diagonal) {
+  void assemble(Pool& pool, const Coupling<D>& coupling, Add add_diagonal, const Buffer<Block<D>>& pairs) {
     pool.each(groups(), [&](std::int64_t group, int thread) {
       Block<D>* blocks = &blocks_[group * n_blocks()];
       clear(blocks, n_blocks());
@@ -80,6 +96,7 @@ class SparseSchur {
       add_groups(blocks_.data(), n_blocks(), n_blocks() * piece / kPieces, n_blocks() * (piece + 1) / kPieces);
     });
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
+    for (std::size_t k = 0; k < place_of_pair_.size(); ++k) add(blocks_[place_of_pair_[k]], pairs[k]);
   }
 
   // The diagonal blocks alone, n_free.
@@ -205,6 +222,7 @@ class SparseSchur {
   std::int64_t most_edges_ = 0;                         // of a stretch
   Buffer<Edge<D>> scratch_;                             // of each thread
   Buffer<std::int32_t> place_;          // for columns between those of the row, nothing
+  std::vector<std::int64_t> place_of_pair_;
   std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j], or kSearched
 };
 

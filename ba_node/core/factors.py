@@ -1,0 +1,324 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Factors on keyframes: all terms of the objective that are not reprojections.
+
+A factor has a whitened residual ``r = W e`` on one to n keyframes, and a robust loss of its own: it adds
+``1/2 Psi(|r|)`` to the objective. With J_k its derivative by the step of keyframe k (weighted as in loss.py), it adds
+``J_k' r`` to the gradient, ``J_k' J_k`` to the blocks of B, and ``J_k' J_l`` between two free keyframes. So B is no
+longer block diagonal, and S = B - E C^-1 E' has blocks also where two keyframes share no point. Points do not enter:
+eliminating them is as cheap as before.
+
+The relative pose of keyframe j in keyframe i is ``T_ij = T_i T_j^-1`` (body i from body j), with T = R, t body from
+world. Against a measured one, ``R_m, t_m``::
+
+    e = (Log(R_m' R_ij), t_ij - t_m),    R_ij = R_i R_j',    t_ij = t_i - R_ij t_j
+
+The local step ``R <- R Exp(dphi), t <- t + R dt`` multiplies T from the right, so that only the difference of both
+steps enters::
+
+    de = A (step_i - step_j),    A = [Jr^-1(e_phi) R_j     0  ]
+                                     [R_i [R_j' t_j]x     R_i ]
+
+The global one (3.26-3.28) is ``dphi_local = Jr(phi) dphi, dt_local = R' dt``: blocks are turned after they are summed.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from ba_node.core import geometry, loss
+from ba_node.core.problem import ProblemError, State
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+# A measured rotation may differ from an orthonormal one by this much.
+_ORTHONORMAL = 1e-6
+
+
+class KeyframeFactors(Protocol):
+    """Factors of one kind: n of them, each with m residuals on k keyframes.
+
+    Attributes:
+        keyframes: (n, k) indices of the keyframes of each.
+        loss: robust loss, one of loss.LOSSES, on the norm of the whitened residual.
+        loss_scale: where it leaves the square.
+    """
+
+    @property
+    def keyframes(self) -> IntArray:
+        """Return (n, k) indices of the keyframes of each."""
+
+    @property
+    def loss(self) -> str:
+        """Return the robust loss."""
+
+    @property
+    def loss_scale(self) -> float:
+        """Return where the loss leaves the square."""
+
+    def residuals(self, state: State) -> FloatArray:
+        """Return the whitened residuals, (n, m)."""
+
+    def jacobians(self, state: State) -> FloatArray:
+        """Return their derivatives by the local steps of the keyframes, (n, k, m, 6): rotation, then translation."""
+
+    def check(self, n_keyframes: int) -> None:
+        """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
+
+
+@dataclass(frozen=True)
+class RelativePoses:
+    """Measured poses of one keyframe in another; one end may be fixed.
+
+    Attributes:
+        keyframes: (n, 2) i and j.
+        rotation: (n, 3, 3) body i from body j.
+        translation: (n, 3) body i from body j: where j is in i, m.
+        root_information: (n, 6, 6) W, on rotation (rad), then translation (m) along the axes of body i.
+        loss: robust loss.
+        loss_scale: where it leaves the square.
+    """
+
+    keyframes: IntArray
+    rotation: FloatArray
+    translation: FloatArray
+    root_information: FloatArray
+    loss: str = "squared"
+    loss_scale: float = 1.0
+
+    def __len__(self) -> int:
+        """Return the number of factors."""
+        return len(self.keyframes)
+
+    def take(self, rows: IntArray | BoolArray, number: IntArray) -> RelativePoses:
+        """Return some of them; ``number`` (n_kf,) are the new indices of the keyframes."""
+        return replace(
+            self,
+            keyframes=number[self.keyframes[rows]],
+            rotation=self.rotation[rows],
+            translation=self.translation[rows],
+            root_information=self.root_information[rows],
+        )
+
+    def residuals(self, state: State) -> FloatArray:
+        """Return the whitened residuals, (n, 6)."""
+        return (self.root_information @ self._errors(state)[:, :, None])[..., 0]
+
+    def jacobians(self, state: State) -> FloatArray:
+        """Return the derivatives of the residuals by the local steps of both keyframes, (n, 2, 6, 6)."""
+        first, second = self.keyframes.T
+        rotation_i, rotation_j = state.rotation[first], state.rotation[second]
+        centre = (np.swapaxes(rotation_j, 1, 2) @ state.translation[second][:, :, None])[..., 0]
+        a = np.zeros((len(self), 6, 6))
+        a[:, :3, :3] = geometry.inverse_right_jacobian(self._errors(state)[:, :3]) @ rotation_j
+        a[:, 3:, :3] = rotation_i @ geometry.hat(centre)
+        a[:, 3:, 3:] = rotation_i
+        a = self.root_information @ a
+        return np.stack([a, -a], axis=1)
+
+    def check(self, n_keyframes: int) -> None:
+        """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
+        n = len(self)
+        shapes = {"keyframes": (n, 2), "rotation": (n, 3, 3), "translation": (n, 3), "root_information": (n, 6, 6)}
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise ProblemError(f"{name} of the relative poses has shape {array.shape}, expected {shape}")
+            bad = ~np.isfinite(array).reshape(n, -1).all(axis=1)
+            if bad.any():
+                raise ProblemError(f"{name} of relative pose {int(np.argmax(bad))} is not finite")
+        turned = self.rotation @ np.swapaxes(self.rotation, 1, 2) - np.eye(3)
+        bad = (np.abs(turned).max(axis=(1, 2)) > _ORTHONORMAL) | (np.linalg.det(self.rotation) < 0.0)
+        if bad.any():
+            raise ProblemError(f"rotation of relative pose {int(np.argmax(bad))} is no rotation: expected R R' = I")
+        same = self.keyframes[:, 0] == self.keyframes[:, 1]
+        if same.any():
+            row = int(np.argmax(same))
+            raise ProblemError(f"relative pose {row} is of keyframe {self.keyframes[row, 0]} in itself")
+        check_common(self, n_keyframes)
+
+    def _errors(self, state: State) -> FloatArray:
+        """Return e, (n, 6), not whitened."""
+        first, second = self.keyframes.T
+        rotation = state.rotation[first] @ np.swapaxes(state.rotation[second], 1, 2)
+        translation = state.translation[first] - (rotation @ state.translation[second][:, :, None])[..., 0]
+        angle = geometry.so3_log(np.swapaxes(self.rotation, 1, 2) @ rotation)
+        return np.concatenate([angle, translation - self.translation], axis=1)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Blocks of B between two free keyframes, by their numbers among the free ones; those below the diagonal follow.
+
+    Attributes:
+        rows: (n_pairs,) the lower number.
+        columns: (n_pairs,) the higher number; pairs are distinct and sorted.
+        blocks: (n_pairs, 6, 6).
+    """
+
+    rows: IntArray
+    columns: IntArray
+    blocks: FloatArray
+
+    def product(self, x: FloatArray) -> FloatArray:
+        """Return the product with x, (n_free, d), d >= 6; the same."""
+        out = np.zeros_like(x)
+        np.add.at(out[:, :6], self.rows, (self.blocks @ x[self.columns, :6, None])[..., 0])
+        np.add.at(out[:, :6], self.columns, (np.swapaxes(self.blocks, 1, 2) @ x[self.rows, :6, None])[..., 0])
+        return out
+
+    def matrix(self, n_free: int, size: int) -> scipy.sparse.bsr_matrix:
+        """Return the blocks as a symmetric block-sparse matrix, (size n_free, size n_free)."""
+        rows, columns = np.concatenate([self.rows, self.columns]), np.concatenate([self.columns, self.rows])
+        order = np.lexsort((columns, rows))
+        blocks = np.zeros((len(rows), size, size))
+        blocks[:, :6, :6] = np.concatenate([self.blocks, np.swapaxes(self.blocks, 1, 2)])[order]
+        bounds = np.searchsorted(rows[order], np.arange(n_free + 1))
+        return scipy.sparse.bsr_matrix((blocks, columns[order], bounds), shape=(size * n_free, size * n_free))
+
+
+@dataclass(frozen=True)
+class FactorTerms:
+    """What all factors add to the equations of the free keyframes.
+
+    Attributes:
+        value: 1/2 sum Psi.
+        gradient: (n_free, 6).
+        diagonal: (n_free, 6, 6) to the blocks of B.
+        pairs: between two free keyframes.
+    """
+
+    value: float
+    gradient: FloatArray
+    diagonal: FloatArray
+    pairs: Pairs
+
+    def curvature(self, step: FloatArray) -> float:
+        """Return ``p'H p`` of the factors' part of H for a step (n_free, d), d >= 6."""
+        own = (self.diagonal @ step[:, :6, None])[..., 0]
+        return float(np.sum(step[:, :6] * (own + self.pairs.product(step)[:, :6])))
+
+
+class FactorSum:
+    """The sum of all factors of a problem.
+
+    Attributes:
+        rows: (n_pairs,) as of Pairs, of all that the factors couple.
+        columns: (n_pairs,) the same.
+    """
+
+    def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray, parameterisation: str = "local") -> None:
+        """Find which free keyframes they couple.
+
+        Args:
+            factors: of the problem.
+            fixed: (n_kf,).
+            parameterisation: how a pose is stepped.
+        """
+        self._factors, self._parameterisation = tuple(factors), parameterisation
+        self._free = np.flatnonzero(~fixed)
+        self._column = np.full(len(fixed), -1, np.intp)
+        self._column[self._free] = np.arange(len(self._free))
+        n = len(self._free)
+        keys = [self._keys(self._column[kind.keyframes], n) for kind in self._factors]
+        distinct = np.unique(np.concatenate([key.ravel() for key in keys])) if keys else np.empty(0, np.intp)
+        distinct = distinct[distinct >= 0]
+        self.rows, self.columns = np.divmod(distinct, max(n, 1))
+        # By kind: (n, n_places) the pair that each two places of a factor belong to, -1 if one of them is fixed.
+        self._pair = [np.where(key >= 0, np.searchsorted(distinct, key), -1) for key in keys]
+
+    def value(self, state: State) -> float:
+        """Return 1/2 sum Psi."""
+        return sum(self._value(kind, state) for kind in self._factors)
+
+    def weighted_squares(self, state: State) -> tuple[float, int]:
+        """Return ``r' W r`` with the IRLS weights W, and the number of residuals."""
+        total, count = 0.0, 0
+        for kind in self._factors:
+            residual = kind.residuals(state)
+            total += float(np.sum(_weigh(kind, residual)[1] * np.sum(residual * residual, axis=1)))
+            count += residual.size
+        return total, count
+
+    def linearise(self, state: State) -> FactorTerms:
+        """Return what the factors add at a state."""
+        n = len(self._free)
+        gradient, diagonal = np.zeros((n, 6)), np.zeros((n, 6, 6))
+        between = np.zeros((len(self.rows), 6, 6))
+        terms = FactorTerms(0.0, gradient, diagonal, Pairs(self.rows, self.columns, between))
+        value = sum(self._add(kind, number, state, terms) for number, kind in enumerate(self._factors))
+        return self._stepped(state, replace(terms, value=value))
+
+    @staticmethod
+    def _value(kind: KeyframeFactors, state: State) -> float:
+        return 0.5 * float(np.sum(_weigh(kind, kind.residuals(state))[0]))
+
+    def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms) -> float:
+        """Add what the factors of a kind, by its number, have at a state to terms; return their share of the value."""
+        residual, jacobian = kind.residuals(state), kind.jacobians(state)
+        cost, weight = _weigh(kind, residual)
+        turned = np.swapaxes(jacobian * weight[:, None, None, None], -1, -2)
+        column, pair = self._column[kind.keyframes], self._pair[number]
+        for a in range(column.shape[1]):
+            rows = np.flatnonzero(column[:, a] >= 0)
+            mine = turned[rows, a]
+            np.add.at(terms.gradient, column[rows, a], (mine @ residual[rows, :, None])[..., 0])
+            np.add.at(terms.diagonal, column[rows, a], mine @ jacobian[rows, a])
+        for place, (a, b) in enumerate(itertools.combinations(range(column.shape[1]), 2)):
+            for low, high in ((a, b), (b, a)):
+                rows = np.flatnonzero((pair[:, place] >= 0) & (column[:, low] < column[:, high]))
+                np.add.at(terms.pairs.blocks, pair[rows, place], turned[rows, low] @ jacobian[rows, high])
+        return 0.5 * float(np.sum(cost))
+
+    @staticmethod
+    def _keys(column: IntArray, n: int) -> IntArray:
+        """Return a key of the pair of free keyframes at each two places of a factor, (n, n_places), -1 for none."""
+        keys = []
+        for a, b in itertools.combinations(range(column.shape[1]), 2):
+            low, high = np.minimum(column[:, a], column[:, b]), np.maximum(column[:, a], column[:, b])
+            keys.append(np.where(low >= 0, low * n + high, -1))
+        return np.stack(keys, axis=1) if keys else np.empty((len(column), 0), np.intp)
+
+    def _stepped(self, state: State, terms: FactorTerms) -> FactorTerms:
+        """Return terms by the steps of the parameterisation in place of local ones."""
+        if self._parameterisation == "local":
+            return terms
+        rotation = state.rotation[self._free]
+        turn = np.zeros((len(rotation), 6, 6))
+        turn[:, :3, :3] = geometry.right_jacobian(geometry.so3_log(rotation))
+        turn[:, 3:, 3:] = np.swapaxes(rotation, 1, 2)
+        back = np.swapaxes(turn, 1, 2)
+        return FactorTerms(
+            terms.value,
+            (back @ terms.gradient[:, :, None])[..., 0],
+            back @ terms.diagonal @ turn,
+            replace(terms.pairs, blocks=back[self.rows] @ terms.pairs.blocks @ turn[self.columns]),
+        )
+
+
+def check_common(kind: KeyframeFactors, n_keyframes: int) -> None:
+    """Raise ProblemError if factors of a kind name keyframes that do not exist, or a loss."""
+    bad = (kind.keyframes < 0) | (kind.keyframes >= n_keyframes)
+    if bad.any():
+        row, place = np.argwhere(bad)[0]
+        what = f"keyframe index {kind.keyframes[row, place]} is out of range [0, {n_keyframes})"
+        raise ProblemError(f"factor {row} ({type(kind).__name__}): {what}")
+    if kind.loss not in loss.LOSSES or not (np.isfinite(kind.loss_scale) and kind.loss_scale > 0.0):
+        known = ", ".join(loss.LOSSES)
+        raise ProblemError(
+            f"factors ({type(kind).__name__}) with loss {kind.loss!r} of scale {kind.loss_scale}: expected one of"
+            f" {known} with a scale > 0"
+        )
+
+
+def _weigh(kind: KeyframeFactors, residual: FloatArray) -> loss.CostAndWeight:
+    return loss.evaluate(kind.loss, np.sqrt(np.sum(residual * residual, axis=1)), kind.loss_scale)
