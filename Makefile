@@ -9,7 +9,7 @@ ARGS ?=
 RUN := .venv/bin/python
 CHECKED := ba_node benchmarks tests tools setup.py $(wildcard launch/*.py)
 
-.PHONY: help setup demo test sanitize bench lint format clean
+.PHONY: help setup demo test fuzz soak sanitize bench lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
@@ -22,6 +22,9 @@ demo: setup ## play a recording into the node over DDS, compare with ground trut
 
 test: setup ## run the tests
 	@$(RUN) -m pytest $(ARGS)
+
+fuzz: setup ## give readers and back-end 50 000 broken files and 200 000 broken messages (about 20 minutes)
+	@$(RUN) -m tests.fuzz $(ARGS)
 
 sanitize: setup ## run the tests of the C++ kernels under AddressSanitizer and UndefinedBehaviourSanitizer
 	@sh tools/sanitize.sh $(ARGS)

@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +21,19 @@ TRUTH_TOPIC = "ground_truth/pose"
 TRUTH_TYPE = "geometry_msgs/msg/PoseStamped"
 
 
-def record(path: Path | str, timeline: Iterable[tuple[str, int, Measurement]], truth: Poses | None = None) -> int:
+def record(
+    path: Path | str,
+    timeline: Iterable[tuple[str, int, Measurement]],
+    truth: Poses | None = None,
+    camera_info: Mapping[str, Any] = MappingProxyType({}),
+) -> int:
     """Write a recording; return the number of messages.
 
     Args:
         path: the file.
         timeline: topic (one of INPUT_TYPES), stamp in ns, measurement; the rig before the tracks.
         truth: true poses, by keyframe id, to be written beside the keyframes; None for none.
+        camera_info: fields of every CameraInfo that differ from what the rig says, those of ``roi`` as a mapping.
 
     Raises:
         BagError: a message cannot be written.
@@ -40,6 +48,8 @@ def record(path: Path | str, timeline: Iterable[tuple[str, int, Measurement]], t
             if isinstance(measurement, CameraRig):
                 names = measurement.names
                 message = rig_message(ROSBAGS_FACTORY, measurement, stamp_ns)
+                for info in message.cameras:
+                    _set(info, camera_info)
             elif isinstance(measurement, Keyframe):
                 fixed_frame = measurement.frame_id
                 message = keyframe_message(ROSBAGS_FACTORY, measurement)
@@ -74,6 +84,14 @@ def read_truth(reader: BagReader) -> Poses | None:
     position = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
     orientation = np.array([(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses])
     return Poses(np.arange(len(order), dtype=np.uint64), stamps[order], position[order], orientation[order])
+
+
+def _set(message: Any, fields: Mapping[str, Any]) -> None:
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            _set(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
 
 
 def _true_pose(truth: Poses, row: int, frame_id: str) -> object:

@@ -1,0 +1,153 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Readers of files as functions of bytes: each takes what is in the file, whatever it is."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import struct
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.io import ros_types
+from ba_node.io.bal import BalProblem, read_bal, write_bal
+from ba_node.io.map_file import load_map, write_map
+from ba_node.io.mcap import BagReader
+from ba_node.io.parameters import configure, parameters_yaml
+from ba_node.io.ply import read_ply, write_ply
+from ba_node.io.trajectory import read_tum, write_tum
+from ba_node.offline.recording import read_truth, record
+from ba_node.synthetic.faults import MONO, SOUND, spoiled
+
+Reader = Callable[[Path], object]
+_TINY: dict[str, Any] = {"keyframes": 3, "length_m": 10.0, "landmarks": 200, "tracks": 12}
+_MEMBER = struct.Struct("<HI")
+
+
+def read_recording(path: Path) -> None:
+    """Read a recording as a replay does, to its end."""
+    with BagReader(path) as reader:
+        for _ in reader.measurements():
+            pass
+        read_truth(reader)
+
+
+def read_plain_map(path: Path) -> None:
+    """Pack members as they come into an archive with right checksums, and load that as a map.
+
+    A member is a name of n bytes and a content of m bytes behind the two lengths: a change of a byte reaches the reader
+    of arrays, which it seldom does behind a checksum.
+    """
+    data, stream = path.read_bytes(), io.BytesIO()
+    offset = 0
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as file, warnings.catch_warnings():
+        # It warns of names that come twice, but writes them.
+        warnings.simplefilter("ignore")
+        while offset + _MEMBER.size <= len(data) and len(file.filelist) < 100:
+            n, m = _MEMBER.unpack_from(data, offset)
+            name = data[offset + _MEMBER.size :][:n].decode("latin-1")
+            file.writestr(zipfile.ZipInfo(name), data[offset + _MEMBER.size + n :][:m])
+            offset += _MEMBER.size + n + m
+    path.write_bytes(stream.getvalue())
+    load_map(path, Config().scene)
+
+
+def _packed(suffix: str, pack: Callable[[bytes], bytes]) -> Reader:
+    def read(path: Path) -> None:
+        packed = path.with_suffix(suffix)
+        packed.write_bytes(pack(path.read_bytes()))
+        read_bal(packed)
+
+    return read
+
+
+# Name -> what reads a file.
+READERS: dict[str, Reader] = {
+    "mcap": read_recording,
+    "mcap_packed": read_recording,
+    "tum": read_tum,
+    "bal": read_bal,
+    "bal_bz2": _packed(".bz2", bz2.compress),
+    "bal_gz": _packed(".gz", gzip.compress),
+    "bal_bz2_raw": lambda path: read_bal(path.rename(path.with_suffix(".bz2"))),
+    "ply": read_ply,
+    "yaml": lambda path: configure(path, {}),
+    "map": lambda path: load_map(path, Config().scene),
+    "map_members": read_plain_map,
+}
+
+
+def seeds() -> dict[str, list[bytes]]:
+    """Return whole files for every reader."""
+    with TemporaryDirectory() as name:
+        return _seeds(Path(name))
+
+
+def _seeds(folder: Path) -> dict[str, list[bytes]]:
+    recording = spoiled(SOUND, MONO, **_TINY, guesses=True)
+    record(folder / "a.mcap", recording.timeline, recording.sound.truth)
+    backend = Backend(Config())
+    for measurement in recording.measurements:
+        backend.add(measurement)
+    backend.flush(final=True)
+    estimate = backend.solve()
+    assert estimate is not None
+    write_tum(folder / "a.tum", estimate.trajectory)
+    write_ply(folder / "a.ply", estimate.cloud, "map")
+    write_map(folder / "a.npz", backend.snapshot())
+    rng = np.random.default_rng(0)
+    write_bal(folder / "a.txt", _bal(rng))
+    read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "ply", "npz", "txt")}
+    yaml = parameters_yaml(Config()).encode()
+    return {
+        "mcap": [_unpacked(folder / "a.mcap", chunked) for chunked in (True, False)],
+        "mcap_packed": [read["mcap"]],
+        "tum": [read["tum"]],
+        "bal": [read["txt"]],
+        "bal_bz2": [read["txt"]],
+        "bal_gz": [read["txt"]],
+        "bal_bz2_raw": [bz2.compress(read["txt"])],
+        "ply": [read["ply"]],
+        "yaml": [yaml, b"a: &a [1, 2]\nb: *a\nsolver: {max_iterations: 3}\n"],
+        "map": [read["npz"]],
+        "map_members": [_members(folder / "a.npz")],
+    }
+
+
+def _bal(rng: np.random.Generator) -> BalProblem:
+    camera, point = (index.ravel() for index in np.meshgrid(np.arange(2), np.arange(4), indexing="ij"))
+    cameras = np.hstack([rng.normal(size=(2, 6)).round(2), np.tile([500.0, 0.0, 0.0], (2, 1))])
+    return BalProblem(cameras, rng.normal(size=(4, 3)).round(2), camera, point, rng.normal(size=(8, 2)).round(1))
+
+
+def _unpacked(path: Path, chunked: bool) -> bytes:
+    """Return a recording without compression and checksums, so that a changed byte reaches the decoders."""
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=4096, compression=CompressionType.NONE, use_chunking=chunked, enable_crcs=False)
+    writer.start("ros2")
+    channels: dict[str, int] = {}
+    with BagReader(path) as reader:
+        for topic, kind, time_ns, data in reader.messages():
+            if topic not in channels:
+                text = ros_types.schema_text(kind).encode()
+                channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+            writer.add_message(channels[topic], time_ns, data, time_ns)
+    writer.finish()  # type: ignore[no-untyped-call]
+    return stream.getvalue()
+
+
+def _members(path: Path) -> bytes:
+    with zipfile.ZipFile(path) as file:
+        parts = [(item.encode("latin-1"), file.read(item)) for item in file.namelist()]
+    return b"".join(_MEMBER.pack(len(name), len(content)) + name + content for name, content in parts)
