@@ -396,8 +396,8 @@ class Backend:
         self._renew(session_id, self.scene.next_cameras or self.scene.cameras)
 
     def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
-        self.scene = Scene(self.config.scene, session_id)
-        self.scene.cameras = cameras
+        refused, self.scene = self.scene.refused_rig, Scene(self.config.scene, session_id)
+        self.scene.cameras, self.scene.refused_rig = cameras, refused
         self._current, self._settled = None, False
         self._delivered.clear()
         self._report = SolveReport(reason=_UNSOLVED)

@@ -93,11 +93,13 @@ class CameraRig:
         frame_id: name of the body frame.
         names: optical frame of each camera.
         models: distortion model of each camera, as in CameraInfo.
-        intrinsics: (n, 4) fx fy cx cy, px.
+        intrinsics: (n, 4) fx fy cx cy, px of the image.
         distortion: n arrays, the coefficients as in CameraInfo.
         image_size: (n, 2) width and height, px; 0 if unknown.
         position: (n, 3) camera in the body, m.
         orientation: (n, 4) body from camera optical frame, quaternion x y z w.
+        malformed: why a camera of the message cannot be used, empty if all can.
+        notes: what was adjusted, a sentence each.
     """
 
     frame_id: str
@@ -108,6 +110,8 @@ class CameraRig:
     image_size: NDArray[np.int64]
     position: FloatArray
     orientation: FloatArray
+    malformed: str = ""
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of cameras."""

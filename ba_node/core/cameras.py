@@ -37,6 +37,8 @@ N_PARAMS = 12
 
 # For th below this the ratios of the equidistant model are taken from their series.
 _SMALL_RADIUS2 = 1e-12
+# Angles at which a lens is looked at for where its distortion folds over.
+_FOLD_STEPS = 2000
 
 
 class CameraError(ValueError):
@@ -76,7 +78,9 @@ def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> t
         name, coefficients = "plumb_bob", coefficients[:0]
     if name not in _NAMES:
         known = ", ".join(_NAMES)
-        raise CameraError(f"distortion model {name!r} is not supported: rectify the images or use one of {known}")
+        raise CameraError(
+            f"distortion_model {name!r} is not supported: choose one of {known}, or rectify the images and send no d"
+        )
     model, counts = _NAMES[name]
     if len(coefficients) > max(counts) and not np.any(coefficients[max(counts) :]):
         coefficients = coefficients[: max(counts)]
@@ -91,6 +95,31 @@ def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> t
     params[:4] = intrinsics
     params[4 : 4 + len(coefficients)] = coefficients
     return model, params
+
+
+def widest(model: Model, params: FloatArray) -> float:
+    """Return how far from the axis a distorted ray may lie and be the image of one ray alone; inf without a limit.
+
+    Beyond it the distortion folds over: the image of rays farther out turns back. Tangential terms are left out.
+
+    Args:
+        model: of the camera.
+        params: (12,) of the camera.
+    """
+    if not params[DISTORTION].any():
+        return np.inf
+    angle = np.linspace(0.0, np.pi if model == Model.EQUIDISTANT else np.deg2rad(89.0), _FOLD_STEPS)
+    with np.errstate(all="ignore"):
+        if model == Model.EQUIDISTANT:
+            t2 = angle * angle
+            k1, k2, k3, k4 = params[4:8]
+            radius = angle * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        else:
+            radial = np.where(np.isin(np.arange(N_PARAMS), (6, 7)), 0.0, params)
+            ray = np.stack([np.tan(angle), np.zeros(_FOLD_STEPS)], axis=1)
+            radius = _rational(ray, radial[None, DISTORTION])[0][:, 0]
+        turns = np.flatnonzero(~(np.diff(radius) > 0.0))
+    return float(radius[turns[0]]) if len(turns) else np.inf
 
 
 def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-# Fields of the inputs that nothing here reads, so that a recording may have them otherwise.
-_UNREAD = frozenset({"covariance", "r", "p", "binning_x", "binning_y", "roi"})
+# Fields of the inputs that nothing here reads, so that a recording may have them otherwise, and those it may lack.
+_UNREAD = frozenset({"covariance", "r", "p"})
+_OPTIONAL = frozenset({"binning_x", "binning_y", "roi"})
 
 
 class TypeMismatchError(ValueError):
@@ -128,7 +129,7 @@ def _differences(type_name: str, theirs: Typestore) -> Iterator[str]:
         return
     found = dict(theirs.fielddefs[type_name][1])
     for name, expected in typestore().fielddefs[type_name][1]:
-        if name in _UNREAD:
+        if name in _UNREAD or (name in _OPTIONAL and name not in found):
             continue
         if name not in found:
             yield f"{type_name} has no field {name} (expected {_show(expected)})"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages.camera_info import Lens, lens_of
 from ba_node.messages.factory import (
     ConversionError,
     MessageFactory,
@@ -53,14 +54,17 @@ INPUT_TYPES = {
 }
 
 
+_NO_LENS = Lens(np.zeros(4), np.zeros(0), np.zeros(2, np.int64))
+
+
 def measurement_from_message(type_name: str, msg: Any) -> Measurement:
     """Return what an input message says.
 
-    Arrays of a message that do not fit together are not an error here: the measurement says so in
-    ``malformed``, and the scene counts it.
+    Arrays of a message that do not fit together, or a camera that cannot be, are not an error here: the measurement
+    says so in ``malformed``, and the scene counts it.
 
     Raises:
-        ConversionError: the type is not an input, or a camera rig cannot be read.
+        ConversionError: the type is not an input.
     """
     if type_name == INPUT_TYPES["keyframes"]:
         return _keyframe(msg)
@@ -130,34 +134,38 @@ def _guesses(msg: Any) -> LandmarkGuesses:
 def _rig(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
     """Return the rig; without poses the cameras sit at the origin of the body."""
     n = len(cameras)
+    names = tuple(str(info.header.frame_id) for info in cameras)
+    read = [_lens(info) for info in cameras]
+    lenses, wrong = [lens for lens, _ in read], ""
     if poses is not None and len(poses) != n:
-        raise ConversionError(
-            f"camera rig {frame_id!r}: cameras has {n} entries, body_from_camera {len(poses)}:"
-            " expected one pose for each camera"
-        )
-    if n == 0:
-        raise ConversionError(f"camera rig {frame_id!r}: no cameras")
-    matrices = np.array([_array(info.k, np.float64) for info in cameras])
-    skewed = np.flatnonzero(matrices[:, 1] != 0.0)
-    if len(skewed):
-        raise ConversionError(
-            f"camera rig {frame_id!r}: camera {skewed[0]}: skew k[1] = {matrices[skewed[0], 1]:g}: expected 0"
-        )
-    if poses is None:
-        position, orientation = np.zeros((n, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    else:
+        wrong = f"cameras has {n} entries, body_from_camera {len(poses)}: expected one pose for each camera"
+    for i, (_, why) in enumerate(read):
+        if why:
+            wrong = wrong or f"camera {i} ({names[i]!r}): {why}"
+    position, orientation = np.zeros((n, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    if poses and not wrong:
         position = np.array([_xyz(pose.position) for pose in poses])
         orientation = np.array([_xyzw(pose.orientation) for pose in poses])
     return CameraRig(
         frame_id=frame_id,
-        names=tuple(str(info.header.frame_id) for info in cameras),
+        names=names,
         models=tuple(str(info.distortion_model) for info in cameras),
-        intrinsics=matrices[:, [0, 4, 2, 5]],
-        distortion=tuple(_array(info.d, np.float64) for info in cameras),
-        image_size=np.array([[info.width, info.height] for info in cameras], dtype=np.int64),
+        intrinsics=np.array([lens.intrinsics for lens in lenses]).reshape(-1, 4),
+        distortion=tuple(lens.distortion for lens in lenses),
+        image_size=np.array([lens.image_size for lens in lenses], dtype=np.int64).reshape(-1, 2),
         position=position,
         orientation=orientation,
+        malformed=wrong,
+        notes=tuple(f"camera {i} ({names[i]!r}): {lens.note}" for i, lens in enumerate(lenses) if lens.note),
     )
+
+
+def _lens(info: Any) -> tuple[Lens, str]:
+    """Return the camera of a message, and why it cannot be used."""
+    try:
+        return lens_of(info), ""
+    except ConversionError as error:
+        return _NO_LENS, str(error)
 
 
 def _xyz(vector: Any) -> NDArray[np.float64]:

@@ -107,6 +107,9 @@ def replay(
             run.end(options.optimize)
             if not run.sessions:
                 raise ReplayError(f"{bag}: no keyframe in it can be used{_why(reader, run)}")
+            if run.backend.scene.cameras is None:
+                refused = run.backend.scene.refused_rig or "none came"
+                raise ReplayError(f"{bag}: no camera rig that can be used: {refused}")
         truth = read_truth(reader)
         report = {"bag": bag.name, **_write(out, run.sessions, truth)}
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))

@@ -46,7 +46,7 @@ class Inputs(Component):
         try:
             measurement: Measurement | None = measurement_from_message(kind, message)
             if isinstance(measurement, CameraRig):
-                measurement = self.host.place_cameras(measurement) if self._is_news(topic, measurement) else None
+                measurement = self._placed(measurement) if self._is_news(topic, measurement) else None
             if measurement is None:
                 return
             self.host.inbox.put(measurement, time.monotonic())
@@ -54,6 +54,11 @@ class Inputs(Component):
             counted["unreadable"] += 1
             name = self.host.node.resolve_topic_name(topic)
             self.host.log(Notice("unreadable", f"{name}: {error}; dropped (unreadable = {counted['unreadable']})"))
+
+    def _placed(self, rig: CameraRig) -> CameraRig | None:
+        for note in rig.notes:
+            self.host.log(Notice("camera_adjusted", note))
+        return rig if rig.malformed else self.host.place_cameras(rig)
 
     def _came_twice(self, topic: str, message: Any) -> bool:
         """Return True for what the other subscription of this topic has brought already."""
@@ -68,5 +73,6 @@ class Inputs(Component):
         if topic == "camera_info" and "camera_rig" in self._rigs:
             self.host.log(Notice("camera_info", "camera_info is ignored: camera_rig has told the cameras"))
             return False
-        self._rigs[topic] = content
+        if not rig.malformed:
+            self._rigs[topic] = content
         return not known

@@ -30,6 +30,8 @@ DEPTH_RANGE_M = (1e-3, 1e6)
 MAX_POSITION_M = 1e9
 MAX_GUESS_M = 1e12
 _MIN_QUATERNION_NORM = 1e-6
+# A distortion that folds over within this share of the way from the principal point to the border is no calibration.
+_FOLD_REFUSED = 0.5
 _STAMP = np.iinfo(np.int64)
 
 
@@ -115,6 +117,9 @@ def clean_guesses(guesses: LandmarkGuesses, log: RejectionLog) -> LandmarkGuesse
 def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
     """Return the cameras of a rig, or None (counted) if one of them cannot be used."""
     n = len(rig)
+    if rig.malformed:
+        log.reject("bad_rig", f"camera rig {rig.frame_id!r}: {rig.malformed}")
+        return None
     shapes = (np.shape(rig.intrinsics), np.shape(rig.position), np.shape(rig.orientation), len(rig.distortion))
     if n == 0 or shapes != ((n, 4), (n, 3), (n, 4), n):
         log.reject("bad_rig", f"camera rig of {n} cameras: shapes {shapes}, expected ({n}, 4), ({n}, 3), ({n}, 4), {n}")
@@ -127,11 +132,32 @@ def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
             return None
         try:
             model[i], params[i] = cameras.parameters(rig.models[i], rig.intrinsics[i], rig.distortion[i])
+            _check_fold(f"camera {i} ({rig.names[i]!r})", cameras.Model(model[i]), params[i], rig.image_size[i], log)
         except cameras.CameraError as error:
-            log.reject("unknown_model", f"camera {i} of the rig: {error}")
+            log.reject("unknown_model", f"camera {i} ({rig.names[i]!r}): {error}")
             return None
     rotation, translation = geometry.inverse(geometry.matrix_from_quaternion(rig.orientation), rig.position)
     return Cameras(rotation, translation, model, params)
+
+
+def _check_fold(
+    name: str, model: cameras.Model, params: FloatArray, size: NDArray[np.int64], log: RejectionLog
+) -> None:
+    """Raise CameraError if a distortion folds over near the middle of the image, warn if it does so farther out.
+
+    Corners are let pass: those of a fisheye's image are black.
+    """
+    focal, centre = params[: cameras.CX], params[cameras.CX : cameras.DISTORTION.start]
+    nearest = float(np.min(np.concatenate([centre, size - centre]) / np.tile(focal, 2)))
+    limit = cameras.widest(model, params) if nearest > 0.0 else np.inf
+    if limit >= nearest:
+        return
+    limit_px, nearest_px = limit * focal.min(), nearest * focal.min()
+    where = f"folds over {limit_px:.0f} px from the principal point; the image reaches {nearest_px:.0f} px"
+    if limit < _FOLD_REFUSED * nearest:
+        raise cameras.CameraError(f"the distortion {where}: d is not that of this camera, calibrate it again")
+    text = f"{name}: the distortion {where}: observations beyond have no ray; calibrate it again"
+    log.warn("distortion_folds", text=text)
 
 
 def seen_from_first(rig: CameraRig) -> CameraRig:

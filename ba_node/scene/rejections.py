@@ -15,8 +15,9 @@ REASONS: dict[str, str] = {
     "bad_depth": "A depth outside [1e-3, 1e6] m; the pixel is used without it.",
     "bad_pose": "A keyframe whose position is not finite or beyond 1e9 m, or whose quaternion is not finite or zero.",
     "bad_guess": "A guess that is not finite or beyond 1e12 m.",
-    "bad_rig": "A camera rig without cameras, or with poses that are not finite or quaternions that are zero.",
-    "unknown_model": "A camera rig with a camera that cannot be used (distortion model, coefficients, focal length).",
+    "bad_rig": "A camera rig without cameras, with a k, region or binning that no camera has, or with poses that are"
+    " not finite or quaternions that are zero.",
+    "unknown_model": "A camera rig with a camera that cannot be used (distortion model, coefficients).",
     "rig_changed": "Another camera rig while a session has observations; it is used from the next session on.",
     "unknown_camera": "A tracks message whose camera_index is not in the rig.",
     "unknown_keyframe": "A tracks message whose keyframe never came.",
@@ -30,12 +31,14 @@ REASONS: dict[str, str] = {
 NOTICES: dict[str, str] = {
     "reordered": "A keyframe whose stamp lies before the newest one; it was sorted in.",
     "repeated_guess": "A second guess for a track; the first one stays.",
+    "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
 }
 
 # What somebody has to know or mend: kind -> what it is about. Said on the terminal, in report.json, on /diagnostics and
 # in ba_msgs/SolverReport; a replay that has any ends with another exit code than 0.
 WARNINGS: dict[str, str] = {
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
+    "distortion_folds": "A camera whose distortion folds over inside its image.",
 }
 
 NOTES_KEPT = 50

@@ -35,6 +35,7 @@ class Scene:
         session_id: the session, None before the first message that names one.
         frame_id: name of the fixed frame.
         cameras: the rig, None before it came.
+        refused_rig: why the last rig that was refused was, empty if none was.
         keyframes: table, in order of arrival; see ``order``.
         landmarks: table, in order of arrival.
         sightings: table, in order of arrival.
@@ -49,6 +50,7 @@ class Scene:
         self.frame_id = ""
         self.cameras: Cameras | None = None
         self.next_cameras: Cameras | None = None
+        self.refused_rig = ""
         self.keyframes = Keyframes()
         self.landmarks = Landmarks()
         self.sightings = Sightings()
@@ -172,7 +174,10 @@ class Scene:
 
     def _set_rig(self, rig: CameraRig) -> None:
         cameras = ingest.rig_cameras(rig, self.log)
-        if cameras is None or (self.cameras is not None and _same(cameras, self.cameras)):
+        if cameras is None:
+            self.refused_rig = self.log.notes[-1].rpartition("; dropped")[0]
+            return
+        if self.cameras is not None and _same(cameras, self.cameras):
             return
         if len(self.sightings):
             # The rig has no session of its own: it may belong to a session that is about to begin.
@@ -180,6 +185,7 @@ class Scene:
             self.log.reject("rig_changed", f"another camera rig ({len(rig)} cameras) in session {self.session_id}")
             return
         self.cameras = cameras
+        self.log.notice("adjusted_camera", len(rig.notes))
         self._place_pending()
 
     def _add_keyframe(self, keyframe: Keyframe) -> None:
@@ -267,7 +273,9 @@ class Scene:
     def _reject_waiting(self, tracks: FeatureTracks) -> None:
         what = f"tracks of camera {tracks.camera_index} wait for keyframe {tracks.keyframe_id}"
         if tracks.keyframe_id in self._keyframe_rows:
-            self.log.reject("pending_overflow", f"{what} and the camera rig, which never came")
+            refused = f"a camera rig that can be used; refused was: {self.refused_rig}"
+            waits_for = refused if self.refused_rig else "the camera rig, which never came"
+            self.log.reject("pending_overflow", f"{what} and {waits_for}")
         else:
             self.log.reject("unknown_keyframe", f"{what}, which never came")
 

@@ -129,6 +129,8 @@ def select(scene: Scene, config: Config, end: int | None = None) -> Selection | 
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:
+    if scene.cameras is None and scene.refused_rig:
+        return f"no camera rig that can be used: {scene.refused_rig}"
     if scene.cameras is None:
         return "no camera rig yet: nothing is known about the cameras"
     if len(window) == 0:

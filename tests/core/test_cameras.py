@@ -125,7 +125,7 @@ def test_zeros_beyond_the_model_and_an_empty_name_are_let_pass() -> None:
     ("name", "k", "d", "words"),
     [
         ("thin_prism", K, [], "thin_prism"),
-        ("", K, [0.1, 0.0, 0.0, 0.0], "distortion model ''"),
+        ("", K, [0.1, 0.0, 0.0, 0.0], "distortion_model '' is not supported: choose one of"),
         ("rational_polynomial", K, [0.1] * 12, "12 coefficients"),
         ("plumb_bob", K, [0.1, 0.2, 0.3], "3 coefficients"),
         ("plumb_bob", [0.0, 500.0, 1.0, 1.0], [], "focal"),
@@ -136,3 +136,36 @@ def test_zeros_beyond_the_model_and_an_empty_name_are_let_pass() -> None:
 def test_bad_cameras_are_refused_by_name(name: str, k: list[float], d: list[float], words: str) -> None:
     with pytest.raises(cameras.CameraError, match=words):
         cameras.parameters(name, np.asarray(k), np.asarray(d))
+
+
+def _turning_point(name: str, d: list[float]) -> tuple[float, float]:
+    """Return the radius where widest() says that a distortion folds, and where the projection itself turns back."""
+    model, params = cameras.parameters(name, np.array([1.0, 1.0, 0.0, 0.0]), np.array(d))
+    top = np.deg2rad(88.5)
+    angle = np.linspace(1e-3, top, 20_001)
+    x = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
+    u = cameras.project(x, np.array([model], np.uint8), params[None])[:, 0]
+    back = np.flatnonzero(np.diff(u) <= 0.0)
+    return cameras.widest(model, params), float(u[back[0]]) if len(back) else np.inf
+
+
+@pytest.mark.parametrize(
+    ("name", "d"),
+    [
+        ("plumb_bob", [-0.5, 0.0, 0.0, 0.0]),
+        ("plumb_bob", [-0.3, 0.1, 0.0, 0.0, -0.05]),
+        ("rational_polynomial", [0.5, -0.2, 0.0, 0.0, -0.01, 0.9, 0.1, 0.0]),
+        ("equidistant", [-0.2, 0.0, 0.0, 0.0]),
+        ("equidistant", [0.01, -0.05, 0.0, -0.02]),
+    ],
+)
+def test_where_a_distortion_folds_over(name: str, d: list[float]) -> None:
+    said, found = _turning_point(name, d)
+    assert np.isfinite(found)
+    assert said == pytest.approx(found, rel=1e-4)
+
+
+def test_sound_distortions_do_not_fold() -> None:
+    assert _turning_point("plumb_bob", [0.1, 0.02, 0.0, 0.0]) == (np.inf, np.inf)
+    assert _turning_point("equidistant", [0.01, 0.001, 0.0, 0.0]) == (np.inf, np.inf)
+    assert _turning_point("plumb_bob", [0.0] * 5) == (np.inf, np.inf)

@@ -231,7 +231,8 @@ def test_a_rig_of_unequal_lengths_is_counted(tmp_path: Path, rig: CameraRig) -> 
     message = rig_message(F, rig, 0)
     message.body_from_camera.pop()
     payload = ros_types.encode(INPUT_TYPES["camera_rig"], message)
-    found, reader = read(tmp_path / "t.mcap", rewrite(rig, "camera_rig", payload=payload))
-    assert reader.rejected == {"undecodable": 1}
-    assert "cameras has 2 entries, body_from_camera 1" in reader.rejection_notes[0]
-    assert len(found) == 8
+    (tmp_path / "t.mcap").write_bytes(rewrite(rig, "camera_rig", payload=payload))
+    with BagReader(tmp_path / "t.mcap") as reader:
+        rigs = [measurement for _, _, measurement in reader.measurements() if isinstance(measurement, CameraRig)]
+    assert not reader.rejected
+    assert sum(found.malformed.startswith("cameras has 2 entries, body_from_camera 1") for found in rigs) == 1
