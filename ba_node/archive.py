@@ -138,6 +138,10 @@ def _report_from(content: MapContent) -> SolveReport:
             name = facts.fact(field.name, str)
             require(name in Status.__members__, f"status = {name!r}, expected one of {', '.join(Status.__members__)}")
             values[field.name] = Status[name]
+        elif field.name == "warnings":
+            lines = facts.fact(field.name, list)
+            require(all(type(line) is str for line in lines), f"warnings = {lines!r}, expected texts")
+            values[field.name] = tuple(lines)
         else:
             default = field.default
             values[field.name] = facts.fact(field.name, (int, float) if type(default) is float else type(default))
