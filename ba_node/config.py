@@ -319,6 +319,12 @@ class NodeConfig:
         maximum=100_000,
         live=False,
     )
+    map_folder: str = _param(
+        "~/.ros/ba_node",
+        "Folder that ~/save_map and ~/load_map work in: what clients name is below it. / for any file; empty: both"
+        " services refuse.",
+        live=False,
+    )
     queue_depth: int = _param(100, "QoS depth of the input subscriptions.", minimum=1, maximum=100_000, live=False)
     silence_s: float = _param(
         10.0,

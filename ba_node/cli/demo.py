@@ -31,11 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the demo."""
+    from ba_node.io.files import locked_folder  # noqa: PLC0415
     from ba_node.offline.demo import run as run_demo  # noqa: PLC0415
     from ba_node.offline.demo import shipped_bag, write  # noqa: PLC0415
 
-    outcome = run_demo(args.bag or shipped_bag(), args.out, lambda text: print(text, flush=True))
-    errors = write(outcome, args.out)
+    with locked_folder(args.out):
+        outcome = run_demo(args.bag or shipped_bag(), args.out, lambda text: print(text, flush=True))
+        errors = write(outcome, args.out)
     rows = []
     for kind, unit in (("translation", "m"), ("rotation", "deg")):
         for name, error in errors.items():

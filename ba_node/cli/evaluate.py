@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from ba_node.evaluation.metrics import absolute_error  # noqa: PLC0415
+    from ba_node.io.files import whole_file  # noqa: PLC0415
     from ba_node.io.json_file import write_json  # noqa: PLC0415
     from ba_node.io.trajectory import read_tum  # noqa: PLC0415
 
@@ -72,7 +73,8 @@ def run(args: argparse.Namespace) -> int:
 
         from ba_node.evaluation.plot import Comparison, draw  # noqa: PLC0415
 
-        draw(args.plot, Comparison(None, estimate, reference, np.empty((0, 3)), args.align))
+        with whole_file(args.plot) as stream:
+            draw(stream, Comparison(None, estimate, reference, np.empty((0, 3)), args.align))
     return 0
 
 

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--final-optimize", action="store_true", help="refine all keyframes and points of the newest session at the end"
     )
     parser.add_argument(
-        "--save-map", type=Path, metavar="FILE", help="write the map at the end, as in docs/map_format.md"
+        "--save-map", type=Path, metavar="FILE", help="write the map at the end, NAME.npz; see docs/map_format.md"
     )
 
 

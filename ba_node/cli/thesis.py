@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Run what is missing and write the pages."""
     # Processor time is compared: threads that wait for each other would count.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from ba_node.io.files import locked_folder  # noqa: PLC0415
     from ba_node.thesis import catalogue  # noqa: PLC0415
     from ba_node.thesis.data_sets import DATA_SETS  # noqa: PLC0415
     from ba_node.thesis.problems import DATA  # noqa: PLC0415
@@ -76,8 +77,10 @@ def run(args: argparse.Namespace) -> int:
             show(done + int(share * task.weight), total)
             done += task.weight if share >= 1.0 else 0
 
-        sections = repetition.run(time.process_time, progress)
+        with locked_folder(args.out):
+            sections = repetition.run(time.process_time, progress)
+            page = repetition.write(sections)
     for section in sections:
         print(f"{section.experiment.heading}\n\n{section.table().markdown()}")
-    print(f"written: {repetition.write(sections)}")
+    print(f"written: {page}")
     return 0

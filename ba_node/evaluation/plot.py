@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,8 @@ class Comparison:
     kind: Kind = "se3"
 
 
-def draw(path: Path, comparison: Comparison) -> None:
-    """Write a PNG: the site from above on the left, the error over time on the right.
+def draw(target: Path | IO[bytes], comparison: Comparison) -> None:
+    """Write a PNG, to a file or a stream: the site from above on the left, the error over time on the right.
 
     The same input gives the same bytes with the same version of matplotlib.
 
@@ -71,7 +71,7 @@ def draw(path: Path, comparison: Comparison) -> None:
     if before is not None:
         change = f"{before.translation.rmse:.3f} m before, {change} after adjustment"
     figure.suptitle(f"Trajectory error (RMSE, {comparison.kind} alignment): {change}", fontsize=13)
-    figure.savefig(path, metadata={"Software": None})
+    figure.savefig(target, format="png", metadata={"Software": None})
 
 
 def _draw_site(axes: Any, comparison: Comparison, before: TrajectoryError | None, after: TrajectoryError) -> None:

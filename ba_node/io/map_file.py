@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node import __version__, archive
-from ba_node.io.files import whole_file
+from ba_node.io.files import FileKindError, open_regular, whole_file
 from ba_node.scene.map_content import MapContent, MapError
 
 if TYPE_CHECKING:
@@ -29,8 +29,12 @@ if TYPE_CHECKING:
 
 FORMAT = "ba_node map"
 VERSION = 1
+SUFFIX = ".npz"
+# Larger files are not read: such a map would not fit into the memory of most machines.
+MAX_BYTES = 2**32
 _HEAD = "map.json"
-_SUFFIX = ".npy"
+_MAX_HEAD_BYTES = 2**24
+_ARRAY = ".npy"
 # Not written, but what other tools write may be compressed.
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # What numpy, zipfile and zlib raise on archives that are cut off, altered, or made on purpose to be strange.
@@ -51,7 +55,7 @@ def write_map(path: Path | str, content: MapContent) -> None:
     with whole_file(path, durable=True) as stream, zipfile.ZipFile(stream, "w") as file:
         file.writestr(zipfile.ZipInfo(_HEAD), json.dumps(head, indent=1, allow_nan=False))
         for name, array in content.arrays.items():
-            with file.open(zipfile.ZipInfo(name + _SUFFIX), "w", force_zip64=True) as member:
+            with file.open(zipfile.ZipInfo(name + _ARRAY), "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
@@ -62,12 +66,32 @@ def read_map(path: Path | str) -> MapContent:
         MapFileError: it cannot be opened, is no map or damaged, or has a newer format.
     """
     try:
-        with Path(path).open("rb") as stream:
+        with open_regular(path, MAX_BYTES) as stream:
             return _read(stream)
+    except FileKindError as error:
+        raise MapFileError(str(error)) from None
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
     except MapFileError as error:
         raise MapFileError(f"{path}: {error}") from None
+
+
+def map_name(name: Path | str) -> Path:
+    """Return the name of the file of a map: with ``.npz`` at its end, added where it is missing."""
+    path = Path(name)
+    return path if path.suffix == SUFFIX else Path(f"{path}{SUFFIX}")
+
+
+def is_map(path: Path | str) -> bool:
+    """Return True for a file that says to be a map, of whatever version; its arrays are not looked at."""
+    try:
+        with open_regular(path, MAX_BYTES) as stream, zipfile.ZipFile(stream) as file:
+            if file.getinfo(_HEAD).file_size > _MAX_HEAD_BYTES:
+                return False
+            head = json.loads(file.read(_HEAD))
+    except (OSError, FileKindError, RecursionError, *_DAMAGE):
+        return False
+    return isinstance(head, dict) and head.get("format") == FORMAT
 
 
 def load_map(path: Path | str, config: SceneConfig) -> archive.Known:
@@ -95,8 +119,8 @@ def _read(stream: Any) -> MapContent:
             if _HEAD not in file.namelist():
                 raise MapFileError(f"not a map: it has no {_HEAD}, which save_map writes")
             facts = _head(file.read(_HEAD))
-            names = [name for name in file.namelist() if name.endswith(_SUFFIX)]
-            return MapContent({name.removesuffix(_SUFFIX): _array(file.read(name)) for name in names}, facts)
+            names = [name for name in file.namelist() if name.endswith(_ARRAY)]
+            return MapContent({name.removesuffix(_ARRAY): _array(file.read(name)) for name in names}, facts)
     except MapFileError:
         raise
     except MemoryError:

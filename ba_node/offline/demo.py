@@ -19,6 +19,7 @@ import numpy as np
 from ba_node.estimate import Cloud, Poses
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
 from ba_node.evaluation.plot import Comparison, draw
+from ba_node.io.files import whole_file
 from ba_node.io.mcap import BagReader
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
@@ -126,7 +127,8 @@ def write(outcome: Outcome, out: Path) -> dict[str, TrajectoryError]:
     write_tum(out / "ground_truth.tum", outcome.truth)
     write_ply(out / "points.ply", outcome.cloud, outcome.frame_id)
     comparison = Comparison(outcome.before, outcome.after, outcome.truth, outcome.cloud.position)
-    draw(out / "trajectory.png", comparison)
+    with whole_file(out / "trajectory.png") as stream:
+        draw(stream, comparison)
     return {
         "before": absolute_error(outcome.before, outcome.truth),
         "after": absolute_error(outcome.after, outcome.truth),
@@ -161,7 +163,9 @@ class _Process:
         self._interrupt = interrupt
 
     def __enter__(self) -> _Process:
-        with self._log.open("wb") as stream:
+        # Made anew: nothing is written through a link that stands there.
+        self._log.unlink(missing_ok=True)
+        with self._log.open("xb") as stream:
             # A session of its own: Ctrl-C in the terminal reaches this process alone, which then ends the others.
             self._process = subprocess.Popen(
                 self._command, stdout=stream, stderr=subprocess.STDOUT, start_new_session=True

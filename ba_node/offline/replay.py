@@ -8,6 +8,7 @@ report.json alone.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,9 +21,9 @@ from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.io.files import whole_file
+from ba_node.io.files import locked_folder, whole_file
 from ba_node.io.json_file import write_json
-from ba_node.io.map_file import load_map, write_map
+from ba_node.io.map_file import load_map, map_name, write_map
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
@@ -91,13 +92,15 @@ def replay(
 
     Raises:
         BagError: the recording cannot be read.
+        FolderInUseError: another process writes into the folder.
         MapFileError: the map cannot be loaded.
         ReplayError: it holds no keyframe that can be used.
         OSError: a file cannot be written.
     """
-    with BagReader(bag) as reader:
+    with contextlib.ExitStack() as stack:
+        reader = stack.enter_context(BagReader(bag))
         measurements = reader.measurements()
-        out.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(locked_folder(out))
         (out / "report.json").unlink(missing_ok=True)
         with BagWriter(out / "refined.mcap") as writer:
             run = _Run(config, writer, watch)
@@ -115,11 +118,11 @@ def replay(
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
         report["attention"] = attention(report)
-    if options.save is not None:
-        write_map(options.save, run.backend.snapshot())
-    with whole_file(out / "effective.yaml") as stream:
-        stream.write(parameters_yaml(config, comments=False).encode())
-    write_json(out / "report.json", report)
+        if options.save is not None:
+            write_map(map_name(options.save), run.backend.snapshot())
+        with whole_file(out / "effective.yaml") as file:
+            file.write(parameters_yaml(config, comments=False).encode())
+        write_json(out / "report.json", report)
     return report
 
 
