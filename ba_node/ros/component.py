@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ba_node.estimate import Estimate, SolveReport
     from ba_node.measurements import CameraRig
     from ba_node.ros.inbox import Inbox
+    from ba_node.ros.relay import Relay
     from ba_node.ros.worker import Notice, Worker
 
 
@@ -47,6 +48,7 @@ class Host:
         config: the parameters as they are now.
         inbox: where measurements and commands for the back-end go.
         worker: the solver's thread.
+        relay: brings work to the executor's thread, and knows what is owed to clients.
         log: log a Notice, the same one not more often than every few seconds.
         active: True between activate and deactivate.
         ignoring: why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken.
@@ -63,6 +65,7 @@ class Host:
     config: Config
     inbox: Inbox
     worker: Worker
+    relay: Relay
     log: Callable[[Notice], None]
     active: bool = False
     ignoring: set[str] = field(default_factory=lambda: {"inactive"})

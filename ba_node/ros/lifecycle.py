@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make rclpy's lifecycle node fit for use: requests that make no sense are answered, and failures are told.
 
-In Jazzy an invalid request raises out of the executor and is never answered (rclpy issue 1209), and what a transition
-raises is swallowed without a word. Here a request is answered with success = false and a line in the log, and a
-transition that raises is logged and ends in a state from which the node can be configured anew.
+In Jazzy an invalid request raises out of the executor and is never answered (rclpy issue 1209), and so is a parameter
+of a type that does not exist; what a transition raises is swallowed without a word. Here a request is answered with
+success = false and a line in the log, and a transition that raises is logged and ends in a state from which the node
+can be configured anew.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+from ba_node.ros.answering import answering
+from ba_node.ros.log import Severity, log
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,6 +33,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
         super().__init__(node_name, **node_options)
         self._answer = self._service_change_state.callback
         self._service_change_state.callback = self._on_request
+        for service in self.services:
+            service.callback = answering(self, service.srv_name, service.srv_type.Response, service.callback)
 
     def configure(self) -> None:
         """Acquire everything."""
@@ -90,9 +96,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
             action()
         except Exception as error:
             text = f"{name} failed: {type(error).__name__}: {error}"
-            self.get_logger().error(f"{text}\n{traceback.format_exc()}")
+            log(self, Severity.ERROR, f"{text}\n{traceback.format_exc()}")
             return TransitionCallbackReturn.ERROR
-        self.get_logger().info(f"{name}: done")
+        log(self, Severity.INFO, f"{name}: done")
         return TransitionCallbackReturn.SUCCESS
 
     def _on_request(self, request: Any, response: Any) -> Any:
@@ -108,4 +114,4 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     def _tell(self, transition: str) -> None:
         possible = sorted({item[1] for item in self._state_machine.available_transitions})
         text = f"transition {transition!r} was refused or failed; the node is {self.state}, from where it can "
-        self.get_logger().warning(text + (" or ".join(possible) or "go nowhere"))
+        log(self, Severity.WARNING, text + (" or ".join(possible) or "go nowhere"))

@@ -15,14 +15,16 @@ import rclpy
 from rclpy.exceptions import InvalidNamespaceException, InvalidNodeNameException
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
 from ba_node.ros import arguments
 from ba_node.ros.executor import NodeExecutor
+from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from types import FrameType
 
 USAGE_ERROR = 2
@@ -45,18 +47,19 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the program and its arguments; None for those of the process.
     """
     given = list(sys.argv if args is None else args)
-    with _one_interrupt():
+    with _signals() as ended:
         try:
-            rclpy.init(args=given)
+            # rclpy's own handlers end the context at once: nobody who waits for an answer could be told any more.
+            rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
         except _ARGUMENT_ERRORS as error:
             return _refuse(str(error))
         try:
-            return _run(given)
+            return _run(given, ended)
         finally:
             rclpy.try_shutdown()
 
 
-def _run(given: list[str]) -> int:
+def _run(given: list[str], ended: Callable[[], bool]) -> int:
     if arguments.asks_for_help(given):
         print(arguments.USAGE, end="")
         return 0
@@ -66,21 +69,17 @@ def _run(given: list[str]) -> int:
         node = BaNode()
     except (ConfigError, InvalidNodeNameException, InvalidNamespaceException) as error:
         return _refuse(str(error))
-    except Exception:
-        if rclpy.ok():
-            raise
-        return 0  # a signal came while the node was being made
     executor = NodeExecutor()
     executor.add_node(node)
     for text in arguments.idle_files(given, node.get_fully_qualified_name()):
-        node.get_logger().warning(text)
+        log(node, Severity.WARNING, text)
     node.start()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     # Modules, messages and the node stay for good: looking through them took the collector 14 ms at a time.
     gc.collect()
     gc.freeze()
     try:
-        _spin(executor, node)
+        _spin(executor, node, ended)
     finally:
         node.stop()
         executor.shutdown()
@@ -89,10 +88,10 @@ def _run(given: list[str]) -> int:
     return 0
 
 
-def _spin(executor: NodeExecutor, node: BaNode) -> None:
-    """Run callbacks until the context ends. One that raises, as rclpy's own do on a senseless request, is survived."""
+def _spin(executor: NodeExecutor, node: BaNode, ended: Callable[[], bool]) -> None:
+    """Run callbacks until a signal. One that raises, as rclpy's own do on a senseless request, is survived."""
     faults = 0
-    while rclpy.ok():
+    while rclpy.ok() and not ended():
         if _spin_once(executor, node):
             faults = 0
             continue
@@ -102,15 +101,14 @@ def _spin(executor: NodeExecutor, node: BaNode) -> None:
 
 
 def _spin_once(executor: NodeExecutor, node: BaNode) -> bool:
-    """Run one callback; return False if it raised."""
+    """Run one callback, after a wait that a signal may last out; return False if it raised."""
     try:
-        # On a signal rclpy first wakes the executor and then ends the context: it may find the executor asleep again.
         executor.spin_once()
     except Exception as error:
-        # A signal ends the context at any moment, also between two messages that a callback publishes.
+        # Whoever embeds the node may end the context at any moment, also between two messages of a callback.
         if isinstance(error, ExternalShutdownException) or not rclpy.ok():
             return True
-        node.get_logger().error(f"internal error, going on: {error}\n{traceback.format_exc()}")
+        log(node, Severity.ERROR, f"{fault(error)}, going on\n{traceback.format_exc()}")
         return False
     return True
 
@@ -121,24 +119,28 @@ def _refuse(reason: str) -> int:
 
 
 @contextmanager
-def _one_interrupt() -> Iterator[None]:
-    """Leave the first SIGINT to rclpy, which ends the context as on SIGTERM; a second one interrupts whatever hangs.
+def _signals() -> Iterator[Callable[[], bool]]:
+    """Note the first SIGINT or SIGTERM, for the executor to find; a second one interrupts whatever hangs.
 
-    Python's own handler, which rclpy's calls, would raise KeyboardInterrupt in the middle of any callback.
+    Python's own handler would raise KeyboardInterrupt in the middle of any callback.
+
+    Yields:
+        What tells whether one came.
     """
-    interrupts = 0
+    count = 0
 
-    def on_interrupt(_number: int, _frame: FrameType | None) -> None:
-        nonlocal interrupts
-        interrupts += 1
-        if interrupts > 1:
+    def note(_number: int, _frame: FrameType | None) -> None:
+        nonlocal count
+        count += 1
+        if count > 1:
             raise KeyboardInterrupt
 
-    previous = signal.signal(signal.SIGINT, on_interrupt)
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield lambda: count > 0
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.log import Severity, log
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate
@@ -94,5 +95,5 @@ class MapTransform(Component):
     def _say(self, words: str) -> None:
         """Tell /diagnostics, and the log when it changes to a reason why there is none."""
         if words.startswith("off") and words != self.host.tf:
-            self.host.node.get_logger().warning(f"map -> odom on /tf is {words}")
+            log(self.host.node, Severity.WARNING, f"map -> odom on /tf is {words}")
         self.host.tf = words

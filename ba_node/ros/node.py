@@ -29,10 +29,12 @@ from ba_node.ros.diagnostics import Diagnostics
 from ba_node.ros.inbox import Inbox
 from ba_node.ros.inputs import Inputs
 from ba_node.ros.lifecycle import ManagedNode
+from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.map_transform import MapTransform
 from ba_node.ros.optimize import Optimize
 from ba_node.ros.parameters import Parameters
 from ba_node.ros.publishing import Publishing
+from ba_node.ros.relay import Relay
 from ba_node.ros.services import Services
 from ba_node.ros.side_outputs import SideOutputs
 from ba_node.ros.silence import Silence
@@ -97,9 +99,12 @@ class BaNode(ManagedNode):
 
     def stop(self) -> None:
         """End the worker, during a solve after its current iteration."""
+        host = self._host
         self.cleanup()
+        if host is not None and host.relay.left_waiting:
+            time.sleep(_LINGER_S)
         if not all(worker.stop() for worker in self._leaving):
-            self.get_logger().error("the solver did not stop in time, leaving it")
+            log(self, Severity.ERROR, "the solver did not stop in time, leaving it")
 
     def configure(self) -> None:
         """Make an empty map and everything that works on it."""
@@ -109,10 +114,12 @@ class BaNode(ManagedNode):
         inbox = Inbox(config.node.inbox_size)
         backend = Backend(config, clock=time.perf_counter)
         worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
-        self._host = Host(self, config, inbox, worker, self._log)
+        relay = Relay(self, lambda: worker.alive)
+        self._host = host = Host(self, config, inbox, worker, relay, self._log)
+        host.at_cleanup.callback(relay.close)
         worker.start()
         for kind in COMPONENTS:
-            self._components.append(kind(self._host))
+            self._components.append(kind(host))
         self._settings.check_overrides()
 
     def activate(self) -> None:
@@ -138,11 +145,13 @@ class BaNode(ManagedNode):
         host, self._host = self._host, None
         host.active = False
         self._components.clear()
-        self._leaving = [worker for worker in [*self._leaving, host.worker] if not worker.stop(_STOP_S)]
-        self._refined_before += host.worker.refined
-        host.at_cleanup.close()
         self._lingering = host.after_cleanup
         self._linger_timer.reset()
+        try:
+            self._leaving = [worker for worker in [*self._leaving, host.worker] if not worker.stop(_STOP_S)]
+            self._refined_before += host.worker.refined
+        finally:
+            host.at_cleanup.close()
 
     def _end_lingering(self) -> None:
         """Destroy what was left for a moment after the last cleanup."""
@@ -186,11 +195,10 @@ class BaNode(ManagedNode):
             if not self.context.ok():
                 raise  # a signal ended the context between two messages
             name = type(component).__name__
-            text = f"internal error in {name}, going on: {type(error).__name__}: {error}\n{traceback.format_exc()}"
+            text = f"{name}, going on after an {fault(error)}\n{traceback.format_exc()}"
             self._log(Notice(f"failure {name}", text, is_error=True))
 
     def _log(self, notice: Notice) -> None:
         """Log a notice, the same one not more often than every few seconds."""
         if self._throttle.passes(notice.key, time.monotonic()):
-            log = self.get_logger()
-            (log.error if notice.is_error else log.warning)(notice.text)
+            log(self, Severity.ERROR if notice.is_error else Severity.WARNING, notice.text)

@@ -14,6 +14,7 @@ from ba_node.ros import qos
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.latency import Sliding
+from ba_node.ros.log import Severity, log
 from ba_node.ros.throttle import Throttle
 
 if TYPE_CHECKING:
@@ -97,10 +98,5 @@ class Publishing(Component):
             and not report.status.usable
             and self._throttle.passes(report.status.name, time.monotonic())
         ):
-            log = self.host.node.get_logger()
             text = f"keyframe {report.newest_keyframe_id} was not refined: {report.reason}"
-            # Two call sites, as rclpy remembers the severity of each and refuses another.
-            if report.status is Status.SKIPPED:
-                log.info(text)
-            else:
-                log.warning(text)
+            log(self.host.node, Severity.INFO if report.status is Status.SKIPPED else Severity.WARNING, text)

@@ -9,18 +9,18 @@ Files are written and read by a thread of their own, one at a time.
 from __future__ import annotations
 
 import threading
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ba_node.io.map_file import MapFileError, load_map, write_map
+from ba_node.io.map_folder import MapPathError, path_in_folder
 from ba_node.messages.commands import SERVICE_TYPES
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import message_class
-from ba_node.ros.relay import Answer, LateService, Relay
+from ba_node.ros.relay import LateService, Owed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from ba_node import archive
     from ba_node.backend import Backend
@@ -36,22 +36,22 @@ class Services(Component):
     def __init__(self, host: Host) -> None:
         """Advertise."""
         super().__init__(host)
-        self._relay = Relay(self)
-        self._busy: Answer | None = None
+        self._busy: Owed | None = None
         begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}
         for name, kind in SERVICE_TYPES.items():
             LateService(self, message_class(kind), f"~/{name}", begin[name])
 
-    def _reset(self, _request: Any, answer: Answer) -> None:
+    def _reset(self, _request: Any, answer: Owed) -> None:
         def reset(backend: Backend) -> Estimate:
             keyframes = len(backend.scene.keyframes)
             backend.reset()
-            self._give(answer, True, f"forgot {keyframes} keyframes; the next keyframe begins a new map")
+            text = f"forgot {keyframes} keyframes; the next keyframe begins a new map"
+            answer.give_later(success=True, message=text)
             return backend.estimate()
 
         self._post(answer, reset)
 
-    def _pause(self, request: Any, answer: Answer) -> None:
+    def _pause(self, request: Any, answer: Owed) -> None:
         """Ignore data, or take it again. What a solver has begun with goes on."""
         ignoring = self.host.ignoring
         was = _PAUSED in ignoring
@@ -59,92 +59,80 @@ class Services(Component):
         text = "paused: keyframes and tracks are ignored and counted" if request.data else "running"
         answer.give(success=True, message=f"{text}{' (as before)' if was == request.data else ''}")
 
-    def _save(self, request: Any, answer: Answer) -> None:
-        path = self._begin_file(request.path, answer)
+    def _save(self, request: Any, answer: Owed) -> None:
+        path = self._begin_file(request.path, answer, to_write=True)
         if path is None:
             return
 
         def copy(backend: Backend) -> None:
             content = backend.snapshot()
-            self._in_thread(answer, lambda: self._write(path, content, answer))
+            # A file is written to the end when the node ends.
+            self._in_thread(answer, lambda: self._write(path, content, answer), daemon=False)
 
         self._post(answer, copy)
 
-    def _write(self, path: Path, content: MapContent, answer: Answer) -> None:
+    def _write(self, path: Path, content: MapContent, answer: Owed) -> None:
         try:
             write_map(path, content)
         except OSError as error:
-            self._give(answer, False, f"cannot write {path}: {error.strerror or error}; nothing was saved")
+            text = f"cannot write {path}: {error.strerror or error}; nothing was saved"
+            answer.give_later(success=False, message=text)
             return
         counts = _counts(content)
-        self._give(answer, True, f"{path}: {_told(counts)}", **counts)
+        answer.give_later(success=True, message=f"{path}: {_told(counts)}", **counts)
 
-    def _load(self, request: Any, answer: Answer) -> None:
-        path = self._begin_file(request.path, answer)
+    def _load(self, request: Any, answer: Owed) -> None:
+        path = self._begin_file(request.path, answer, to_write=False)
         if path is not None:
-            self._in_thread(answer, lambda: self._read(path, answer))
+            # Nothing is lost with a read that does not come to its end.
+            self._in_thread(answer, lambda: self._read(path, answer), daemon=True)
 
-    def _read(self, path: Path, answer: Answer) -> None:
+    def _read(self, path: Path, answer: Owed) -> None:
         try:
             known = load_map(path, self.host.config.scene)
         except MapFileError as error:
-            self._give(answer, False, f"{error}; the map is as before")
+            answer.give_later(success=False, message=f"{error}; the map is as before")
             return
 
         def take_over(backend: Backend) -> Estimate:
             backend.take_over(known)
             counts = _known(known)
-            text = f"{path}: {_told(counts)} of session {known.scene.session_id or 0}"
-            self._give(answer, True, text, **counts, session_id=known.scene.session_id or 0)
+            session = known.scene.session_id or 0
+            text = f"{path}: {_told(counts)} of session {session}"
+            answer.give_later(success=True, message=text, **counts, session_id=session)
             return backend.estimate()
 
         self._post(answer, take_over)
 
-    def _begin_file(self, name: str, answer: Answer) -> Path | None:
+    def _begin_file(self, name: str, answer: Owed, *, to_write: bool) -> Path | None:
         """Return the path to work on, or None after saying why not."""
-        if self._busy:
-            answer.give(success=False, message="another map is being saved or loaded: try again when that is done")
-        elif not name or "\0" in name:
-            answer.give(success=False, message=f"path = {name!r}: expected the name of a file")
-        else:
-            self._busy = answer
-            return Path(name).expanduser()
-        return None
+        if self._busy is not None and not self._busy.given:
+            text = "another map is being saved or loaded: try again when that is done"
+            answer.give(success=False, message=text)
+            return None
+        try:
+            path = path_in_folder(name, self.host.config.node.map_folder, to_write=to_write)
+        except MapPathError as error:
+            answer.give(success=False, message=str(error))
+            return None
+        self._busy = answer
+        return path
 
-    def _post(self, answer: Answer, command: Callable[[Backend], Estimate | None]) -> None:
-        """Have the solver's thread do something; the caller hears of it if that fails."""
+    def _post(self, answer: Owed, command: Callable[[Backend], Estimate | None]) -> None:
+        """Have the solver's thread do something."""
 
         def guarded(backend: Backend) -> Estimate | None:
-            with self._telling(answer):
+            with answer.at_work():
                 return command(backend)
 
         self.host.inbox.post(guarded)
 
-    def _in_thread(self, answer: Answer, action: Callable[[], None]) -> None:
+    def _in_thread(self, answer: Owed, action: Callable[[], None], *, daemon: bool) -> None:
         def guarded() -> None:
-            with self._telling(answer):
+            with answer.at_work():
                 action()
 
-        # Not a daemon, as the solver's thread is that starts it: a file is written to the end when the node ends.
-        threading.Thread(target=guarded, name="map file", daemon=False).start()
-
-    @contextmanager
-    def _telling(self, answer: Answer) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            self._give(answer, False, f"internal error: {type(error).__name__}: {error}")
-            raise
-
-    def _give(self, answer: Answer, success: bool, message: str, **fields: int) -> None:
-        """Answer, from any thread."""
-
-        def give() -> None:
-            self._busy = None if self._busy is answer else self._busy
-            answer.give(success=success, message=message, **fields)
-            (self.host.node.get_logger().info if success else self.host.node.get_logger().warning)(message)
-
-        self._relay.call(give)
+        threading.Thread(target=guarded, name="map file", daemon=daemon).start()
 
 
 def _counts(content: MapContent) -> dict[str, int]:

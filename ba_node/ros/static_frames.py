@@ -16,6 +16,7 @@ from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import message_class
+from ba_node.ros.log import Severity, log
 from ba_node.ros.worker import Notice
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class StaticFrames(Component):
             kind = message_class(SHARED_TYPES["/tf"])
         except LookupError:
             text = "frames.extrinsics = tf_static: tf2_msgs is not installed; cameras sit where camera_rig says"
-            host.node.get_logger().warning(text)
+            log(host.node, Severity.WARNING, text)
             return
         self.subscription(kind, TF_STATIC, self._receive, qos.latched(_DEPTH))
         host.place_cameras = self._place

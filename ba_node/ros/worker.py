@@ -92,6 +92,11 @@ class Worker:
         """Return how many keyframes took part in a usable solve so far."""
         return self._ledger.refined
 
+    @property
+    def alive(self) -> bool:
+        """Return True while the thread works, or before it was started."""
+        return self._thread.ident is None or self._thread.is_alive()
+
     def start(self) -> None:
         """Begin."""
         self._thread.start()
@@ -114,7 +119,7 @@ class Worker:
             arrivals = self._inbox.drain(0.0 if self._behind else None if self._settled else self._settle_time_s)
             if self._inbox.closed:
                 return
-            self.step(arrivals)
+            self._guard(self.step, arrivals)
 
     def step(self, arrivals: list[Arrival]) -> None:
         """Take in what arrived (nothing means silence, unless there is more to solve), and solve if there is need."""
@@ -202,10 +207,13 @@ class Worker:
             self._put(Notice("clock_jump", self._backend.jump_note))
 
     def _guard(self, action: Callable[..., None], *arguments: object) -> None:
-        """Run one step of the work; a fault in it is reported and costs that step only."""
+        """Run one step of the work; a fault in it is reported and costs that step only.
+
+        One that would end the thread, as SystemExit does, is none of its business either.
+        """
         try:
             action(*arguments)
-        except Exception as error:
+        except BaseException as error:
             self._failures["internal_error"] += 1
             text = f"internal error, going on: {type(error).__name__}: {error}\n{traceback.format_exc()}"
             self._put(Notice(f"failure {type(error).__name__}", text, is_error=True))

@@ -7,12 +7,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from ba_msgs.action import Optimize
+from ba_msgs.srv import SaveMap
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
@@ -202,6 +204,32 @@ def test_goals_that_make_no_sense(start_node: StartNode, peer: Any, client: Clie
     assert node.stop() == 0
     assert "method = 'guess': choose one of auto, lma_cd" in node.err + node.out
     assert "time_budget_s = -1.0: expected seconds" in node.err + node.out
+
+
+def test_answers_that_warn_and_inform_in_turn(
+    start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, tmp_path: Path
+) -> None:
+    """A goal without data, a recording, the goal again; a save that fails, one that does not, and both again."""
+    node = start_node(*SMALL_WINDOW, "-p", f"node.map_folder:={tmp_path}")
+    peer.connect()
+    statuses = []
+    for part in (None, range(6), range(0), range(6, KEYFRAMES)):
+        if part:
+            _play(peer, scene, *part)
+        elif part is not None:
+            assert peer.call(Trigger, "ba_node/reset", Trigger.Request()).success
+        statuses.append(client.result(client.send(max_iterations=3).get_result_async()).status)
+    failed, done = GoalStatus.STATUS_ABORTED, GoalStatus.STATUS_SUCCEEDED
+    assert statuses == [failed, done, failed, done]
+    saved = [
+        peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path=path)).success
+        for path in ("none/a", "a", "none/a", "a", "../a", "b")
+    ]
+    assert saved == [False, True, False, True, False, True]
+    assert node.stop() == 0
+    text = node.err + node.out
+    assert text.count("[WARN]") >= 4 and text.count("~/optimize: ") >= 4, text
+    assert "Traceback" not in text and "severity" not in text, text
 
 
 @pytest.mark.parametrize("end", ["cleanup", "signal"])

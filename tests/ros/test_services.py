@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +34,16 @@ INACTIVE = ("--ros-args", "-p", "node.autostart:=false")
 @pytest.fixture(scope="module")
 def scene() -> SyntheticData:
     return generate(SyntheticOptions(seed=3, keyframes=KEYFRAMES, length_m=12.0, path="line", outlier_share=0.0))
+
+
+@pytest.fixture
+def start_node(start_node: StartNode, tmp_path: Path) -> StartNode:
+    """Return a function that starts a node whose maps are in the folder of the test."""
+
+    def start(*arguments: str, **options: Any) -> Any:
+        return start_node("--ros-args", "-p", f"node.map_folder:={tmp_path}", *arguments, **options)
+
+    return start
 
 
 @pytest.fixture
@@ -150,40 +161,53 @@ def test_a_saved_map_goes_on_in_another_node(
     np.testing.assert_array_equal(shown, positions)
     _play(peer, scene, *range(5, KEYFRAMES))
     assert Status(peer.received["report"][-1].status).usable
-    assert len(peer.received["path"][-1].poses) == KEYFRAMES
+    peer.until(lambda: len(peer.received["path"][-1].poses) == KEYFRAMES, "the path of all")
     assert second.stop() == 0
 
 
 def test_what_cannot_be_saved_or_loaded_is_told(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path
 ) -> None:
-    start_node()
+    node = start_node()
     peer.connect()
     _play(peer, scene, *range(3))
-    (tmp_path / "text").write_text("hello")
+    (tmp_path / "text.npz").write_text("hello")
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "link.npz").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe.npz")
     for path, reason in (
         (tmp_path / "none" / "a.npz", "cannot write .*: No such file or directory; nothing was saved"),
-        (tmp_path / "text" / "a.npz", "cannot write .*: Not a directory; nothing was saved"),
-        (tmp_path, "cannot write .*: Is a directory; nothing was saved"),
+        (tmp_path / "text.npz" / "a.npz", "cannot write .*: Not a directory; nothing was saved"),
+        (tmp_path / "folder.npz", "is no regular file"),
+        (tmp_path / "pipe.npz", "is no regular file"),
+        (tmp_path / "link.npz", "is a link"),
+        (tmp_path / "text", "text.npz is there and no map of ba_node: it is not overwritten"),
+        ("/dev/null", "leads elsewhere: expected a file below node.map_folder"),
+        ("../a", "leads elsewhere"),
         ("", "path = '': expected the name of a file"),
     ):
         answer = _save(peer, path)
         assert (answer.success, answer.keyframes) == (False, 0)
         assert _matches(reason, answer.message)
+    assert (tmp_path / "text.npz").read_text() == "hello"
 
     good = tmp_path / "good.npz"
-    assert _save(peer, good).success
+    assert _save(peer, "good").message.startswith(f"{good}: 3 keyframes")
+    assert _save(peer, good).success, "a map may be replaced"
     newer = good.read_bytes().replace(b'"version": 1', b'"version": 2')
     (tmp_path / "newer.npz").write_bytes(newer)
     (tmp_path / "cut.npz").write_bytes(good.read_bytes()[:-1000])
     np.savez(tmp_path / "foreign.npz", a=np.zeros(3))
     for path, reason in (
         (tmp_path / "none.npz", "cannot be read: No such file or directory; the map is as before"),
-        (tmp_path, "cannot be read: Is a directory"),
+        (tmp_path / "folder.npz", "is no regular file"),
+        (tmp_path / "pipe.npz", "is no regular file"),
+        (tmp_path / "link.npz", "is a link"),
         (tmp_path / "text", "not a map: expected an .npz file"),
         (tmp_path / "foreign.npz", "not a map: it has no map.json"),
         (tmp_path / "cut.npz", "cut off or damaged"),
         (tmp_path / "newer.npz", "damaged: Bad CRC-32|format version 2"),
+        ("/dev/zero", "leads elsewhere"),
         ("", "expected the name of a file"),
     ):
         answer = _load(peer, path)
@@ -192,6 +216,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
     # The map is as it was.
     _play(peer, scene, 3)
     peer.until(lambda: len(peer.received["path"][-1].poses) == 4, "the path of the map and one more")
+    assert node.stop() == 0
 
 
 def _matches(pattern: str, text: str) -> bool:
