@@ -331,7 +331,7 @@ class Backend:
             problem, methods.from_config(self.config.solver), clock=self._clock, on_iteration=on_iteration
         )
         elapsed = self._clock() - began
-        merged = window.merge(self.scene, selection, result, self.config.tracks.outlier_px, self.config.solver.backend)
+        merged = window.merge(self.scene, selection, result, self.config.tracks, self.config.solver.backend)
         figures = quality.figures(selection, result, merged.norms)
         report = dataclasses.replace(self._base_report(newest), **figures, solve_time_s=elapsed)
         return report, merged.state

@@ -61,6 +61,10 @@ class Rays:
     distance_m: FloatArray
     distance_sigma_m: FloatArray
 
+    def part(self, which: BoolArray) -> Rays:
+        """Return some of them."""
+        return Rays(**{item.name: getattr(self, item.name)[which] for item in dataclasses.fields(self)})
+
 
 @dataclass(frozen=True)
 class Triangulation:
@@ -136,6 +140,13 @@ def triangulate(rays: Rays, n_points: int, backend: str = "auto") -> Triangulati
     points = points + origin
     points[(count < 2) & ~measured] = np.nan
     return Triangulation(points, parallax(rays, n_points), measured)
+
+
+def errors(rays: Rays, points: FloatArray) -> FloatArray:
+    """Return the angle between each ray and its point, (n,) sigmas; inf where the point is behind it or NaN."""
+    away = points.take(rays.point, axis=0) - rays.centre
+    across = _length(_cross(rays.direction, away)) / np.maximum(_length(away), 1e-300)
+    return np.asarray(np.where((rays.direction * away).sum(axis=1) > 0.0, rays.px_per_rad * across, np.inf))
 
 
 def parallax(rays: Rays, n_points: int) -> FloatArray:

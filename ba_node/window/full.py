@@ -201,7 +201,7 @@ def _join(scene: Scene, config: Config, later: int) -> None:
     selection = select(scene, dataclasses.replace(config, window=wide))
     if not isinstance(selection, str):
         result = solver.solve(selection.problem, options(config.solver, max_iterations=config.solver.max_iterations))
-        merge(scene, selection, result, config.tracks.outlier_px, config.solver.backend)
+        merge(scene, selection, result, config.tracks, config.solver.backend)
 
 
 def _corrections(
@@ -273,5 +273,4 @@ def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArr
     now = dataclasses.replace(
         selection, problem=problem, sightings=problem.observations, rows=rows, keyframes=keyframes, landmarks=landmarks
     )
-    norms = native_kernels.residual_norms(problem, problem.start, config.solver.backend)
-    judge(scene, now, norms, config.tracks.outlier_px)
+    judge(scene, now, problem.start, config.tracks, config.solver.backend)

@@ -1,12 +1,12 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Choose the first position of a landmark: the front-end's guess, or a triangulation.
+"""Choose the first position of a landmark: the front-end's guess, or where its views agree that it is.
 
-The gate on the median reprojection error widens with the bulk of the points: where most have large errors, the poses
-are still bad and the points are not to blame. A guess that passes the gate is taken. Otherwise the better of the two by
-robust error is taken, so that a whole map with bad start values (pixel errors of tens) is not thrown away; a
-triangulation must have passed its own gates. Both must lie in front of the cameras: all of them for a triangulation,
-two (one with a measured depth) for a guess.
+A point is triangulated from the views that agree with each other (core/consensus.py), if they are more than a third of
+all, and show a parallax that is not noise. The gate on how far off a view may be and agree widens where most views
+agree with no other: the poses are still bad then, and the points are not to blame. A guess that passes the gate is
+taken. Otherwise the better of the two by robust error is taken, so that a whole map with bad start values (pixel errors
+of tens) is not thrown away. A guess must lie in front of two cameras (one with a measured depth).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core import loss, native_kernels, triangulation
+from ba_node.core import consensus, loss, native_kernels, triangulation
 
 if TYPE_CHECKING:
     from ba_node.config import TracksConfig
@@ -29,6 +29,12 @@ BoolArray = NDArray[np.bool_]
 # Robust error of a view with the point behind the camera, in sigmas: worse than any view that is only bad.
 _BEHIND = 1e4
 BULK = 10
+# Of a point's views more than this share has to agree: half of them may be wrong, and not all of the wrong ones apart.
+_LEAST_SUPPORT = 1.0 / 3.0
+# Two rays meet by chance more easily than three: they have to come as much nearer to each other.
+_TWO_VIEWS = 0.5
+# Parallax below this many standard deviations of the rays' directions is noise.
+_LEAST_PARALLAX = 4.0
 # Three standard deviations of a normal distribution, of which 1.4826 median absolute deviations are one.
 SPREAD = 3.0 * 1.4826
 
@@ -38,9 +44,27 @@ class _Fit:
     """How well points fit their views: views in front, median error (sigmas), summed robust error; each (n_pt,)."""
 
     in_front: NDArray[np.intp]
-    views: NDArray[np.intp]
     median: FloatArray
     robust: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """What the views of points agree on.
+
+    Attributes:
+        points: (n_pt, 3), m.
+        support: (n_pt,) how many views agree.
+        good: (n_pt,) True where that is a place to believe in.
+        measured: (n_pt,) True where a distance was measured by one that agrees.
+        gate: how far off a view may be and agree, sigmas.
+    """
+
+    points: FloatArray
+    support: NDArray[np.intp]
+    good: BoolArray
+    measured: BoolArray
+    gate: float
 
 
 def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig, backend: str = "auto") -> FloatArray:
@@ -52,20 +76,48 @@ def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig, ba
         config: the gates.
         backend: kernels.
     """
-    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points, backend)
-    fit = _fit(problem, found.points, backend)
-    wide = found.parallax_rad >= np.deg2rad(config.min_parallax_deg)
-    sound = (wide | found.measured) & (fit.in_front == fit.views) & (fit.views > 0)
-    gate = widened(config.max_triangulation_px, fit.median[sound])
-    good = sound & (fit.median <= gate)
-    points = np.where(good[:, None], found.points, np.nan)
+    found = agreed_points(problem, config, backend)
+    points = np.where(found.good[:, None], found.points, np.nan)
     if np.isnan(guess).all():
         return points
-    guess_fit = _fit(problem, guess, backend)
+    fit, guess_fit = _fit(problem, points, backend), _fit(problem, guess, backend)
     needed = np.where(found.measured, 1, 2)
     guess_usable = guess_fit.in_front >= needed
-    take_guess = guess_usable & ((guess_fit.median <= gate) | ~good | (guess_fit.robust <= fit.robust))
+    take_guess = guess_usable & ((guess_fit.median <= found.gate) | ~found.good | (guess_fit.robust <= fit.robust))
     return np.where(take_guess[:, None], guess, points)
+
+
+def agreed_points(problem: Problem, config: TracksConfig, backend: str = "auto") -> _Found:
+    """Return where most views of each point agree that it is.
+
+    Args: as of :func:`initial_points`.
+    """
+    rays, n = triangulation.rays_of(problem), problem.n_points
+    gate = config.max_triangulation_px
+    found = _consensus(rays, n, gate, config, backend)
+    views = np.bincount(rays.point, minlength=n)
+    if 2 * int(found.support.sum()) < int(views[views > 1].sum()):
+        # Most views agree with no other: the poses are bad.
+        rough = triangulation.triangulate(rays, n, backend)
+        fit = _fit(problem, rough.points, backend)
+        wide = rough.parallax_rad >= np.deg2rad(config.min_parallax_deg)
+        gate = widened(gate, fit.median[(wide | rough.measured) & (fit.in_front == views) & (views > 0)])
+        found = _consensus(rays, n, gate, config, backend)
+    return found
+
+
+def _consensus(rays: triangulation.Rays, n: int, gate: float, config: TracksConfig, backend: str) -> _Found:
+    found, agrees = consensus.triangulate(rays, n, gate, backend)
+    of = rays.part(agrees)
+    views, support = np.bincount(rays.point, minlength=n), np.bincount(of.point, minlength=n)
+    sharpness, worst = np.zeros(n), np.zeros(n)
+    np.maximum.at(sharpness, of.point, of.px_per_rad)
+    np.maximum.at(worst, of.point, triangulation.errors(of, found.points))
+    wide = found.parallax_rad >= np.deg2rad(config.min_parallax_deg)
+    wide &= found.parallax_rad * sharpness >= _LEAST_PARALLAX
+    fits = worst <= gate * np.where(support > 2, 1.0, _TWO_VIEWS)
+    good = ((wide & (support >= 2)) | found.measured) & fits & (support > _LEAST_SUPPORT * views)
+    return _Found(found.points, support, good, found.measured, gate)
 
 
 def widened(gate: float, errors: FloatArray, bulk: int = BULK) -> float:
@@ -96,7 +148,6 @@ def _fit(problem: Problem, points: FloatArray, backend: str) -> _Fit:
     cost, _ = loss.evaluate("huber", norm, 1.0)
     return _Fit(
         np.bincount(obs.point[in_front], minlength=n),
-        np.bincount(obs.point, minlength=n),
         _median_by_point(norm, obs.point, n),
         np.bincount(obs.point, cost, n).astype(float),
     )

@@ -11,10 +11,12 @@ import numpy as np
 
 from ba_node.core import geometry, native_kernels
 from ba_node.window import gauge
-from ba_node.window.initial_points import widened
+from ba_node.window.initial_points import agreed_points, widened
+from ba_node.window.problems import part_of
 
 if TYPE_CHECKING:
-    from ba_node.core.problem import State
+    from ba_node.config import TracksConfig
+    from ba_node.core.problem import Problem, State
     from ba_node.core.result import Result
     from ba_node.scene.scene import Scene
     from ba_node.scene.tables import BoolArray, FloatArray, IntArray
@@ -33,7 +35,7 @@ class Merged(NamedTuple):
     state: State | None
 
 
-def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float, backend: str = "auto") -> Merged:
+def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
     """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
     state = result.state
     if not result.status.usable or not state.is_finite():
@@ -47,9 +49,7 @@ def merge(scene: Scene, selection: Selection, result: Result, outlier_px: float,
     scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
-    whole = dataclasses.replace(selection.problem, observations=selection.sightings)
-    norms = native_kernels.residual_norms(whole, state, backend)
-    judge(scene, selection, norms, outlier_px)
+    norms = judge(scene, selection, state, tracks, backend)
     _displace(scene, selection.lost)
     return Merged(norms, state)
 
@@ -77,15 +77,23 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
     return dataclasses.replace(state, translation=translation, points=points)
 
 
-def judge(scene: Scene, selection: Selection, norm: FloatArray, outlier_px: float) -> None:
+def judge(scene: Scene, selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> FloatArray:
     """Mark the observations to leave out next time, and note the error of each point.
 
-    The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point with
-    fewer than two good views (or one with a measured depth) is in the wrong place, or its track is: it loses its
-    position, and all its views are heard again when it is next placed.
+    The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point that
+    less than half of its views believe in is placed anew where more of them agree. One with fewer than two good views
+    (or one with a measured depth) is in the wrong place, or its track is: it loses its position, and all its views are
+    heard again when it is next placed.
+
+    Returns:
+        (n_all,) sizes of the residuals, as ``Selection.norms``.
     """
-    obs, n_points = selection.sightings, selection.problem.n_points
+    obs, n_points, outlier_px = selection.sightings, selection.problem.n_points, tracks.outlier_px
+    whole = dataclasses.replace(selection.problem, observations=obs, start=state)
+    norm = native_kernels.residual_norms(whole, state, backend)
     outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
+    if outlier_px > 0:
+        _place_anew(scene, selection, whole, (norm, outlier), tracks, backend)
     scene.sightings.outlier[selection.rows] = outlier
     if outlier_px > 0:
         worth = ~outlier * np.where(np.isfinite(obs.depth_m), 2, 1) if len(obs.depth_m) else ~outlier
@@ -93,6 +101,35 @@ def judge(scene: Scene, selection: Selection, norm: FloatArray, outlier_px: floa
         _displace(scene, selection.landmarks[good < 2])
     error = norm * obs.sigma_px
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
+    return norm
+
+
+def _place_anew(
+    scene: Scene,
+    selection: Selection,
+    whole: Problem,
+    judged: tuple[FloatArray, BoolArray],
+    tracks: TracksConfig,
+    backend: str,
+) -> None:
+    """Move the points that most views contradict to where more of them agree; write their norms and outliers over."""
+    norm, outlier = judged
+    point, n_points = whole.observations.point, whole.n_points
+    good = np.bincount(point, ~outlier, n_points)
+    doubted = 2 * good < np.bincount(point, minlength=n_points)
+    rows = np.flatnonzero(doubted.take(point))
+    if not len(rows):
+        return
+    views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
+    found = agreed_points(views, tracks, backend)
+    start = dataclasses.replace(views.start, points=found.points)
+    at = native_kernels.residual_norms(views, start, backend)
+    supports = at <= tracks.outlier_px
+    better = found.good & (np.bincount(views.observations.point, supports, views.n_points) > good[doubted])
+    moved = better.take(views.observations.point)
+    norm[rows[moved]], outlier[rows[moved]] = at[moved], ~supports[moved]
+    landmarks = selection.landmarks[doubted][better]
+    scene.landmarks.position[landmarks] = found.points[better] + selection.origin
 
 
 def _displace(scene: Scene, landmarks: IntArray) -> None:

@@ -182,7 +182,9 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     np.testing.assert_allclose(after.trajectory.position, moved(before.trajectory.position), atol=1e-9)
     kept = np.isin(after.cloud.track_id, before.cloud.track_id)
     rows = np.searchsorted(before.cloud.track_id, after.cloud.track_id[kept])
-    np.testing.assert_allclose(after.cloud.position[kept], moved(before.cloud.position[rows]), rtol=1e-6, atol=1e-6)
+    followed = np.isclose(after.cloud.position[kept], moved(before.cloud.position[rows]), rtol=1e-6, atol=1e-6)
+    # Points that most of their views contradict are placed anew.
+    assert followed.all(axis=1).mean() > 0.99
     assert kept.sum() > 100
 
 

@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "consensus.hpp"
 #include "kernel.hpp"
 #include "norms.hpp"
 #include "relative_poses.hpp"
@@ -87,6 +88,20 @@ py::tuple triangulate(const Ints& point, const Doubles& centre, const Doubles& d
     ba::Triangulator(rays, n_points).run(x, angle, has_distance);
   }
   return py::make_tuple(points, parallax, measured);
+}
+
+// Whether each ray agrees with the place that most rays of its point agree on, (n_rays,).
+Array<bool> agreeing(const Ints& point, const Doubles& centre, const Doubles& direction, const Doubles& px_per_rad,
+                     const Doubles& distance, const Doubles& distance_sigma, py::ssize_t n_points, double gate) {
+  const ba::RaysView rays{point.size(),      point.data(),    centre.data(),        direction.data(),
+                          px_per_rad.data(), distance.data(), distance_sigma.data()};
+  Array<bool> agrees({point.size()});
+  bool* out = agrees.mutable_data();
+  {
+    py::gil_scoped_release release;
+    ba::Consensus(rays, n_points, gate).run(out);
+  }
+  return agrees;
 }
 
 template <int D>
@@ -320,4 +335,7 @@ PYBIND11_MODULE(_kernels, m) {
         py::arg("camera_model"), py::arg("camera_params"), py::arg("state"));
   m.def("triangulate", &triangulate, py::kw_only(), py::arg("point"), py::arg("centre"), py::arg("direction"),
         py::arg("px_per_rad"), py::arg("distance_m"), py::arg("distance_sigma_m"), py::arg("n_points"));
+  m.def("agreeing", &agreeing, py::kw_only(), py::arg("point"), py::arg("centre"), py::arg("direction"),
+        py::arg("px_per_rad"), py::arg("distance_m"), py::arg("distance_sigma_m"), py::arg("n_points"),
+        py::arg("gate"));
 }
