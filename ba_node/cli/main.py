@@ -16,12 +16,12 @@ from types import ModuleType
 from typing import NoReturn
 
 from ba_node import __version__
-from ba_node.cli import convert, demo, evaluate, params, play, replay, solve, steps, synth, thesis
+from ba_node.cli import convert, demo, evaluate, params, play, replay, robustness, solve, steps, synth, thesis
 from ba_node.cli import map as map_command
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rsplit(".", 1)[1]: module
-    for module in (replay, map_command, play, solve, convert, evaluate, synth, demo, params, steps, thesis)
+    for module in (replay, map_command, play, solve, convert, evaluate, synth, demo, params, steps, robustness, thesis)
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -45,12 +45,21 @@ class Parser(argparse.ArgumentParser):
         self.exit(USAGE_ERROR, f"ba: error: {message}; see {self.prog} --help\n")
 
 
+class Overview(argparse.HelpFormatter):
+    """Leave room for the longest command; argparse forgets that they are indented."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog)
+        self._action_max_length = 2 + max(map(len, COMMANDS)) + 2
+
+
 def build_parser(command: str | None) -> argparse.ArgumentParser:
     """Return the parser, with the options of one command (all if None)."""
     parser = Parser(
         prog="ba",
         description="Offline tools of ba_node, the bundle-adjustment back-end for ROS 2.",
         epilog="ba COMMAND --help tells more about each.",
+        formatter_class=Overview,
     )
     parser.add_argument("--version", action="version", version=f"ba_node {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)

@@ -52,7 +52,7 @@ class SessionError:
 
 
 def session_errors(out: Path, truth: Poses) -> list[SessionError]:
-    """Return the errors of every session that a replay wrote.
+    """Return the errors of every session that a replay wrote, that of the newest first.
 
     Args:
         out: the folder of the replay.
@@ -61,7 +61,7 @@ def session_errors(out: Path, truth: Poses) -> list[SessionError]:
     Raises:
         EvaluationError: a session's poses have no partner in the truth.
     """
-    return [_session(path.parent, truth) for path in sorted(out.rglob("trajectory.tum"))]
+    return [_session(path.parent, truth) for path in sorted(out.rglob("trajectory.tum"), key=_place)]
 
 
 def said(report: Mapping[str, Any]) -> str:
@@ -72,6 +72,10 @@ def said(report: Mapping[str, Any]) -> str:
             value = part.get(name, ())
             lines += (f"{key}: {text}" for key, text in value.items()) if isinstance(value, Mapping) else value
     return "\n".join(lines)
+
+
+def _place(path: Path) -> tuple[int, str]:
+    return len(path.parts), path.parent.name
 
 
 def _session(folder: Path, truth: Poses) -> SessionError:

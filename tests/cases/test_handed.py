@@ -21,7 +21,7 @@ from tests.cases.conftest import Replay, harmless
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "cases"
 OK, ATTENTION = 0, 3
-pytestmark = pytest.mark.xfail(strict=False, reason="not mended yet")
+pending = pytest.mark.xfail(strict=False, reason="not mended yet")
 # Name -> keyframes, exit codes, largest error m, patterns of which each has to be found in what is said.
 WITH_TRUTH: dict[str, tuple[int, tuple[int, ...], float, tuple[str, ...]]] = {
     "clock_set_back": (40, (OK, ATTENTION), 0.09, ("stamp|clock|session",)),
@@ -48,6 +48,7 @@ def truth_of(path: Path) -> Poses:
     return Poses(ids, read.stamp_ns, read.position, read.orientation)
 
 
+@pending
 @pytest.mark.parametrize("name", WITH_TRUTH)
 def test_no_worse_than_what_came_in(name: str, run: Replay) -> None:
     bag = case(name)
@@ -62,6 +63,7 @@ def test_no_worse_than_what_came_in(name: str, run: Replay) -> None:
     outcome.tells(*told)
 
 
+@pending
 def test_clock_set_back_leaves_two_maps(run: Replay) -> None:
     bag = case("clock_set_back")
     assert sorted(error.keyframes for error in run(bag).errors(truth_of(bag))) == [20, 20]
@@ -100,6 +102,7 @@ def test_region_of_interest_is_taken_off_the_principal_point(run: Replay) -> Non
     np.testing.assert_allclose(published, positions(by_hand), atol=1e-6)
 
 
+@pending
 def test_camera_that_hardly_moves_does_not_mirror_the_map(run: Replay) -> None:
     outcome = run(case("mono_hardly_moves"))
     assert outcome.code in (OK, ATTENTION)
@@ -114,6 +117,7 @@ def test_camera_that_hardly_moves_does_not_mirror_the_map(run: Replay) -> None:
     assert along > 0.9 * moved[0] ** 2, f"{moved[0]:.3f} m before, {along / moved[0]:.3f} m along it after"
 
 
+@pending
 def test_map_at_its_optimum_stays_there(run: Replay) -> None:
     bag = case("optimal_map_runaway_point")
     outcome = run(bag)

@@ -16,7 +16,7 @@ from tests.cases.conftest import Replay, harmless
 # Faults that are not mended yet; a name goes as soon as its tests pass.
 PENDING = {
     *("baseline_reversed", "cameras_swapped", "extrinsics_inverted", "axes_confused", "camera_turned", "depth_in_mm"),
-    *("poses_inverted", "focal_off", "roi_ignored", "roi_given", "binning_ignored", "binning_given"),
+    *("poses_inverted", "focal_off", "roi_ignored", "binning_ignored"),
     *("rectified_with_distortion", "clock_set_back", "one_stamp_zero", "one_stamp_future", "session_lowered"),
     *("useless_messages", "duplicates", "frame_slash", "frame_empty", "frame_changes", "ids_reused", "wrong_ids"),
     *("outliers_uniform", "outliers_jumping", "outliers_moving", "one_keyframe_far", "few_points", "few_observations"),

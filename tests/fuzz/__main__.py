@@ -16,8 +16,13 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.fuzz import targets
+from tests.fuzz import files, targets
 from tests.fuzz.worker import GUIDED
+
+# Quarters of the messages that each target takes.
+_SHARE = {"stream": 3, "cdr": 1}
+# A process ends after so many and the next goes on from its corpus: the fuzzer itself grows by some kB a run.
+_ROUND = 20_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,25 +52,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _fuzz(name: str, args: argparse.Namespace) -> bool:
     of_streams = name in targets.STREAMS
-    names = [other for other in args.only if (other in targets.STREAMS) == of_streams]
-    count = -(-(args.messages if of_streams else args.files) // len(names))
     what = "messages" if of_streams else "files"
+    count = -(-args.messages * _SHARE[name] // 4) if of_streams else -(-args.files // len(files.READERS))
     print(f"{name:12} {count:7} {what} ...", end=" ", flush=True)
-    out = args.out / name
-    began = time.monotonic()
-    command = [sys.executable, "-m", "tests.fuzz.worker", name, "--count", str(count), "--out", str(out)]
-    result = subprocess.run(
-        [*command, "--seed", str(args.seed)], capture_output=True, text=True, errors="replace", check=False
-    )
-    took = time.monotonic() - began
-    if result.returncode == 0:
-        _, runs, peak_mb = result.stdout.split()[-3:]
-        print(f"{runs} runs, {took:.0f} s, at most {peak_mb} MB", flush=True)
-        return True
-    (out / "log.txt").write_text(result.stdout + result.stderr)
-    tail = [line for line in result.stderr.splitlines() if line.strip()][-12:]
-    print(f"FAULT after {took:.0f} s (code {result.returncode}); see {out}", *tail, sep="\n    ", flush=True)
-    return False
+    began, done, runs, peak_mb = time.monotonic(), 0, 0, 0
+    while done < count:
+        result = _round(name, min(_ROUND, count - done), args.out / name, args.seed + done)
+        if result.returncode != 0:
+            text = result.stdout + result.stderr
+            trace = text[text.rfind("Traceback") :].split("\n\n")[0] if "Traceback" in text else text[-1000:]
+            head = f"FAULT after {time.monotonic() - began:.0f} s (code {result.returncode}); see {args.out / name}"
+            print(head, *trace.splitlines()[-8:], sep="\n    ", flush=True)
+            return False
+        taken, of_round, peak = (int(word) for word in result.stdout.split()[-3:])
+        done, runs, peak_mb = done + taken, runs + of_round, max(peak_mb, peak)
+    print(f"{runs} runs, {time.monotonic() - began:.0f} s, at most {peak_mb} MB", flush=True)
+    return True
+
+
+def _round(name: str, count: int, out: Path, seed: int) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tests.fuzz.worker", name, "--count", str(count), "--seed", str(seed)]
+    return subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, errors="replace", check=False)
 
 
 if __name__ == "__main__":

@@ -144,7 +144,7 @@ def _changed(source: Bytes, value: Any) -> Any:
         at = source.below(len(items))
         items[at : at + 1] = [[], [_changed(source, items[at])], items][source.below(3)] if items else []
         return tuple(items)
-    return (0, 1, value + 1, max(0, value - 1), source.unpack("H"), source.unpack("Q"))[source.below(6)]
+    return (0, 1, (value + 1) % 2**64, max(0, value - 1), source.unpack("H"), source.unpack("Q"))[source.below(6)]
 
 
 def _changed_array(source: Bytes, value: np.ndarray) -> np.ndarray:
