@@ -26,6 +26,9 @@ test: setup ## run the tests
 fuzz: setup ## give readers and back-end 50 000 broken files and 200 000 broken messages (about 20 minutes)
 	@$(RUN) -m tests.fuzz $(ARGS)
 
+soak: setup ## run back-end and node for long, and see that nothing grows (about 20 minutes)
+	@$(RUN) -m tests.soak $(ARGS)
+
 sanitize: setup ## run the tests of the C++ kernels under AddressSanitizer and UndefinedBehaviourSanitizer
 	@sh tools/sanitize.sh $(ARGS)
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import itertools
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from ba_node.backend import FINISHED_KEPT, Backend
 from ba_node.config import Config
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.scene.tables import Table
-from ba_node.synthetic import SyntheticOptions, generate
+from tests.soak.drive import Drive
 
 ROUNDS, LENGTH = 40, 50
 SESSION_ROUNDS = 4
@@ -45,19 +45,20 @@ def sizes(backend: Backend) -> dict[str, int]:
 @pytest.mark.slow
 def test_sizes_stay_within_bounds_over_thousands_of_keyframes() -> None:
     """A drive is repeated with new ids; some tracks name keyframes that never come, and sessions end."""
-    data = generate(SyntheticOptions(seed=1, keyframes=LENGTH, length_m=25.0, tracks=40, track_loss=0.2))
+    drive = Drive(length=LENGTH, tracks=40, session_rounds=SESSION_ROUNDS)
     backend = Backend(Config().with_values(LIMITS))
-    backend.add(data.rig)
+    backend.add(drive.rig)
     largest: list[dict[str, int]] = []
     rejected = 0
-    for turn in range(ROUNDS):
-        moved = Shift(turn)
-        for keyframe, tracks in zip(data.keyframes, data.tracks, strict=True):
-            backend.add(moved(keyframe))
-            for image in tracks:
-                backend.add(moved(image))
-            lost = dataclasses.replace(moved(tracks[0]), keyframe_id=2**63 + keyframe.keyframe_id)
-            backend.add(lost)
+    frames = drive.frames()
+    for _ in range(ROUNDS):
+        for keyframe, *images in itertools.islice(frames, LENGTH):
+            assert isinstance(keyframe, Keyframe)
+            backend.add(keyframe)
+            for image in images:
+                backend.add(image)
+            assert isinstance(images[0], FeatureTracks)
+            backend.add(dataclasses.replace(images[0], keyframe_id=2**63 + keyframe.keyframe_id))
             estimate = backend.solve()
             assert estimate is not None
             assert np.isfinite(estimate.trajectory.position).all()
@@ -77,22 +78,3 @@ def test_sizes_stay_within_bounds_over_thousands_of_keyframes() -> None:
     for name in bounds.keys() - {"finished"}:
         first, second = (max(size[name] for size in part) for part in (early, late))
         assert second <= first, f"{name} still grows: {first}, then {second}"
-
-
-@dataclasses.dataclass(frozen=True)
-class Shift:
-    """Give the measurements of a drive new ids, times and, every few drives, a new session."""
-
-    turn: int
-
-    def __call__(self, measurement: Any) -> Any:
-        first = self.turn * LENGTH
-        changes = {
-            "session_id": self.turn // SESSION_ROUNDS,
-            "keyframe_id": first + measurement.keyframe_id,
-        }
-        if isinstance(measurement, Keyframe):
-            return dataclasses.replace(measurement, stamp_ns=measurement.stamp_ns + first * 10**9, **changes)
-        assert isinstance(measurement, FeatureTracks)
-        ids = measurement.track_id + np.uint64(self.turn * 10**6)
-        return dataclasses.replace(measurement, track_id=ids, **changes)
