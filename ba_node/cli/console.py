@@ -4,10 +4,15 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ba_node.io.bag_topics import TopicChoice
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -59,3 +64,24 @@ def require_mcap(path: Path) -> None:
     require_folder(path)
     if path.suffix != ".mcap":
         raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so")
+
+
+def add_topic_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that read the inputs of the node from a recording."""
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="NAME=TOPIC",
+        help="which topic is meant where a recording has several, e.g. keyframes=/robot1/keyframes; repeatable",
+    )
+    parser.add_argument(
+        "--namespace", default="", metavar="NS", help="take topics of this namespace only, e.g. /robot1"
+    )
+
+
+def topic_choice(args: argparse.Namespace) -> TopicChoice:
+    """Return what these options say."""
+    from ba_node.io.bag_topics import TopicChoice, parse_topic  # noqa: PLC0415  # slow to import
+
+    return TopicChoice(dict(parse_topic(text) for text in args.topic), args.namespace)

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ba_node.cli.console import facts, progress_bar, require_folder
+from ba_node.cli.console import add_topic_options, facts, progress_bar, require_folder, topic_choice
 from ba_node.offline.attention import HARMLESS
 
 SUMMARY = "run the back-end on a recording, without a middleware"
@@ -38,10 +38,13 @@ _ERRORS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("bag", type=Path, metavar="BAG.mcap")
+    parser.add_argument(
+        "bag", type=Path, nargs="+", metavar="BAG", help="recording: .mcap or .db3, a folder, or files in any order"
+    )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results; made if missing"
     )
+    add_topic_options(parser)
     parser.add_argument(
         "--params", type=Path, metavar="YAML", help="parameters, in the form of ROS or plain (ba params)"
     )
@@ -68,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     require_folder(args.save_map)
     config = configure(args.params, dict(parse_assignment(text) for text in args.set))
     with progress_bar("replay", "messages") as progress:
-        options = MapOptions(args.load_map, args.final_optimize, args.save_map)
+        options = MapOptions(args.load_map, args.final_optimize, args.save_map, topic_choice(args))
         report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
     print(facts(_rows(report)))
     _tell(report)
@@ -79,6 +82,9 @@ def run(args: argparse.Namespace) -> int:
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     statuses = report["solves_by_status"]
     rows = [
+        ("topics", ", ".join(report["topics_taken"].values())),
+        *(("left aside", f"{topic}: {reason}") for topic, reason in report["topics_left"].items()),
+        *(("adjusted", note) for note in report["cameras_adjusted"]),
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
         *((label, f"{_short(report[key]['input'])} -> {_short(report[key]['refined'])} px") for label, key in _ERRORS),
@@ -93,7 +99,7 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
     error = report.get("trajectory_error_m")
     if error:
-        rows.insert(5, ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)"))
+        rows.insert(-4, ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)"))
     if report["older_sessions"]:
         rows.append(
             (

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import heapq
 import struct
+import zlib
+from collections import Counter
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import IO, TYPE_CHECKING, NamedTuple
@@ -18,19 +20,33 @@ from typing import IO, TYPE_CHECKING, NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Channel, Chunk, Schema
 
-from ba_node.io.bag_errors import BagError
+from ba_node.io.bag_errors import BagError, EmptyBagError
+from ba_node.io.unpack import unpack
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
 
 MAGIC = b"\x89MCAP0\r\n"
+# Chunks of recorders hold a few MB. One of more than this is a trap or damaged, and so are more than this waiting.
+MAX_CHUNK_BYTES = 2**27
+MAX_CHUNK_RECORDS = 10**6
+MAX_WAITING_BYTES = 2**29
 
 # opcode (1 byte) and length (8 bytes) in front of every record
 _HEAD = struct.Struct("<BQ")
+# channel, number, log time, publish time in front of a message's bytes
+_MESSAGE = struct.Struct("<HIQQ")
 _COMPRESSIONS = ("", "lz4", "zstd")
+
+
+class Message(NamedTuple):
+    """A message: channel, log time in ns, bytes."""
+
+    channel_id: int
+    log_time: int
+    data: bytes
 
 
 class Block(NamedTuple):
@@ -40,11 +56,13 @@ class Block(NamedTuple):
         start_ns: smallest log time in it, ns.
         offset: where it begins, bytes.
         length: with its head, bytes.
+        channels: those with messages in it; None if that is not known.
     """
 
     start_ns: int
     offset: int
     length: int
+    channels: frozenset[int] | None = None
 
 
 @dataclass
@@ -56,6 +74,8 @@ class BagIndex:
         channels: by id.
         blocks: what holds messages, sorted.
         message_count: number of messages that can be read.
+        counts: the same by channel; empty if that is not known.
+        end_ns: largest log time, ns.
         problems: what is wrong with the file, as (reason, words).
     """
 
@@ -63,9 +83,11 @@ class BagIndex:
     channels: dict[int, Channel] = field(default_factory=dict)
     blocks: list[Block] = field(default_factory=list)
     message_count: int = 0
+    counts: Counter[int] = field(default_factory=Counter)
+    end_ns: int = 0
     problems: list[tuple[str, str]] = field(default_factory=list)
 
-    def add(self, record: McapRecord) -> None:
+    def add(self, record: Message | Schema | Channel) -> None:
         """Take note of a schema or a channel; of those that come twice the first counts."""
         if isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
@@ -85,8 +107,9 @@ def read_index(stream: IO[bytes], size: int) -> BagIndex:
         raise BagError("not an MCAP file: it does not begin with the MCAP magic bytes")
     index = _from_summary(stream, size) or _from_records(stream, size)
     if index.message_count == 0:
-        why = "; ".join(words for _, words in index.problems) or "it was closed before anything was recorded"
-        raise BagError(f"no message can be read: {why}")
+        if not index.problems:
+            raise EmptyBagError("no message can be read: it was closed before anything was recorded")
+        raise BagError(f"no message can be read: {'; '.join(words for _, words in index.problems)}")
     return index
 
 
@@ -96,37 +119,46 @@ def read_messages(
     """Yield the messages of some channels by log time; those of the same time in the order of the file.
 
     A block that cannot be read is passed over, and ``report`` gets the reason and the words.
+
+    Raises:
+        BagError: so many blocks overlap in time that they do not fit into memory.
     """
-    waiting: list[tuple[tuple[int, int, int], Message, Iterator[tuple[tuple[int, int, int], Message]]]] = []
-    blocks = iter(index.blocks)
-    following = next(blocks, None)
+    wanted = frozenset(channels)
+    blocks = iter([block for block in index.blocks if block.channels is None or block.channels & wanted])
+    following, held = next(blocks, None), 0
+    # Of each open block: time, place in the file and number of its next message; all of it; its bytes.
+    waiting: list[tuple[int, int, int, list[Message], int]] = []
     while waiting or following:
         # A block is opened only when its first message may come before all that wait.
-        if following and (not waiting or following[:2] < waiting[0][0][:2]):
-            messages = _sorted_messages(stream, index, following, channels, report)
-            following = next(blocks, None)
+        if following and (not waiting or following[:2] < waiting[0][:2]):
+            messages = _sorted_messages(stream, index, following, wanted, report)
+            offset, number, size = following.offset, 0, sum(len(message.data) for message in messages)
+            following, held = next(blocks, None), held + size
+            if held > MAX_WAITING_BYTES:
+                raise BagError(f"chunks of more than {MAX_WAITING_BYTES >> 20} MB overlap in time: split or sort it")
         else:
-            _, message, messages = heapq.heappop(waiting)
-            yield message
-        entry = next(messages, None)
-        if entry:
-            heapq.heappush(waiting, (*entry, messages))
+            _, offset, number, messages, size = heapq.heappop(waiting)
+            yield messages[number]
+            number += 1
+        if number < len(messages):
+            heapq.heappush(waiting, (messages[number].log_time, offset, number, messages, size))
+        else:
+            held -= size
 
 
 def _sorted_messages(
     stream: IO[bytes], index: BagIndex, block: Block, channels: Collection[int], report: Callable[[str, str], None]
-) -> Iterator[tuple[tuple[int, int, int], Message]]:
+) -> list[Message]:
     try:
-        records = _read_block(stream, block)
+        records = _read_block(stream, block, channels)
     except BagError as error:
         report("corrupt", str(error))
-        return
+        return []
     for record in records:
         index.add(record)
-    messages = [r for r in records if isinstance(r, Message) and r.channel_id in channels]
+    messages = [record for record in records if isinstance(record, Message)]
     messages.sort(key=lambda message: message.log_time)
-    for place, message in enumerate(messages):
-        yield (message.log_time, block.offset, place), message
+    return messages
 
 
 def _from_summary(stream: IO[bytes], size: int) -> BagIndex | None:
@@ -138,15 +170,36 @@ def _from_summary(stream: IO[bytes], size: int) -> BagIndex | None:
         return None
     if summary is None or summary.statistics is None or not summary.chunk_indexes:
         return None
-    blocks = [Block(c.message_start_time, c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]
     used = {channel for chunk in summary.chunk_indexes for channel in chunk.message_index_offsets}
+    # Writers may leave message indices out: then nothing is known about what is in which chunk.
+    indexed = used >= summary.statistics.channel_message_counts.keys() and len(used) > 0
+    blocks = [
+        Block(
+            c.message_start_time,
+            c.chunk_start_offset,
+            c.chunk_length,
+            frozenset(c.message_index_offsets) if indexed and c.message_index_offsets else None,
+        )
+        for c in summary.chunk_indexes
+    ]
     schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
     whole = all(block.offset + block.length <= size for block in blocks)
     if not whole or not used <= summary.channels.keys() or not schemas <= summary.schemas.keys():
         return None
     if not summary.channels:
         return None
-    return BagIndex(summary.schemas, summary.channels, sorted(blocks), summary.statistics.message_count)
+    return BagIndex(
+        summary.schemas,
+        summary.channels,
+        sorted(blocks, key=_place),
+        summary.statistics.message_count,
+        Counter(summary.statistics.channel_message_counts),
+        max(c.message_end_time for c in summary.chunk_indexes),
+    )
+
+
+def _place(block: Block) -> tuple[int, int]:
+    return block.start_ns, block.offset
 
 
 def _from_records(stream: IO[bytes], size: int) -> BagIndex:
@@ -166,45 +219,86 @@ def _from_records(stream: IO[bytes], size: int) -> BagIndex:
     if not ended:
         words = f"truncated after {index.message_count} messages (record at byte {offset} of {size} is not whole)"
         index.problems.append(("truncated", words))
-    index.blocks.sort()
+    index.blocks.sort(key=_place)
     return index
 
 
 def _index_block(stream: IO[bytes], index: BagIndex, block: Block) -> None:
     try:
-        records = _read_block(stream, block)
+        records = _read_block(stream, block, None)
     except BagError as error:
         index.problems.append(("corrupt", str(error)))
         return
+    messages = []
     for record in records:
-        index.add(record)
-    times = [record.log_time for record in records if isinstance(record, Message)]
-    if times:
-        index.blocks.append(block._replace(start_ns=min(times)))
+        if isinstance(record, Message):
+            messages.append(record)
+        else:
+            index.add(record)
+    if messages:
+        times = [message.log_time for message in messages]
+        channels = Counter(message.channel_id for message in messages)
+        index.blocks.append(block._replace(start_ns=min(times), channels=frozenset(channels)))
         index.message_count += len(times)
+        index.counts.update(channels)
+        index.end_ns = max(index.end_ns, *times)
 
 
-def _read_block(stream: IO[bytes], block: Block) -> list[McapRecord]:
-    """Return the records in a block, or raise BagError with its place and what is wrong with it."""
+def _read_block(stream: IO[bytes], block: Block, channels: Collection[int] | None) -> list[Message | Schema | Channel]:
+    """Return schemas, channels and messages in a block, those of some channels (None for all).
+
+    Raises:
+        BagError: it cannot be read; tells its place and what is wrong with it.
+    """
+    where = f"record at byte {block.offset}"
+    if block.length > MAX_CHUNK_BYTES:
+        raise BagError(f"{where}: {block.length >> 20} MB: expected {MAX_CHUNK_BYTES >> 20} MB at most")
     stream.seek(block.offset)
     data = stream.read(block.length)
-    where = f"record at byte {block.offset}"
     try:
         opcode, length = _HEAD.unpack_from(data)
-        content = ReadDataStream(BytesIO(data[_HEAD.size :]))
-        if opcode == Opcode.MESSAGE:
-            return [Message.read(content, length)]
-        if opcode == Opcode.SCHEMA:
-            return [Schema.read(content)]
-        if opcode == Opcode.CHANNEL:
-            return [Channel.read(content)]
-        if opcode != Opcode.CHUNK:
+        if opcode == Opcode.CHUNK:
+            chunk = Chunk.read(ReadDataStream(BytesIO(data[_HEAD.size :])))
+            return _records(_unpacked(chunk, where), channels, where)
+        if opcode not in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             raise BagError(f"{where}: opcode {opcode}, expected a chunk")
-        chunk = Chunk.read(content)
-        if chunk.compression not in _COMPRESSIONS:
-            raise BagError(f"{where}: chunk compression {chunk.compression!r} is unknown: expected zstd, lz4 or none")
-        return breakup_chunk(chunk, validate_crc=True)
+        return _records(data[: _HEAD.size + length], channels, where)
     except BagError:
         raise
     except Exception as error:  # broken bytes lead the parsers into errors of every kind
         raise BagError(f"{where} is damaged: {type(error).__name__}: {error}") from error
+
+
+def _unpacked(chunk: Chunk, where: str) -> bytes:
+    if chunk.compression not in _COMPRESSIONS:
+        raise BagError(f"{where}: chunk compression {chunk.compression!r} is unknown: expected zstd, lz4 or none")
+    if chunk.uncompressed_size > MAX_CHUNK_BYTES:
+        claim = f"a chunk of {len(chunk.data)} bytes that claims to be {chunk.uncompressed_size >> 20} MB"
+        raise BagError(f"{where}: {claim}: expected {MAX_CHUNK_BYTES >> 20} MB at most: record in smaller chunks")
+    # A chunk is unpacked as far as it says itself.
+    data = unpack(chunk.compression, chunk.data, chunk.uncompressed_size) if chunk.compression else chunk.data
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise BagError(f"{where} is damaged: its checksum is another")
+    return data
+
+
+def _records(data: bytes, channels: Collection[int] | None, where: str) -> list[Message | Schema | Channel]:
+    """Return what stands in the bytes of a chunk; records of other kinds are passed over."""
+    found: list[Message | Schema | Channel] = []
+    at = count = 0
+    while at < len(data):
+        opcode, length = _HEAD.unpack_from(data, at)
+        begin = at + _HEAD.size
+        at, count = begin + length, count + 1
+        if at > len(data) or count > MAX_CHUNK_RECORDS:
+            raise BagError(f"{where} is damaged: record {count} of {length} bytes in a chunk of {len(data)}")
+        if opcode == Opcode.MESSAGE:
+            channel, _, log_time, _ = _MESSAGE.unpack_from(data, begin)
+            if channels is None:
+                found.append(Message(channel, log_time, b""))
+            elif channel in channels:
+                found.append(Message(channel, log_time, data[begin + _MESSAGE.size : at]))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            content = ReadDataStream(BytesIO(data[begin:at]))
+            found.append(Schema.read(content) if opcode == Opcode.SCHEMA else Channel.read(content))
+    return found

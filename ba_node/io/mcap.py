@@ -1,73 +1,100 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read MCAP recordings of ROS 2 without ROS; write them with :class:`BagWriter`."""
+"""Read recordings of ROS 2 without ROS, MCAP or SQLite, of one file or several; write them with :class:`BagWriter`."""
 
 from __future__ import annotations
 
 import contextlib
+import heapq
+import pickle
+import tempfile
 from collections import Counter, deque
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ba_node.io import ros_types
-from ba_node.io.bag_errors import BagError
-from ba_node.io.bag_index import BagIndex, read_index, read_messages
+from ba_node.io.bag_errors import BagError, EmptyBagError
+from ba_node.io.bag_files import PACKED, find_files, unpack_file
+from ba_node.io.bag_index import MAX_CHUNK_BYTES
+from ba_node.io.bag_source import BagChannel, Source, open_source
+from ba_node.io.bag_topics import CAMERAS, NO_CHOICE, Chooser, Chosen, TopicChoice
 from ba_node.io.bag_writer import BagWriter
 from ba_node.io.ros_types import ROSBAGS_FACTORY, TypeMismatchError
+from ba_node.io.unpack import ZSTD_MAGIC, unpack
+from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
-    from mcap.records import Channel
-
-    from ba_node.measurements import Measurement
-
-__all__ = ["ROSBAGS_FACTORY", "BagError", "BagReader", "BagWriter"]
+__all__ = ["ROSBAGS_FACTORY", "BagError", "BagReader", "BagWriter", "TopicChoice"]
 
 _NOTES = 100
+# Messages that are looked at for the frames that a topic names.
+_LOOKED_AT = 20
+# Parts of a recording follow each other but for this, s: messages wait a while before they are written.
+_MAX_OVERLAP_NS = 1_000_000_000
+
+
+class _Raw(NamedTuple):
+    """A message as it is recorded: number of its channel, log time in ns, bytes."""
+
+    channel: int
+    log_time: int
+    data: bytes
 
 
 class BagReader:
     """Read a recording. Use it as a context manager.
 
     Args:
-        path: the ``*.mcap`` file.
+        path: a file (``*.mcap``, ``*.db3``, either packed as ``*.zstd``), a folder of them as rosbag2 writes it, or
+            several files of one recording in any order.
+        choice: topics that the user names.
 
     Attributes:
         topics: type of each topic, as ``package/msg/Type``.
-        message_count: messages in the file, as far as it is whole.
+        message_count: messages in the recording, as far as it is whole.
         rejected: what could not be read, counted by reason: ``truncated``, ``corrupt``, ``undecodable``.
         rejection_notes: the last of these in words, with topic and number.
+        warnings: what somebody has to know about the files, by kind.
+        taken: topic of each input, after :meth:`measurements`.
+        left: topics that are inputs by type and were not taken, with the reason.
 
     Raises:
-        BagError: the file is empty, not MCAP, or holds no message that can be read.
+        BagError: a file is empty, not a recording, or holds no message that can be read.
     """
 
     topics: dict[str, str]
     message_count: int
 
-    def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path | str | Sequence[Path], choice: TopicChoice = NO_CHOICE) -> None:
+        self.paths = [Path(path)] if isinstance(path, (str, Path)) else list(path)
+        self.path = self.paths[0]
         self.rejected: Counter[str] = Counter()
         self.rejection_notes: deque[str] = deque(maxlen=_NOTES)
+        self.warnings: dict[str, str] = {}
+        self.taken: dict[str, str] = {}
+        self.left: dict[str, str] = {}
+        self._choice = choice
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
+        self._sources: list[tuple[Path, Source]] = []
+        self._channels: list[BagChannel] = []
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> BagReader:
         with contextlib.ExitStack() as stack:
-            self._stream = stack.enter_context(self._open())
-            try:
-                self._index = read_index(self._stream, self.path.stat().st_size)
-            except BagError as error:
-                raise BagError(f"{self.path}: {error}") from None
+            self._open(stack)
             self._stack = stack.pop_all()
-        self.message_count = self._index.message_count
+        self.message_count = sum(source.facts.message_count for _, source in self._sources)
+        self._channels = [channel for _, source in self._sources for channel in source.facts.channels]
         self.topics = {}
-        for channel in self._index.channels.values():
-            self.topics.setdefault(channel.topic, _type_of(self._index, channel))
-        for reason, words in self._index.problems:
-            self._reject(reason, words)
+        for channel in self._channels:
+            self.topics.setdefault(channel.topic, channel.type_name)
+        for path, source in self._sources:
+            for reason, words in source.facts.problems:
+                self._reject(path, reason, words)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -80,11 +107,11 @@ class BagReader:
             topics: only these; all if None.
 
         Raises:
-            BagError: nothing of the file can be read after all.
+            BagError: nothing of the recording can be read after all.
         """
-        for channel_id, log_time, data in self._raw(self._channels(topics)):
-            channel = self._index.channels[channel_id]
-            yield channel.topic, _type_of(self._index, channel), log_time, data
+        for number, log_time, data in self._raw(self._numbers(topics)):
+            channel = self._channels[number]
+            yield channel.topic, channel.type_name, log_time, data
 
     def decode(self, topic: str, data: bytes) -> Any:
         """Return the message in the bytes of a topic, by the definition in the recording.
@@ -92,127 +119,243 @@ class BagReader:
         Raises:
             BagError: there is no such topic, or the bytes do not fit its definition.
         """
-        channels = self._channels([topic])
-        if not channels:
+        numbers = self._numbers([topic])
+        if not numbers:
             raise BagError(f"{self.path}: no topic {topic}; there are: {', '.join(sorted(self.topics))}")
         try:
-            return self._decoder(min(channels))(data)
+            return self._decoder(min(numbers))(data)
         except TypeMismatchError as error:
             raise BagError(f"{self.path}: topic {topic}: {error}") from error
         except Exception as error:  # generated decoders raise whatever broken bytes lead them to
             raise BagError(f"{self.path}: topic {topic}: {type(error).__name__}: {error}") from error
 
-    def measurements(self) -> Iterator[tuple[str, int, Measurement]]:
+    def check(self, topic: str) -> None:
+        """Raise BagError if a topic's definition lacks a field that ours has, or has it of another type."""
+        for number in self._numbers([topic]):
+            self._check(number)
+
+    def measurements(self, cameras_known: bool = False) -> Iterator[tuple[str, int, Measurement]]:
         """Yield (topic, log time in ns, measurement) of the input topics, in the order of :meth:`messages`.
 
-        A topic is known by its type. Where several have the type of one input, the one with the input's name is
-        taken, and of several such the one in the namespace of the keyframes. A lone camera (CameraInfo) is read only
-        when there is no rig. Messages that cannot be read are counted in ``rejected``.
+        The first cameras that can be used come before all else, wherever they stand: they are latched, and a recorder
+        may have got them late. A lone camera (CameraInfo) is read only when there is no rig. See :class:`Chooser` for
+        which topics are taken; ``taken`` and ``left`` tell. Messages that cannot be read are counted in ``rejected``.
+
+        Args:
+            cameras_known: the recording may come without cameras.
 
         Raises:
-            BagError: keyframes, tracks or cameras are missing, or a definition lacks a field.
+            BagError: keyframes, tracks or cameras are missing, it cannot be told which of several are meant, or a
+                definition lacks a field.
         """
-        chosen = self._choose()
+        chosen = self._choose(cameras_known)
+        self.taken, self.left = chosen.taken, chosen.left
+        wanted = {(topic, INPUT_TYPES[name]) for name, topic in chosen.taken.items()}
         # A topic can have channels of several types, from publishers that disagree.
-        channels = {c.id for c in self._index.channels.values() if (c.topic, _type_of(self._index, c)) in chosen}
-        for channel_id in sorted(channels):
-            self._check(channel_id)
-        return self._measurements(channels)
+        numbers = {n for n, c in enumerate(self._channels) if (c.topic, c.type_name) in wanted}
+        for number in sorted(numbers):
+            self._check(number)
+        cameras = {n for n in numbers if self._channels[n].type_name in [INPUT_TYPES[name] for name in CAMERAS]}
+        return self._measurements(numbers, self._first_cameras(cameras))
 
-    def _measurements(self, channels: Collection[int]) -> Iterator[tuple[str, int, Measurement]]:
-        numbers: Counter[str] = Counter()
-        for channel_id, log_time, data in self._raw(channels):
-            channel = self._index.channels[channel_id]
-            type_name = _type_of(self._index, channel)
-            number = numbers[channel.topic]
-            numbers[channel.topic] += 1
+    def _measurements(self, numbers: Collection[int], first: _Raw | None) -> Iterator[tuple[str, int, Measurement]]:
+        counts: Counter[str] = Counter()
+        raw = self._raw(numbers)
+        if first is not None:
+            raw = chain([first], _without(raw, first))
+        for number, log_time, data in raw:
+            channel = self._channels[number]
+            place = counts[channel.topic]
+            counts[channel.topic] += 1
             try:
-                measurement = measurement_from_message(type_name, self._decoder(channel_id)(data))
+                measurement = measurement_from_message(channel.type_name, self._decoder(number)(data))
             except Exception as error:  # as in decode: whatever the bytes are, the next message may be sound
-                words = f"topic {channel.topic}, message {number}: {type(error).__name__}: {error}"
-                self._reject("undecodable", words)
+                words = f"topic {channel.topic}, message {place}: {type(error).__name__}: {error}"
+                self._reject(self.path, "undecodable", words)
                 continue
             yield channel.topic, log_time, measurement
 
-    def _raw(self, channels: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        count = 0
-        lost = Counter[str]()
+    def _first_cameras(self, numbers: Collection[int]) -> _Raw | None:
+        """Return the first message of some channels that holds cameras that can be read."""
+        rejected, notes = self.rejected.copy(), self.rejection_notes.copy()
+        try:
+            for raw in self._raw(numbers):
+                with contextlib.suppress(Exception):  # what cannot be read is counted in its turn
+                    kind = self._channels[raw.channel].type_name
+                    found = measurement_from_message(kind, self._decoder(raw.channel)(raw.data))
+                    if isinstance(found, CameraRig) and not found.malformed:
+                        return raw
+        except BagError:
+            return None
+        finally:
+            self.rejected, self.rejection_notes = rejected, notes
+        return None
 
-        def report(reason: str, words: str) -> None:
-            lost[reason] += 1
-            self._reject(reason, words)
-
-        for message in read_messages(self._stream, self._index, channels, report):
-            count += 1
-            yield message.channel_id, message.log_time, message.data
-        if lost and not count:
-            raise BagError(f"{self.path}: no message can be read: {self.rejection_notes[-1]}")
-
-    def _choose(self) -> set[tuple[str, str]]:
-        """Return topic and type of each input that the recording has."""
-        chosen: dict[str, str] = {}
-        there = {(channel.topic, _type_of(self._index, channel)) for channel in self._index.channels.values()}
-        for name, type_name in INPUT_TYPES.items():
-            found = [topic for topic, kind in there if kind == type_name]
-            space = chosen.get("keyframes", "").rpartition("/")[0]
-            found.sort(key=lambda topic: (topic.rpartition("/")[2] != name, topic.rpartition("/")[0] != space, topic))
-            if found:
-                chosen[name] = found[0]
-        if "camera_rig" in chosen:
-            chosen.pop("camera_info", None)
-        missing = [INPUT_TYPES[name] for name in ("keyframes", "feature_tracks") if name not in chosen]
-        if "camera_rig" not in chosen and "camera_info" not in chosen:
+    def _choose(self, cameras_known: bool) -> Chosen:
+        there = {(channel.topic, channel.type_name) for channel in self._channels}
+        full = {(channel.topic, channel.type_name) for channel in self._channels if channel.count != 0}
+        found = {
+            name: [topic for topic, kind in there if kind == type_name and ((topic, kind) in full or not full)]
+            for name, type_name in INPUT_TYPES.items()
+        }
+        try:
+            chosen = Chooser(found, self._frames_of, self._content_of).choose(self._choice)
+        except BagError as error:
+            raise BagError(f"{self.path}: {error}") from None
+        missing = [INPUT_TYPES[name] for name in ("keyframes", "feature_tracks") if name not in chosen.taken]
+        if not cameras_known and not chosen.taken.keys() & set(CAMERAS):
             missing.append(f"{INPUT_TYPES['camera_rig']} or {INPUT_TYPES['camera_info']}")
         if missing:
             listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there)) or "none"
             raise BagError(
                 f"{self.path}: no topic of type {', and none of type '.join(missing)}; in the recording: {listed}"
             )
-        return {(topic, INPUT_TYPES[name]) for name, topic in chosen.items()}
+        return chosen
 
-    def _channels(self, topics: Collection[str] | None) -> set[int]:
-        channels = self._index.channels.values()
-        return {channel.id for channel in channels if topics is None or channel.topic in topics}
+    def _first_messages(self, topic: str) -> Iterator[Any]:
+        numbers = [n for n in self._numbers([topic]) if self._channels[n].type_name in INPUT_TYPES.values()]
+        for count, raw in enumerate(self._raw(numbers)):
+            if count == _LOOKED_AT:
+                return
+            with contextlib.suppress(Exception):  # as in _first_cameras
+                yield raw.channel, self._decoder(raw.channel)(raw.data)
 
-    def _check(self, channel_id: int) -> None:
-        channel = self._index.channels[channel_id]
+    def _frames_of(self, topic: str) -> frozenset[str]:
+        frames: set[str] = set()
+        for _, message in self._first_messages(topic):
+            parts = getattr(message, "cameras", None) or [message]
+            frames |= {str(part.header.frame_id).removeprefix("/") for part in parts}
+        return frozenset(frames)
+
+    def _content_of(self, topic: str) -> object:
+        for number, message in self._first_messages(topic):
+            return pickle.dumps(measurement_from_message(self._channels[number].type_name, message))
+        return None
+
+    def _raw(self, numbers: Collection[int]) -> Iterator[_Raw]:
+        """Yield the messages of some channels of all files by log time; those of the same time file by file."""
+        count, lost = 0, self.rejected["corrupt"]
+        waiting: list[tuple[int, int, _Raw, Iterator[_Raw]]] = []
+        following = self._readers(numbers)
+        opened = next(following, None)
+        while waiting or opened:
+            # A file is read only when its first message may come before all that wait.
+            if opened and (not waiting or opened[0] <= waiting[0][0]):
+                place, raws = opened[1:]
+                opened = next(following, None)
+            else:
+                _, place, raw, raws = heapq.heappop(waiting)
+                count += 1
+                yield raw
+            entry = next(raws, None)
+            if entry:
+                heapq.heappush(waiting, (entry.log_time, place, entry, raws))
+        if not count and self.rejected["corrupt"] > lost:
+            raise BagError(f"{self.path}: no message can be read: {self.rejection_notes[-1]}")
+
+    def _readers(self, numbers: Collection[int]) -> Iterator[tuple[int, int, Iterator[_Raw]]]:
+        """Yield, for each file by its first time, that time, its place and its messages."""
+        begin = 0
+        for place, (path, source) in enumerate(self._sources):
+            own = {c.id: begin + i for i, c in enumerate(source.facts.channels) if begin + i in numbers}
+            begin += len(source.facts.channels)
+            if own:
+                yield source.facts.start_ns, place, self._of_source(path, source, own)
+
+    def _of_source(self, path: Path, source: Source, numbers: dict[int, int]) -> Iterator[_Raw]:
+        def report(reason: str, words: str) -> None:
+            self._reject(path, reason, words)
+
+        try:
+            for channel, log_time, data in source.read(numbers, report):
+                whole: bytes | None = data
+                if data[:4] == ZSTD_MAGIC:
+                    whole = self._unpacked(path, numbers[channel], data)
+                if whole is not None:
+                    yield _Raw(numbers[channel], log_time, whole)
+        except BagError as error:
+            raise BagError(f"{path}: {error}") from None
+
+    def _unpacked(self, path: Path, number: int, data: bytes) -> bytes | None:
+        """Return a message that the recorder has packed by itself (CDR never begins so), None if it is damaged."""
+        try:
+            return unpack("zstd", data, MAX_CHUNK_BYTES)
+        except Exception as error:  # what the library raises on damaged data has no common class
+            self._reject(path, "undecodable", f"topic {self._channels[number].topic}: zstd: {error}")
+            return None
+
+    def _numbers(self, topics: Collection[str] | None) -> set[int]:
+        return {number for number, c in enumerate(self._channels) if topics is None or c.topic in topics}
+
+    def _check(self, number: int) -> None:
+        channel = self._channels[number]
         where = f"{self.path}: topic {channel.topic}"
-        schema = self._index.schemas[channel.schema_id]
-        if channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
+        if channel.encoding != ("cdr", "ros2msg"):
+            messages, definitions = channel.encoding
             raise BagError(
-                f"{where}: messages in {channel.message_encoding!r}, definitions in {schema.encoding!r}:"
+                f"{where}: messages in {messages!r}, definitions in {definitions!r}:"
                 " expected 'cdr' and 'ros2msg', as ROS 2 records them"
             )
         try:
-            ros_types.check_definition(_type_of(self._index, channel), _text(schema.data))
+            ros_types.check_definition(channel.type_name, channel.definition)
         except TypeMismatchError as error:
             raise BagError(f"{where}: {error}") from error
 
-    def _decoder(self, channel_id: int) -> Callable[[bytes], Any]:
-        if channel_id not in self._decoders:
-            channel = self._index.channels[channel_id]
-            schema = self._index.schemas.get(channel.schema_id)
-            text = "" if schema is None else _text(schema.data)
-            self._decoders[channel_id] = ros_types.decoder(_type_of(self._index, channel), text)
-        return self._decoders[channel_id]
+    def _decoder(self, number: int) -> Callable[[bytes], Any]:
+        if number not in self._decoders:
+            channel = self._channels[number]
+            self._decoders[number] = ros_types.decoder(channel.type_name, channel.definition)
+        return self._decoders[number]
 
-    def _reject(self, reason: str, words: str) -> None:
+    def _reject(self, path: Path, reason: str, words: str) -> None:
         self.rejected[reason] += 1
-        self.rejection_notes.append(f"{self.path}: {words}")
+        self.rejection_notes.append(f"{path}: {words}")
 
-    def _open(self) -> IO[bytes]:
-        if self.path.is_dir():
-            raise BagError(f"{self.path}: is a folder: give the .mcap file in it")
-        try:
-            return self.path.open("rb")
-        except OSError as error:
-            raise BagError(f"{self.path}: cannot be opened: {error.strerror}") from error
+    def _open(self, stack: contextlib.ExitStack) -> None:
+        """Open all files. One of several that cannot be read is passed over."""
+        files = find_files(self.paths)
+        self.warnings.update(files.warnings)
+        folder: Path | None = None
+        errors: list[BagError] = []
+        for path in files.paths:
+            if path.suffix == PACKED and folder is None:
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ba_")))
+            source = _source_or_error(path, folder, stack)
+            if isinstance(source, BagError):
+                errors.append(source)
+            else:
+                self._sources.append((path, source))
+        if not self._sources:
+            raise errors[0]
+        self._sources.sort(key=lambda entry: (entry[1].facts.start_ns, entry[1].facts.end_ns, entry[0].name))
+        notes = [str(error) for error in errors if not isinstance(error, EmptyBagError)]
+        self.rejected.update(["unreadable_file"] * len(notes))
+        self.rejection_notes.extend(notes)
+        if not files.are_parts:
+            self._require_parts()
+
+    def _require_parts(self) -> None:
+        """Raise BagError if files overlap in time, as parts of one recording do not."""
+        for (path, source), (other, later) in pairwise(self._sources):
+            if source.facts.end_ns - later.facts.start_ns > _MAX_OVERLAP_NS:
+                raise BagError(
+                    f"{self.path}: holds several recordings: {path.name} and {other.name} are of the same time:"
+                    " give one of them"
+                )
 
 
-def _type_of(index: BagIndex, channel: Channel) -> str:
-    schema = index.schemas.get(channel.schema_id)
-    return "" if schema is None else ros_types.full_name(schema.name)
+def _source_or_error(path: Path, folder: Path | None, stack: contextlib.ExitStack) -> Source | BagError:
+    try:
+        file = unpack_file(path, folder) if folder and path.suffix == PACKED else path
+        return open_source(file, path, stack)
+    except BagError as error:
+        return error
 
 
-def _text(data: bytes) -> str:
-    return data.decode("utf-8", errors="replace")
+def _without(raws: Iterator[_Raw], first: _Raw) -> Iterator[_Raw]:
+    """Yield all messages but one, the first that is equal to it."""
+    for raw in raws:
+        if raw == first:
+            break
+        yield raw
+    yield from raws

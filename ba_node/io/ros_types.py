@@ -18,13 +18,21 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
 # Fields of the inputs that nothing here reads, so that a recording may have them otherwise, and those it may lack.
 _UNREAD = frozenset({"covariance", "r", "p"})
 _OPTIONAL = frozenset({"binning_x", "binning_y", "roi"})
+_LISTS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
+_TEXTS = ("string", "wstring")
+
+# What a definition in a recording may be: code is made of it, for each field and each entry of an array of messages.
+MAX_DEFINITION_BYTES = 2**18
+MAX_DEFINITION_LINES = 4000
+MAX_FIELDS = 2000
+MAX_NESTING = 20
 
 
 class TypeMismatchError(ValueError):
@@ -60,6 +68,11 @@ def typestore() -> Typestore:
             name = f"ba_msgs/msg/{file.name.removesuffix('.msg')}"
             store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))
     return store
+
+
+def is_known(type_name: str) -> bool:
+    """Return True if there is a definition of a type here."""
+    return type_name in typestore().types
 
 
 def schema_text(type_name: str) -> str:
@@ -110,12 +123,42 @@ def check_definition(type_name: str, text: str) -> None:
 @functools.lru_cache(maxsize=64)
 def _store_of(type_name: str, text: str) -> Typestore:
     store = Typestore()
+    size, lines = len(text), text.count("\n")
+    if size > MAX_DEFINITION_BYTES or lines > MAX_DEFINITION_LINES:
+        raise TypeMismatchError(
+            f"the definition of {type_name!r} has {size} bytes in {lines} lines; read are up to {MAX_DEFINITION_BYTES}"
+            f" in {MAX_DEFINITION_LINES}: record the message without fields that are not its own"
+        )
     try:
-        store.register(get_types_from_msg(text, type_name))
-        store.get_msgdef(type_name)
+        definitions = get_types_from_msg(text, type_name)
+        count = _expanded(definitions, type_name)
+        if count <= MAX_FIELDS:
+            store.register(definitions)
+            store.get_msgdef(type_name)
     except Exception as error:  # the parser and the code generator raise whatever a strange text leads them to
         raise TypeMismatchError(f"the definition of {type_name!r} cannot be read: {error!r}") from error
+    if count > MAX_FIELDS:
+        raise TypeMismatchError(
+            f"the definition of {type_name!r} makes {count} fields a message, or nests deeper than {MAX_NESTING}; read"
+            f" are up to {MAX_FIELDS}: record the message without fields that are not its own"
+        )
     return store
+
+
+def _expanded(definitions: Mapping[str, Any], type_name: str, depth: int = 0) -> int:
+    """Return how many fields a message has with all that is in it, each entry of an array of messages counted."""
+    if depth > MAX_NESTING:
+        return MAX_FIELDS + 1
+    total = 0
+    for _, (kind, value) in definitions[type_name][1] if type_name in definitions else ():
+        (inner, name), count = (value[0], int(value[1] or 1)) if kind in _LISTS else ((kind, value), 1)
+        if inner == Nodetype.NAME:
+            total += count * _expanded(definitions, str(name), depth + 1) + count
+        else:
+            total += count if name[0] in _TEXTS else 1
+        if total > MAX_FIELDS:
+            break
+    return total
 
 
 def _decode(store: Typestore, type_name: str, data: bytes) -> Any:
@@ -136,9 +179,9 @@ def _differences(type_name: str, theirs: Typestore) -> Iterator[str]:
         elif found[name] != expected:
             yield f"{type_name}: field {name} is {_show(found[name])}, expected {_show(expected)}"
         else:
-            inner = expected[1][0] if expected[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else expected
+            inner = expected[1][0] if expected[0] in _LISTS else expected
             if inner[0] == Nodetype.NAME:
-                yield from _differences(inner[1], theirs)
+                yield from _differences(str(inner[1]), theirs)
 
 
 def _show(description: Any) -> str:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ba_node.window.correction import Transform
 
 if TYPE_CHECKING:
     from ba_node.estimate import Correction, Estimate
+    from ba_node.measurements import CameraRig
 
 
 def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:
@@ -74,6 +76,20 @@ class StaticTree:
         up, down = self._way_up(_name(base)), self._way_up(_name(frame))
         common = next((name for name in down if name in up), None)
         return None if common is None else up[common].inverse().after(down[common])
+
+    def place(self, rig: CameraRig, base: str) -> tuple[CameraRig, tuple[str, ...]]:
+        """Return a rig with its cameras where they sit in a frame, and the cameras that no way leads to.
+
+        With any of these the rig is returned as it came.
+        """
+        found = [self.find(base, name) for name in rig.names]
+        places = [place for place in found if place is not None]
+        if len(places) < len(found):
+            missing = dict.fromkeys(name for name, place in zip(rig.names, found, strict=True) if place is None)
+            return rig, tuple(missing)
+        orientation = geometry.quaternion_from_matrix(np.array([place.rotation for place in places]))
+        position = np.array([place.translation for place in places])
+        return dataclasses.replace(rig, frame_id=base, position=position, orientation=orientation), ()
 
     def _way_up(self, frame: str) -> dict[str, Transform]:
         """Return ancestor from frame, for the frame itself and all its ancestors, nearest first."""

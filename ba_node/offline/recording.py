@@ -4,21 +4,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.conversion import INPUT_TYPES, guesses_message, keyframe_message, rig_message, tracks_message
 from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message
+from ba_node.messages.topics import TF_STATIC
+from ba_node.messages.transforms import StaticTree
 
 TRUTH_TOPIC = "ground_truth/pose"
 TRUTH_TYPE = "geometry_msgs/msg/PoseStamped"
+# A day at 10 Hz: more is no list of poses of keyframes.
+_MAX_TRUTH = 10**6
 
 
 def record(
@@ -66,16 +72,56 @@ def record(
     return count
 
 
-def read_truth(reader: BagReader) -> Poses | None:
-    """Return the true poses in a recording by time, numbered from 0; None if it has none.
+def placed(
+    measurements: Iterator[tuple[str, int, Measurement]], reader: BagReader, frames: FramesConfig
+) -> Iterator[Measurement]:
+    """Yield measurements, cameras where ``frames.extrinsics`` says that they sit.
 
     Raises:
-        BagError: a message cannot be read.
+        BagError: /tf_static of the recording does not tell where a camera sits.
     """
+    if frames.extrinsics != "tf_static":
+        yield from (measurement for _, _, measurement in measurements)
+        return
+    tree = StaticTree()
+    for topic, _, _, data in reader.messages([TF_STATIC]):
+        tree.add(reader.decode(topic, data))
+    for _, _, measurement in measurements:
+        if not isinstance(measurement, CameraRig) or measurement.malformed:
+            yield measurement
+            continue
+        rig, missing = tree.place(measurement, frames.base_frame)
+        if missing:
+            names = ", ".join(map(repr, missing))
+            raise BagError(
+                f"{reader.path}: frames.extrinsics = tf_static: no way from {frames.base_frame!r} to {names} in"
+                f" {TF_STATIC}: record it, or set frames.extrinsics=rig"
+            )
+        yield rig
+
+
+def read_truth(reader: BagReader) -> Poses | None:
+    """Return the true poses in a recording by time, numbered from 0; None if it has none that can be read.
+
+    What cannot be read is told in ``reader.warnings``. Of several robots the truth is that of the keyframes taken.
+    """
+    try:
+        return _read_truth(reader)
+    except BagError as error:
+        reader.warnings["ground_truth"] = f"no comparison with the truth in the recording: {error}"
+        return None
+
+
+def _read_truth(reader: BagReader) -> Poses | None:
     topics = [
         topic for topic, kind in reader.topics.items() if kind == TRUTH_TYPE and f"/{topic}".endswith(f"/{TRUTH_TOPIC}")
     ]
-    messages = [reader.decode(topic, data) for topic, _, _, data in reader.messages(topics[:1])] if topics else []
+    own = f"{reader.taken.get('keyframes', '').rpartition('/')[0]}/{TRUTH_TOPIC}"
+    topics.sort(key=lambda topic: topic != own)
+    for topic in topics[:1]:
+        reader.check(topic)
+    raw = reader.messages(topics[:1]) if topics else iter(())
+    messages = [reader.decode(topic, data) for topic, _, _, data in itertools.islice(raw, _MAX_TRUTH)]
     if not messages:
         return None
     poses = [message.pose for message in messages]

@@ -11,8 +11,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,14 @@ from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.files import locked_folder, whole_file
 from ba_node.io.json_file import write_json
 from ba_node.io.map_file import load_map, map_name, write_map
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter, TopicChoice
 from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.conversion import output_messages
 from ba_node.offline.attention import attention
-from ba_node.offline.recording import read_truth
+from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.session_record import SessionRecord
 from ba_node.scene.scene import Scene
 from ba_node.window import full
@@ -76,20 +76,33 @@ class MapOptions:
         load: map to begin with; the recording must go on in its session.
         optimize: refine everything of the newest session at the end.
         save: file for the map of the newest session.
+        topics: which topics of the recording are taken, where it cannot be told.
     """
 
     load: Path | None = None
     optimize: bool = False
     save: Path | None = None
+    topics: TopicChoice = field(default_factory=TopicChoice)
 
 
 def replay(
-    bag: Path, out: Path, config: Config, watch: Watch = Watch(), options: MapOptions = MapOptions()
+    bag: Path | Sequence[Path],
+    out: Path,
+    config: Config,
+    watch: Watch = Watch(),
+    options: MapOptions = MapOptions(),
 ) -> dict[str, Any]:
     """Replay a recording and write the results; return the content of report.json.
 
     The newest session's files go to ``out``, those of older sessions to ``out/session_<id>``, with a number behind
     where an id comes again. report.json is written last: where it stands, all others are whole.
+
+    Args:
+        bag: the recording: a file, a folder, or its files in any order.
+        out: folder for the results.
+        config: all parameters.
+        watch: clock and progress.
+        options: maps, and topics of the recording.
 
     Raises:
         BagError: the recording cannot be read.
@@ -99,23 +112,25 @@ def replay(
         OSError: a file cannot be written.
     """
     with contextlib.ExitStack() as stack:
-        reader = stack.enter_context(BagReader(bag))
-        measurements = reader.measurements()
+        reader = stack.enter_context(BagReader(bag, options.topics))
+        measurements = placed(reader.measurements(options.load is not None), reader, config.frames)
         stack.enter_context(locked_folder(out))
         (out / "report.json").unlink(missing_ok=True)
         with BagWriter(out / "refined.mcap") as writer:
             run = _Run(config, writer, watch)
             if options.load is not None:
                 run.load(options.load)
-            run.read((measurement for _, _, measurement in measurements), reader.message_count)
+            run.read(measurements, reader.message_count)
             run.end(options.optimize)
             if not run.sessions:
-                raise ReplayError(f"{bag}: {_nothing_to_use(run)}{_why(reader, run)}")
+                raise ReplayError(f"{reader.path}: {_nothing_to_use(run)}{_why(reader, run)}")
             if run.backend.scene.cameras is None:
                 refused = run.backend.scene.refused_rig or "none came"
-                raise ReplayError(f"{bag}: no camera rig that can be used: {refused}")
+                raise ReplayError(f"{reader.path}: no camera rig that can be used: {refused}")
         truth = read_truth(reader)
-        report = {"bag": bag.name, **_write(out, run.sessions, truth)}
+        report = {"bag": reader.path.name, **_write(out, run.sessions, truth)}
+        report |= {"topics_taken": reader.taken, "topics_left": reader.left, "cameras_adjusted": run.camera_notes}
+        report["bag_warnings"] = dict(reader.warnings)
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
         report["known_already"] = len(run.known_already)
@@ -142,6 +157,7 @@ class _Run:
         self._known: set[int] = set()
         self._inputs: dict[int, Keyframe] = {}
         self._written = 0
+        self.camera_notes: list[str] = []
 
     def load(self, path: Path) -> None:
         """Begin with a map."""
@@ -156,6 +172,8 @@ class _Run:
     def read(self, measurements: Iterable[Measurement], total: int) -> None:
         for done, measurement in enumerate(measurements, start=1):
             self.counted[type(measurement)] += 1
+            if isinstance(measurement, CameraRig):
+                self.camera_notes += [note for note in measurement.notes if note not in self.camera_notes]
             self._take(self.backend.admit(measurement))
             self._watch.progress(done, total)
         self._take(self.backend.admit_rest())

@@ -4,13 +4,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ba_node.core import geometry
 from ba_node.messages.topics import SHARED_TYPES, TF_STATIC
 from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
@@ -53,17 +49,10 @@ class StaticFrames(Component):
 
     def _place(self, rig: CameraRig) -> CameraRig | None:
         base = self.host.config.frames.base_frame
-        found = {name: self._tree.find(base, name) for name in rig.names}
-        places = [found[name] for name in rig.names]
-        known = [place for place in places if place is not None]
-        if len(known) < len(places):
-            self._waiting = rig
-            missing = ", ".join(repr(name) for name, place in found.items() if place is None)
-            text = f"cameras wait for {TF_STATIC}: no way from {base!r} to {missing}"
-            self.host.log(Notice(TF_STATIC, text))
+        placed, missing = self._tree.place(rig, base)
+        self._waiting = rig if missing else None
+        if missing:
+            names = ", ".join(map(repr, missing))
+            self.host.log(Notice(TF_STATIC, f"cameras wait for {TF_STATIC}: no way from {base!r} to {names}"))
             return None
-        self._waiting = None
-        rotation = np.array([place.rotation for place in known])
-        position = np.array([place.translation for place in known])
-        orientation = geometry.quaternion_from_matrix(rotation)
-        return dataclasses.replace(rig, frame_id=base, position=position, orientation=orientation)
+        return placed

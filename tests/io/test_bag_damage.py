@@ -114,7 +114,7 @@ def test_flipped_bytes_never_crash(tmp_path: Path, rig: CameraRig) -> None:
     [
         (b"", "is empty"),
         (b"\x89MCAP", "not an MCAP file"),
-        (b"SQLite format 3\x00" + bytes(100), "not an MCAP file"),
+        (b"SQLite format 3\x00" + bytes(100), "not an SQLite recording of rosbag2, or damaged"),
         (MAGIC, "no message can be read: truncated after 0 messages"),
         (MAGIC + bytes(range(256)), "no message can be read"),
         (MAGIC + b"\x06" + b"\xff" * 8 + bytes(50), "no message can be read: truncated after 0 messages"),
@@ -128,7 +128,7 @@ def test_what_is_no_recording_is_an_error(tmp_path: Path, data: bytes, words: st
 def test_missing_file_and_folder_are_errors(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="No such file"), BagReader(tmp_path / "x.mcap"):
         pass
-    with pytest.raises(BagError, match=r"give the \.mcap file"), BagReader(tmp_path):
+    with pytest.raises(BagError, match=r"no recording in this folder: expected \.mcap or \.db3"), BagReader(tmp_path):
         pass
 
 

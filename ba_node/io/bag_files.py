@@ -1,0 +1,152 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find the files that a recording consists of: one, those that its metadata.yaml lists, or those in a folder."""
+
+from __future__ import annotations
+
+import re
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ba_node.io.bag_errors import BagError
+from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for, pieces
+from ba_node.io.yaml_file import YamlError, read_yaml
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+METADATA = "metadata.yaml"
+STORAGES = (".mcap", ".db3")
+PACKED = ".zstd"
+_KNOWN = ("mcap", "sqlite3")
+
+
+class BagFiles(NamedTuple):
+    """The files of a recording.
+
+    Attributes:
+        paths: the files, in no particular order.
+        are_parts: something says that they are parts of one recording.
+        warnings: what somebody has to know about them, by kind.
+    """
+
+    paths: list[Path]
+    are_parts: bool
+    warnings: dict[str, str]
+
+
+def find_files(paths: Sequence[Path]) -> BagFiles:
+    """Return the files of a recording that is given as a folder, its metadata.yaml, or files.
+
+    Raises:
+        BagError: there are none, or none of a kind that is read; says what to do.
+    """
+    if len(paths) > 1:
+        single = [find_files([path]) for path in paths]
+        unique = dict.fromkeys(file.resolve() for found in single for file in found.paths)
+        # That a file is a part of more is no news where more are given.
+        warnings = [item for found in single for item in found.warnings.items() if item[0] != "split"]
+        return BagFiles(list(unique), True, dict(warnings))
+    path = paths[0]
+    if path.name == METADATA and path.is_file():
+        path = path.parent
+    if not path.is_dir():
+        return BagFiles([path], True, _part_of(path))
+    if (path / METADATA).is_file():
+        try:
+            return _listed(path, _metadata(path))
+        except YamlError as error:
+            files = _in_folder(path)
+            text = f"{path / METADATA}: {error}: all recordings in its folder are taken"
+            return BagFiles(files, False, {"metadata": text})
+    return BagFiles(_in_folder(path), False, {})
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    content = read_yaml(folder / METADATA)
+    facts = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    if not isinstance(facts, dict) or not isinstance(facts.get("relative_file_paths"), list):
+        raise YamlError("no rosbag2_bagfile_information with relative_file_paths")
+    return facts
+
+
+def _listed(folder: Path, facts: dict[str, Any]) -> BagFiles:
+    storage, packing = facts.get("storage_identifier"), str(facts.get("compression_format") or "")
+    if storage not in _KNOWN:
+        raise BagError(f"{folder}: storage {storage!r} is not read: convert it with ros2 bag convert to mcap")
+    if packing not in ("", "zstd"):
+        raise BagError(f"{folder}: compression_format {packing!r} is not read: unpack it, or record with zstd or none")
+    # Names are relative to the folder; older writers put its own name in front.
+    names = list(dict.fromkeys(Path(str(name)).name for name in facts["relative_file_paths"]))
+    found = {name: _there(folder / name) for name in names}
+    files = [file for file in found.values() if file is not None]
+    missing = [name for name, file in found.items() if file is None]
+    if not files:
+        raise BagError(f"{folder}: none of the files that its {METADATA} lists is there: {_shown(missing)}")
+    text = f"{folder}: {len(missing)} of its {len(names)} files are missing: {_shown(missing)}: results have gaps"
+    return BagFiles(files, True, {"missing_files": text} if missing else {})
+
+
+def _there(path: Path) -> Path | None:
+    """Return a file, or the same packed or unpacked; None if neither is there."""
+    other = path.with_suffix("") if path.suffix == PACKED else path.with_name(path.name + PACKED)
+    return next((candidate for candidate in (path, other) if candidate.is_file()), None)
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """Return the recordings in a folder, by number and name; what is there packed and unpacked once."""
+    files = [f for f in folder.iterdir() if f.is_file() and f.name.removesuffix(PACKED).endswith(STORAGES)]
+    by_name = {f.name.removesuffix(PACKED): f for f in sorted(files, key=lambda f: f.suffix == PACKED, reverse=True)}
+    if not by_name:
+        raise BagError(f"{folder}: no recording in this folder: expected .mcap or .db3 files, as ros2 bag writes them")
+    return [by_name[name] for name in sorted(by_name, key=_natural)]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(word[:18]), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", name)]
+
+
+def _part_of(path: Path) -> dict[str, str]:
+    """Return a warning if a file is one of several of a recording."""
+    if not (path.parent / METADATA).is_file():
+        return {}
+    try:
+        names = [Path(str(name)).name for name in _metadata(path.parent)["relative_file_paths"]]
+    except (YamlError, OSError):
+        return {}
+    if len(names) < 2 or path.name not in names:
+        return {}
+    return {"split": f"{path} is one of {len(names)} files of a recording: give its folder {path.parent} to read all"}
+
+
+def unpack_file(path: Path, folder: Path) -> Path:
+    """Unpack a file into a folder and return the one made.
+
+    Raises:
+        BagError: it cannot be read, is damaged, or far larger than a recording can be.
+    """
+    target = folder / path.stem
+    try:
+        require_regular(path)
+        # A recording of black images packs well.
+        limit = limit_for(path.stat().st_size, growth=1000, always=16 * ALWAYS_ALLOWED_BYTES)
+        with path.open("rb") as packed, target.open("xb") as out:
+            out.writelines(pieces("zstd", packed, limit))
+    except BagError as error:
+        raise BagError(f"{path}: {error}") from None
+    except OSError as error:
+        raise BagError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
+    except Exception as error:  # what the library raises on damaged data is no OSError
+        raise BagError(f"{path}: cannot be unpacked: {error}") from error
+    return target
+
+
+def require_regular(path: Path) -> None:
+    """Raise BagError for a device or a pipe, which may have no end, OSError for what is not there."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise BagError("is not a regular file: expected a recording")
+
+
+def _shown(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

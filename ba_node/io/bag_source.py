@@ -1,0 +1,169 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read one file of a recording, MCAP or SQLite: its channels, and their messages by log time."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, field
+from typing import IO, TYPE_CHECKING, Any, Protocol
+
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+from ba_node.io import ros_types
+from ba_node.io.bag_errors import BagError, EmptyBagError
+from ba_node.io.bag_files import require_regular
+from ba_node.io.bag_index import BagIndex, read_index, read_messages
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator
+    from pathlib import Path
+
+    from mcap.records import Channel
+
+_SQLITE_MAGIC = b"SQLite format 3\x00"
+_ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+
+
+@dataclass(frozen=True)
+class BagChannel:
+    """Messages of one topic and type in one file.
+
+    Attributes:
+        id: in its file.
+        topic: full name.
+        type_name: ``package/msg/Type``; empty if the file does not say.
+        encoding: of messages and of definitions, as the file names them.
+        definition: of the type.
+        count: messages in it, None if that is not known.
+    """
+
+    id: int
+    topic: str
+    type_name: str
+    encoding: tuple[str, str]
+    definition: str
+    count: int | None
+
+
+@dataclass
+class SourceFacts:
+    """What a file says of itself.
+
+    Attributes:
+        channels: all.
+        message_count: messages that can be read.
+        start_ns: log time of the first, ns.
+        end_ns: log time of the last, ns.
+        problems: what is wrong with it, as (reason, words).
+    """
+
+    channels: list[BagChannel]
+    message_count: int
+    start_ns: int
+    end_ns: int
+    problems: list[tuple[str, str]] = field(default_factory=list)
+
+
+class Source(Protocol):
+    """One open file."""
+
+    facts: SourceFacts
+
+    def read(self, channels: Collection[int], report: Callable[[str, str], None]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield channel, log time in ns and bytes of the messages of some channels, by log time."""
+        ...
+
+
+def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
+    """Open a file.
+
+    Args:
+        path: the file.
+        name: what it is called in errors: it may have been unpacked from another.
+        stack: closes it.
+
+    Raises:
+        BagError: it cannot be opened, is of another kind, or holds no message that can be read.
+    """
+    try:
+        require_regular(path)
+        stream = stack.enter_context(path.open("rb"))
+        head = stream.read(len(_SQLITE_MAGIC))
+        stream.seek(0)
+        return SqliteSource(path, stack) if head == _SQLITE_MAGIC else McapSource(stream, path.stat().st_size)
+    except BagError as error:
+        raise type(error)(f"{name}: {error}") from None
+    except OSError as error:
+        raise BagError(f"{name}: cannot be opened: {error.strerror}") from error
+
+
+class McapSource:
+    """An MCAP file, whole or damaged."""
+
+    def __init__(self, stream: IO[bytes], size: int) -> None:
+        """Index it."""
+        self._stream = stream
+        self._index = index = read_index(stream, size)
+        channels = [_mcap_channel(index, channel) for channel in index.channels.values()]
+        start_ns = index.blocks[0].start_ns if index.blocks else 0
+        self.facts = SourceFacts(channels, index.message_count, start_ns, index.end_ns, index.problems)
+
+    def read(self, channels: Collection[int], report: Callable[[str, str], None]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield channel, log time and bytes; see :class:`Source`."""
+        return read_messages(self._stream, self._index, channels, report)
+
+
+def _mcap_channel(index: BagIndex, channel: Channel) -> BagChannel:
+    schema = index.schemas.get(channel.schema_id)
+    return BagChannel(
+        channel.id,
+        channel.topic,
+        "" if schema is None else ros_types.full_name(schema.name),
+        (channel.message_encoding, "" if schema is None else schema.encoding),
+        "" if schema is None else schema.data.decode("utf-8", errors="replace"),
+        index.counts[channel.id] if index.counts else None,
+    )
+
+
+class SqliteSource:
+    """An SQLite file of rosbag2; those before Jazzy hold no definitions, so that ours are taken."""
+
+    def __init__(self, path: Path, stack: contextlib.ExitStack) -> None:
+        """Open it."""
+        self._reader = Sqlite3Reader(path)
+        try:
+            self._reader.open()
+        except Exception as error:  # a damaged database leads the library into errors of every kind
+            raise BagError(f"not an SQLite recording of rosbag2, or damaged: {error}") from error
+        stack.callback(self._reader.close)
+        facts = self._reader.metadata
+        if facts.message_count == 0:
+            raise EmptyBagError("no message can be read: it was closed before anything was recorded")
+        channels = [_sqlite_channel(connection) for connection in self._reader.connections]
+        self.facts = SourceFacts(channels, facts.message_count, facts.start_time, facts.end_time - 1)
+        journal = path.with_name(f"{path.name}-wal")
+        if journal.is_file() and journal.stat().st_size:
+            words = f"{journal.name} beside it holds messages that were not written into it: open it with sqlite3 once"
+            self.facts.problems.append(("truncated", words))
+
+    def read(self, channels: Collection[int], report: Callable[[str, str], None]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield channel, log time and bytes; see :class:`Source`."""
+        connections = [connection for connection in self._reader.connections if connection.id in channels]
+        if not connections:
+            return
+        try:
+            for connection, log_time, data in self._reader.messages(connections):
+                yield connection.id, log_time, data
+        except Exception as error:  # as when it is opened
+            report("corrupt", f"the database is damaged: {error}")
+
+
+def _sqlite_channel(connection: Any) -> BagChannel:
+    type_name = ros_types.full_name(connection.msgtype)
+    definition, kind = connection.msgdef.data, _ENCODINGS.get(connection.msgdef.format, "ros2msg")
+    if not definition and ros_types.is_known(type_name):
+        definition = ros_types.schema_text(type_name)
+    encoding = (connection.ext.serialization_format, kind)
+    return BagChannel(connection.id, connection.topic, type_name, encoding, definition, connection.msgcount)
