@@ -14,7 +14,10 @@ from pathlib import Path
 from ba_node.cli.console import progress_bar
 
 SUMMARY = "publish a recording on live topics"
-EXAMPLE = "ba play bags/stereo_loop.mcap --rate 2 --remap keyframes:=front/keyframes"
+EXAMPLE = (
+    "ba play bags/stereo_loop.mcap --rate 2 --remap keyframes:=front/keyframes\n"
+    "  ba play bags/mono_loop.mcap --clock --start 3 --loop"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,6 +28,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--wait", type=float, default=10.0, metavar="S", help="how long to wait for subscribers, s (default: 10)"
+    )
+    parser.add_argument(
+        "--start", type=float, default=0.0, metavar="S", help="begin so many seconds into the recording (default: 0)"
+    )
+    parser.add_argument("--loop", action="store_true", help="play again and again, until interrupted")
+    parser.add_argument(
+        "--clock",
+        type=float,
+        nargs="?",
+        const=100.0,
+        default=0.0,
+        metavar="HZ",
+        help="publish the time of the recording on /clock, for nodes with use_sim_time (HZ: 100)",
     )
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play only these")
     parser.add_argument("--namespace", default="", metavar="NS", help="put in front of every topic")
@@ -45,6 +61,9 @@ def run(args: argparse.Namespace) -> int:
     options = PlayOptions(
         rate=args.rate,
         wait_s=args.wait,
+        start_s=args.start,
+        rounds=0 if args.loop else 1,
+        clock_hz=args.clock,
         namespace=args.namespace,
         topics=args.topics,
         ros_args=("--ros-args", *remaps) if remaps else (),

@@ -45,6 +45,8 @@ class Health:
         report: of the last solve; None before the first.
         tf: what becomes of the transform map -> odom, in words.
         memory_mb: resident, MB.
+        clock: what is wrong with simulated time, in words; empty if nothing is.
+        solver_alive: the solver's thread works.
     """
 
     rates_hz: Mapping[str, float] = field(default_factory=dict)
@@ -57,6 +59,8 @@ class Health:
     report: SolveReport | None = None
     tf: str = ""
     memory_mb: float = 0.0
+    clock: str = ""
+    solver_alive: bool = True
 
 
 @dataclass
@@ -126,6 +130,8 @@ def _inputs(health: Health, limits: DiagnosticsConfig, silence_s: float) -> Find
         missing = [name for name, count in health.publishers.items() if not count]
         words = f"no keyframe for {health.silence_s:.0f} s"
         found.find(Level.STALE, f"{words}; nobody publishes {', '.join(missing)}" if missing else words)
+    if health.clock:
+        found.find(Level.WARN, health.clock)
     turned_away = {reason: count for reason, count in health.recent.items() if reason not in _QUEUE}
     if turned_away:
         words = ", ".join(f"{reason} {count}" for reason, count in sorted(turned_away.items()))
@@ -156,6 +162,8 @@ def _queue(health: Health, limits: DiagnosticsConfig) -> Finding:
 
 def _solver(health: Health, limits: DiagnosticsConfig) -> Finding:
     report = health.report
+    if not health.solver_alive:
+        return Finding("solver", {}, Level.ERROR, ["the solver's thread has ended: start the node anew"])
     if report is None:
         return Finding("solver", {}, words=["no solve yet"])
     share = report.observations / max(report.observations + report.outliers, 1)

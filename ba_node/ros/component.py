@@ -56,6 +56,7 @@ class Host:
         arrived: messages that came in, by topic; ignored ones too.
         place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
         tf: what becomes of the transform map -> odom, in words.
+        clock: what is wrong with simulated time, in words; empty if nothing is.
         at_cleanup: what is undone when the node is cleaned up, last made first.
         after_cleanup: what is undone a moment later: who was answered at cleanup must still hear it.
         report: of the last solve, with its latency; None before the first.
@@ -73,6 +74,7 @@ class Host:
     arrived: Counter[str] = field(default_factory=Counter)
     place_cameras: Callable[[CameraRig], CameraRig | None] = lambda rig: rig
     tf: str = ""
+    clock: str = ""
     report: SolveReport | None = None
     at_cleanup: ExitStack = field(default_factory=ExitStack)
     after_cleanup: ExitStack = field(default_factory=ExitStack)

@@ -72,6 +72,8 @@ class Diagnostics(Component):
             report=host.report and dataclasses.replace(host.report, rejected={**host.report.rejected, **host.counted}),
             tf=host.tf,
             memory_mb=_resident_mb(),
+            clock=host.clock,
+            solver_alive=host.worker.alive,
         )
 
     def _all_lost(self) -> Counter[str]:

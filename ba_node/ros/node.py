@@ -38,6 +38,7 @@ from ba_node.ros.relay import Relay
 from ba_node.ros.services import Services
 from ba_node.ros.side_outputs import SideOutputs
 from ba_node.ros.silence import Silence
+from ba_node.ros.simulated_time import SimulatedTime
 from ba_node.ros.static_frames import StaticFrames
 from ba_node.ros.throttle import Throttle
 from ba_node.ros.worker import Notice, Worker
@@ -53,6 +54,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     SideOutputs,
     Diagnostics,
     Silence,
+    SimulatedTime,
     StaticFrames,
     Services,
     Optimize,

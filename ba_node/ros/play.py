@@ -3,7 +3,8 @@
 """Publish a recording on live topics, where `ros2 bag play` is not at hand.
 
 The recorded bytes go out as they are. Play begins when someone listens, repeats what gets lost on the way, and ends
-when everything has been acknowledged. Writers keep all that is not acknowledged: a subscriber with history keep_all
+when everything has been acknowledged. Whoever begins later than the recording does still gets the cameras from before.
+Writers keep all that is not acknowledged: a subscriber with history keep_all
 slows the play down when it falls behind. One with a queue of limited depth drops the oldest from it, which is to be
 expected at rate 0.
 """
@@ -11,6 +12,7 @@ expected at rate 0.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import time
 from collections import Counter
@@ -22,6 +24,7 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.time import Time
 
 from ba_node.io.mcap import BagReader
 from ba_node.messages.conversion import INPUT_TYPES
@@ -41,6 +44,7 @@ _POLL_S = 0.02
 # Fast DDS asks for acknowledgements every 3 s.
 _ACK_TIMEOUT_S = 10.0
 _LATCHED_DEPTH = 10
+CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 _LATCHED_TYPES = (INPUT_TYPES["camera_rig"], INPUT_TYPES["camera_info"])
 
 
@@ -54,6 +58,9 @@ class PlayOptions:
 
     Attributes:
         rate: times real time; 0 for as fast as the middleware takes it.
+        start_s: where to begin, from the first message on, s; latched messages from before are sent all the same.
+        rounds: how often to play; 0 for ever.
+        clock_hz: publish the time of the recording on /clock, so often a second of real time; 0 for not at all.
         wait_s: how long to wait for a subscriber of each input of the node before the first message, s.
         namespace: put in front of every topic.
         topics: play only these; all if None.
@@ -62,12 +69,15 @@ class PlayOptions:
 
     rate: float = 1.0
     wait_s: float = 10.0
+    start_s: float = 0.0
+    rounds: int = 1
+    clock_hz: float = 0.0
     namespace: str = ""
     topics: Collection[str] | None = None
     ros_args: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("rate", "wait_s"):
+        for name in ("rate", "wait_s", "start_s", "rounds", "clock_hz"):
             value = getattr(self, name)
             if not math.isfinite(value) or value < 0:
                 raise PlayError(f"{name} = {value!r}: expected a finite number, 0 or more")
@@ -146,6 +156,24 @@ def _node(options: PlayOptions) -> Iterator[Any]:
         rclpy.try_shutdown(context=context)
 
 
+class _Time:
+    """Publishes the time of the recording, which is the same for all namespaces."""
+
+    def __init__(self, node: Any, rate_hz: float) -> None:
+        self._kind = message_class(_CLOCK_TYPE)
+        self._publisher = node.create_publisher(self._kind, CLOCK, qos.reliable(max(1, round(rate_hz))))
+        self._last_ns = -1
+        self.count = 0
+
+    def publish(self, time_ns: int) -> None:
+        """Publish a time, unless it was published last."""
+        if time_ns == self._last_ns:
+            return
+        self._last_ns = time_ns
+        self.count += 1
+        self._publisher.publish(self._kind(clock=Time(nanoseconds=time_ns).to_msg()))
+
+
 class _Player:
     def __init__(self, reader: BagReader, node: Any, options: PlayOptions, listener: Listener) -> None:
         self._reader = reader
@@ -153,9 +181,12 @@ class _Player:
         self._listener = listener
         self._skipped: dict[str, str] = {}
         self._publishers: dict[str, Any] = {}
+        self._time = _Time(node, options.clock_hz) if options.clock_hz else None
         for topic, kind in reader.topics.items():
             if options.topics is not None and topic not in options.topics:
                 continue
+            if self._time is not None and topic == CLOCK:
+                continue  # there is one time
             try:
                 cls = message_class(kind)
             except LookupError as error:
@@ -168,6 +199,7 @@ class _Player:
         if not self._publishers:
             there = ", ".join(f"{topic} ({kind})" for topic, kind in reader.topics.items())
             raise PlayError(f"{reader.path}: no topic can be played; topics in the recording: {there}")
+        self._begin_ns = self._find_begin()
 
     def wait(self) -> None:
         """Wait for subscribers of the node's inputs, or if the recording has none of these, for any subscriber."""
@@ -189,18 +221,41 @@ class _Player:
     def run(self) -> PlaySummary:
         """Publish everything."""
         published: Counter[str] = Counter()
+        began = time.monotonic()
+        rounds = itertools.count() if self._options.rounds == 0 else range(self._options.rounds)
+        for _ in rounds:
+            self._play_once(published)
+        duration_s = time.monotonic() - began
+        if self._time is not None:
+            published[CLOCK] = self._time.count
+        return PlaySummary(dict(published), self._skipped, self._unheard, self._confirm(), duration_s)
+
+    def _play_once(self, published: Counter[str]) -> None:
+        """Publish from the start to the end."""
+        begin_ns = self._begin_ns
         total = self._reader.message_count
-        first_ns: int | None = None
         start = time.monotonic()
         for done, (topic, _, log_time_ns, data) in enumerate(self._reader.messages(), start=1):
-            first_ns = log_time_ns if first_ns is None else first_ns
-            if topic in self._publishers:
-                self._sleep_until(start, log_time_ns - first_ns)
+            latched = self._reader.topics[topic] in _LATCHED_TYPES
+            if topic in self._publishers and (log_time_ns >= begin_ns or latched):
+                self._wait_for(start, max(log_time_ns, begin_ns), begin_ns)
                 self._publish(self._publishers[topic], data)
                 published[self._publishers[topic].topic_name] += 1
             self._listener.progress(done, total)
-        duration_s = time.monotonic() - start
-        return PlaySummary(dict(published), self._skipped, self._unheard, self._confirm(), duration_s)
+
+    def _find_begin(self) -> int:
+        """Return the time of the recording at which play begins, ns.
+
+        Raises:
+            PlayError: the recording is over by then.
+        """
+        times = [log_time_ns for _, _, log_time_ns, _ in self._reader.messages()] if self._options.start_s else []
+        if not times:
+            return next((log_time_ns for _, _, log_time_ns, _ in self._reader.messages()), 0)
+        length_s = (times[-1] - times[0]) * 1e-9
+        if self._options.start_s > length_s:
+            raise PlayError(f"start_s = {self._options.start_s:g}: the recording is {length_s:.1f} s long")
+        return times[0] + round(self._options.start_s * 1e9)
 
     def _publish(self, publisher: Any, data: bytes) -> None:
         """Publish, waiting for a subscriber that is behind."""
@@ -210,9 +265,18 @@ class _Player:
                 where = f"{publisher.topic_name}: a subscriber takes no messages any more"
                 raise PlayError(f"{where} (waited {_ACK_TIMEOUT_S:g} s): {error}")
 
-    def _sleep_until(self, start: float, elapsed_ns: int) -> None:
-        if self._options.rate:
-            time.sleep(max(0.0, start + elapsed_ns * 1e-9 / self._options.rate - time.monotonic()))
+    def _wait_for(self, start: float, time_ns: int, begin_ns: int) -> None:
+        """Sleep until a time of the recording, and publish it."""
+        rate = self._options.rate
+        due = start + (time_ns - begin_ns) * 1e-9 / rate if rate else start
+        while (left := due - time.monotonic()) > 0.0 and rate:
+            if self._time is None:
+                time.sleep(left)
+            else:
+                self._time.publish(time_ns - round(left * rate * 1e9))
+                time.sleep(min(left, 1.0 / self._options.clock_hz))
+        if self._time is not None:
+            self._time.publish(time_ns)
 
     def _confirm(self) -> tuple[str, ...]:
         """Wait until the subscribers have got what was sent; return the topics where they have not."""

@@ -66,6 +66,8 @@ def test_all_is_well() -> None:
         ({"recent": {"bad_pose": 2}}, "inputs", Level.WARN, "turned away in the last 10 s: bad_pose 2"),
         ({"recent": {"dropped": 4}}, "queue", Level.ERROR, "4 messages dropped in the last 10 s"),
         ({"recent": {"coalesced": 4}}, "queue", Level.WARN, "4 keyframes solved with a newer one"),
+        ({"clock": "no time"}, "inputs", Level.WARN, "no time"),
+        ({"solver_alive": False}, "solver", Level.ERROR, "the solver's thread has ended"),
         ({"inbox_waiting": 300}, "queue", Level.WARN, "300 of 500 places"),
         ({"status": Status.FAILED, "reason": "no luck"}, "solver", Level.ERROR, "the last solve failed: no luck"),
         ({"status": Status.SKIPPED, "reason": "no rig"}, "solver", Level.WARN, "skipped: no rig"),

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -197,3 +198,31 @@ def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(
         peer.until(lambda peer=peer, expected=expected: _stamps(peer) >= expected, "every keyframe")
         assert _stamps(peer) == expected
     assert [node.stop() for node in nodes] == [0, 0]
+
+
+def test_simulated_time_without_a_clock_is_told(start_node: StartNode, make_peer: MakePeer) -> None:
+    """By name, in the log and on /diagnostics; a clock that comes, or another parameter, ends it."""
+    node = start_node("--ros-args", "-p", "use_sim_time:=true")
+    peer = make_peer()
+    peer.node.create_subscription(DiagnosticArray, "/diagnostics", peer.received["/diagnostics"].append, 10)
+
+    def inputs() -> str:
+        arrays = peer.received["/diagnostics"]
+        found = [one.message for one in arrays[-1].status if one.name.endswith(": inputs")] if arrays else []
+        return str(found[0]) if found else ""
+
+    words = "use_sim_time is true and no time has come for 3 s: /clock has 0 publishers; start the simulation, play"
+    peer.until(lambda: words in inputs(), "a warning on /diagnostics")
+    peer.until(lambda: words in node.err, "a warning in the log")
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+    peer.until(lambda: clock.get_subscription_count() > 0, "the node to hear the time")
+    ticks = iter(range(1, 10**6))
+
+    def told(wanted: str) -> Callable[[], bool]:
+        return lambda: clock.publish(Clock(clock=Time(seconds=next(ticks)).to_msg())) or wanted in inputs()
+
+    peer.until(lambda: told("")() and "use_sim_time" not in inputs(), "the time")
+    peer.until(lambda: "the time has stood still for 3 s: /clock has 1 publisher (/peer)" in inputs(), "it to stand")
+    assert peer.set("use_sim_time", False).successful
+    peer.until(lambda: "use_sim_time" not in inputs(), "the wall clock")
+    assert node.stop() == 0

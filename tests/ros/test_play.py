@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable
@@ -10,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 
 from ba_node.config import Config
 from ba_node.io.bal import read_bal
@@ -219,3 +222,54 @@ def test_a_whole_map_comes_back_as_in_a_replay(
     assert all(peer.received[topic.rsplit("/", 1)[-1]] for topic in wanted), f"of {sorted(wanted)}"
     assert peer.received["report"][-1].dropped == 0
     assert node.stop() == 0
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize("rate", [0.0, 4.0])
+def test_the_time_goes_with_the_recording(bag: Path, scene: SyntheticData, make_peer: MakePeer, rate: float) -> None:
+    """Two rounds from the middle on, with the time on /clock; the cameras come although they were sent before."""
+    peer = make_peer()
+    received = _collect(peer)
+    times: list[int] = []
+    profile = qos.reliable(1000)
+    peer.node.create_subscription(Clock, "/clock", lambda message: times.append(_ns(message.clock)), profile)
+    start_ns = scene.keyframes[4].stamp_ns
+    start_s = (start_ns - scene.keyframes[0].stamp_ns) * 1e-9
+    options = PlayOptions(rate=rate, start_s=start_s, rounds=2, clock_hz=50.0)
+    summary = _play(peer, bag, options)
+    later = [keyframe for keyframe in scene.keyframes if keyframe.stamp_ns >= start_ns]
+    assert len(received["keyframes"]) == summary.published["/keyframes"] == 2 * len(later) == 8
+    assert len(received["camera_rig"]) == 2
+    peer.until(lambda: len(times) == summary.published["/clock"], "every time")
+    last_ns = scene.keyframes[-1].stamp_ns
+    assert (times[0], times[-1], max(times), min(times)) == (start_ns, last_ns, last_ns, start_ns)
+    assert [b for a, b in itertools.pairwise(times) if b <= a] == [start_ns], "time goes back at the second round alone"
+    stamps = {keyframe.stamp_ns for keyframe in later}
+    assert stamps <= set(times)
+    if rate:
+        assert len(times) > 2 * len(stamps), "and between the messages"
+        assert summary.duration_s >= 2 * (last_ns - start_ns) * 1e-9 / rate
+
+
+@pytest.mark.dds
+def test_a_node_goes_by_that_time(bag: Path, scene: SyntheticData, make_peer: MakePeer, start_node: Any) -> None:
+    node, peer = start_node("--ros-args", "-p", "use_sim_time:=true"), make_peer()
+    peer.listen("report")
+    peer.connect()
+    summary = _play(peer, bag, PlayOptions(rate=2.0, clock_hz=100.0))
+    assert not summary.unheard
+    last = scene.keyframes[-1].keyframe_id
+    reports = peer.received["report"]
+    peer.until(lambda: reports and reports[-1].newest_keyframe_id == last, "the last report")
+    # By the clock of the recording the newest pose is young; by the one on the wall it is years old.
+    assert 0.0 <= reports[-1].stamp_latency_p50_s < 10.0
+    assert node.stop() == 0
+
+
+def test_a_start_after_the_end_is_refused(bag: Path) -> None:
+    with pytest.raises(PlayError, match=r"start_s = 100: the recording is 1\.8 s long"):
+        play(bag, PlayOptions(wait_s=0.0, start_s=100.0))
+
+
+def _ns(stamp: Any) -> int:
+    return int(Time.from_msg(stamp).nanoseconds)
