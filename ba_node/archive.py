@@ -134,6 +134,10 @@ def _report_from(content: MapContent) -> SolveReport:
             continue
         if field.name == "rejected":
             values[field.name] = facts.counts(field.name)
+        elif field.name == "warnings":
+            texts = facts.fact(field.name, (list, tuple))
+            require(all(isinstance(text, str) for text in texts), f"warnings = {texts}, expected texts")
+            values[field.name] = tuple(texts)
         elif field.name == "status":
             name = facts.fact(field.name, str)
             require(name in Status.__members__, f"status = {name!r}, expected one of {', '.join(Status.__members__)}")

@@ -23,9 +23,16 @@ A replay solves once for every keyframe, however the messages are spaced, just b
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
 due again if it was not refined without them. A higher session id begins a new map with the same rig; the last estimate
-of the one before is kept in ``finished``. So does a keyframe far older than the newest, as when a recording is played
-again; its session id stays as the front-end has it. Nothing here reads a clock: the caller passes one, for the report
-alone.
+of the one before is kept in ``finished``. So do keyframes far older than the newest, as when a recording is played
+again; their session id stays as the front-end has it. A keyframe that is odd is held until others tell what it was, see
+``scene/sessions.py``; then several are taken in at once, and whoever wants a solve for each of them writes::
+
+    for admitted in backend.admit(measurement):
+        if backend.completes(admitted):
+            write(backend.solve())
+        backend.take(admitted)
+
+Nothing here reads a clock: the caller passes one, for the report alone.
 """
 
 from __future__ import annotations
@@ -41,7 +48,10 @@ from ba_node.core import geometry, methods, solver
 from ba_node.estimate import Correction, Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
+from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
+from ba_node.scene.frame_names import check_name
 from ba_node.scene.scene import Scene
+from ba_node.scene.sessions import Sessions
 from ba_node.window import extras, full, quality
 from ba_node.window.correction import MapCorrection, Transform
 from ba_node.window.known import cloud_of, poses_of, taking_part_of
@@ -55,7 +65,10 @@ if TYPE_CHECKING:
     from ba_node.scene.map_content import MapContent
     from ba_node.scene.tables import IntArray
 
+__all__ = ["FINISHED_KEPT", "Admitted", "Backend"]
+
 FINISHED_KEPT = 8
+_REFUSED_KEPT = 1000
 # Keyframes from which it is learned how many cameras deliver.
 _LEARN_FROM = 5
 _UNSOLVED = "not solved yet"
@@ -75,8 +88,10 @@ class Backend:
         scene: the current map.
         finished: session id and last estimate of the sessions before, oldest first, the last few.
         solve_count: solves since the beginning.
-        jumps: sessions that began because the stamps jumped back.
+        map_index: number of the current map; it rises when another takes its place, whatever the session ids.
+        jumps: sessions that began although the front-end did not raise the session id.
         jump_note: the last of these in words.
+        refused: the last keyframes that were turned away.
         extras: what the next solve is to work out beside the estimate.
     """
 
@@ -86,10 +101,13 @@ class Backend:
         self.scene = Scene(config.scene)
         self.finished: list[tuple[int, Estimate]] = []
         self.solve_count = 0
+        self.map_index = 0
         self.jumps = 0
         self.jump_note = ""
+        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
         self.extras = Extras()
         self._clock = clock
+        self._sessions = Sessions()
         self._current: int | None = None
         self._settled = False
         self._delivered: deque[int] = deque(maxlen=_LEARN_FROM)
@@ -131,41 +149,74 @@ class Backend:
         self.config = config
         self.scene.config = config.scene
 
-    def completes(self, measurement: Measurement) -> bool:
+    @property
+    def held(self) -> list[Keyframe]:
+        """Return the keyframes that wait for others to tell what they are."""
+        return self._sessions.held
+
+    def completes(self, what: Measurement | Admitted) -> bool:
         """Return True if adding this would begin a new keyframe (or session) while the last one is unsolved."""
-        if isinstance(measurement, CameraRig) or self.scene.keyframes.solved.all():
+        if isinstance(what, CameraRig) or self.scene.keyframes.solved.all():
             return False
-        if self._opens(measurement):
-            return True
-        if not isinstance(measurement, Keyframe) or measurement.session_id != self.scene.session_id:
-            return False
-        return self.scene.find_keyframe(measurement.keyframe_id) is None
+        admitted = (what,) if isinstance(what, Admitted) else self._sessions.decide(self.scene, what).admitted
+        return any(self._is_new(one) for one in admitted)
 
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement; what cannot be used is counted in ``rejected``."""
+        for admitted in self.admit(measurement):
+            self.take(admitted)
+
+    def admit(self, measurement: Measurement) -> tuple[Admitted, ...]:
+        """Return what is to be taken in now, in order: nothing while a keyframe is held, several once that is over."""
+        decision = self._sessions.decide(self.scene, measurement)
+        self._sessions.commit(measurement, decision)
+        return self._decided(decision)
+
+    def admit_rest(self) -> tuple[Admitted, ...]:
+        """Return what is to be taken in of all that is held, as nothing more will come."""
+        decision = self._sessions.end(self.scene)
+        self._sessions.commit(None, decision)
+        return self._decided(decision)
+
+    def take(self, admitted: Admitted) -> None:
+        """Take in what :meth:`admit` returned."""
+        measurement = admitted.measurement
         if isinstance(measurement, CameraRig) and self.config.frames.poses_of == "camera":
             measurement = ingest.seen_from_first(measurement)
-        if not isinstance(measurement, CameraRig) and self._opens(measurement):
-            self._note_jump(measurement)
-            self._begin(measurement.session_id)
-        last = self._current
-        if not isinstance(measurement, Keyframe) or self.scene.find_keyframe(measurement.keyframe_id) is not None:
+        if admitted.begins is not None:
+            assert isinstance(measurement, Keyframe)
+            self._begin(measurement.session_id, admitted.begins)
+        if not isinstance(measurement, Keyframe):
             self.scene.add(measurement)
             return
+        last, is_new = self._current, self._is_new(admitted)
         self.scene.add(measurement)
-        if self.scene.find_keyframe(measurement.keyframe_id) is None:
+        if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
+            self.refused.append(measurement)
             return
+        named = self.config.frames.odom_frame
+        check_name(measurement, named, named or self.scene.frame_id or _ODOM_FRAME, self.scene.log)
         if last is not None:
             self._delivered.append(self._cameras_of(last))
         self._current, self._settled = measurement.keyframe_id, False
 
     def flush(self, final: bool = False) -> None:
-        """Call the newest keyframe complete with what has come.
+        """Call the newest keyframe complete with what has come, and let a session begin that the front-end asked for.
 
         Args:
             final: nothing more will come: give up on what waits for its keyframe or for the rig.
         """
         self._settled = True
+        if final:
+            rest = self.admit_rest()
+        else:
+            decision = self._sessions.settle(self.scene)
+            self._sessions.commit(None, decision)
+            rest = self._decided(decision)
+        for admitted in rest:
+            self.take(admitted)
+        if rest:
+            self._settled = True
         if final:
             self.scene.end_pending()
 
@@ -225,6 +276,7 @@ class Backend:
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
         self.finished = []
+        self._sessions.reset()
         self._renew(None, self.scene.next_cameras or self.scene.cameras)
         self._report = SolveReport(reason="reset: the map is empty")
 
@@ -252,6 +304,8 @@ class Backend:
         """
         self.scene, self._report, self._correction = known.scene, known.report, known.correction
         self.scene.config = self.config.scene
+        self.map_index += 1
+        self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
         self.finished = known.finished[-FINISHED_KEPT:]
         self._current = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
         self._settled = known.settled
@@ -315,6 +369,7 @@ class Backend:
             cloud=cloud_of(scene, scene.landmark_order),
             report=self._report,
             correction=self._published(),
+            map_index=self.map_index,
         )
 
     def _published(self) -> Correction | None:
@@ -361,41 +416,43 @@ class Backend:
         row = self.scene.find_keyframe(keyframe_id)
         return 0 if row is None else len(self.scene.cameras_of(row))
 
-    def _opens(self, measurement: Measurement) -> bool:
-        """Return True if a measurement belongs to a later session than the current."""
-        current = self.scene.session_id
-        if isinstance(measurement, CameraRig) or current is None or measurement.session_id < current:
-            return False
-        if measurement.session_id == current and not self._is_before_all(measurement):
-            return False
-        return self.scene.usable(measurement)
+    def _decided(self, decision: Decision) -> tuple[Admitted, ...]:
+        for refusal in decision.refused:
+            self.scene.refuse(refusal)
+            if isinstance(refusal.measurement, Keyframe):
+                self.refused.append(refusal.measurement)
+        return decision.admitted
 
-    def _note_jump(self, measurement: Measurement) -> None:
-        if isinstance(measurement, Keyframe) and measurement.session_id == self.scene.session_id:
-            back_s = (int(self.scene.keyframes.stamp_ns.max()) - measurement.stamp_ns) * 1e-9
-            self.jumps += 1
-            self.jump_note = (
-                f"keyframe {measurement.keyframe_id} is {back_s:.1f} s older than the newest"
-                f" (scene.max_reorder_s = {self.config.scene.max_reorder_s:g}): a new session begins"
-            )
+    def _is_new(self, admitted: Admitted) -> bool:
+        """Return True if a keyframe (or a session) begins with it."""
+        one = admitted.measurement
+        if not isinstance(one, Keyframe) or admitted.begins is not None:
+            return admitted.begins is not None
+        of_current = self.scene.session_id in (None, one.session_id)
+        return of_current and self.scene.find_keyframe(one.keyframe_id) is None
 
-    def _is_before_all(self, measurement: Measurement) -> bool:
-        """Return True if the stamps have jumped back, further than keyframes are sorted."""
-        limit_ns = int(self.config.scene.max_reorder_s * 1e9)
-        if not limit_ns or not isinstance(measurement, Keyframe) or not len(self.scene.keyframes):
-            return False
-        return int(self.scene.keyframes.stamp_ns.max()) - measurement.stamp_ns > limit_ns
-
-    def _begin(self, session_id: int) -> None:
-        if len(self.scene.keyframes):
-            assert self.scene.session_id is not None
-            self.scene.end_pending()
+    def _begin(self, session_id: int, begin: Begin) -> None:
+        before = self.scene
+        waiting = Scene(self.config.scene, session_id)
+        if before.session_id == session_id:
+            waiting.take_waiting(before)
+        if len(before.keyframes) and not begin.replaces:
+            assert before.session_id is not None
+            before.end_pending()
             self._report = dataclasses.replace(self._report, rejected=dict(sorted(self.rejected.items())))
-            self.finished.append((self.scene.session_id, self._estimate(self.scene.order)))
+            self.finished.append((before.session_id, self._estimate(before.order)))
             del self.finished[:-FINISHED_KEPT]
-        self._renew(session_id, self.scene.next_cameras or self.scene.cameras)
+        self._renew(session_id, before.next_cameras or before.cameras)
+        self.scene.pending = waiting.pending
+        if begin.replaces:
+            refuse_lone(before, self.scene.log)
+        if begin.kind:
+            self.scene.log.warn(begin.kind, begin.text)
+            self.jumps += 1
+            self.jump_note = begin.text
 
     def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
+        self.map_index += 1
         refused, self.scene = self.scene.refused_rig, Scene(self.config.scene, session_id)
         self.scene.cameras, self.scene.refused_rig = cameras, refused
         self._current, self._settled = None, False

@@ -178,6 +178,7 @@ class Estimate:
         covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
             0 for poses that were held. None if it was not asked for, or the solve is not usable.
         view: what there is to see; None likewise.
+        map_index: number of the map; another one has another, whatever the session ids.
     """
 
     stamp_ns: int
@@ -190,6 +191,7 @@ class Estimate:
     correction: Correction | None = None
     covariance: FloatArray | None = None
     view: WindowView | None = None
+    map_index: int = 0
 
     @property
     def replaces_map(self) -> bool:

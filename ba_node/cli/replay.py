@@ -4,11 +4,12 @@
 
 Writes into DIR: trajectory.tum, trajectory_input.tum (the front-end's), points.ply, refined.mcap (the node's output
 topics), report.json, effective.yaml (all parameters), and ground_truth.tum if the recording has a ground truth.
-Older sessions of the recording go to DIR/session_<id>/.
+Older sessions of the recording go to DIR/session_<id>/, to DIR/session_<id>_2/ where the same id began a map again.
 
-Exit code: 0 all is well, 2 nothing was written, 3 written, but something has to be looked at: input that was turned
-away, solutions that were not taken, a set-up that looks wrong. Each is said in a line of its own and under "attention"
-in report.json.
+Exit code: 0 all is well, 2 nothing was written (no keyframe in the recording can be used), 3 written, but something has
+to be looked at: input that was turned away, solutions that were not taken, nothing refined at all (no cameras, no
+tracks, all known already), stamps that jumped, a set-up that looks wrong. Each is said in a line of its own and under
+"attention" in report.json.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ba_node.cli.console import facts, progress_bar, require_folder
+from ba_node.offline.attention import HARMLESS
 
 SUMMARY = "run the back-end on a recording, without a middleware"
 # Results were written, and something in them has to be looked at.
@@ -81,7 +83,10 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
         *((label, f"{_short(report[key]['input'])} -> {_short(report[key]['refined'])} px") for label, key in _ERRORS),
         ("rms without outliers", f"{_short(report['rms_px_without_outliers']['refined'])} px"),
-        ("solves", f"{report['solves']} ({', '.join(f'{n} {name.lower()}' for name, n in statuses.items())})"),
+        (
+            "solves",
+            f"{report['solves']} ({', '.join(f'{n} {name.lower()}' for name, n in statuses.items()) or 'none'})",
+        ),
         ("time in the solver", f"{report['solver_time_s']:.2f} s, slowest {1e3 * report['slowest_solve_s']:.0f} ms"),
         ("outliers left out", str(report["outliers"])),
         ("rejected", ", ".join(f"{n} {reason}" for reason, n in _rejected(report).items()) or "nothing"),
@@ -90,7 +95,14 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if error:
         rows.insert(5, ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)"))
     if report["older_sessions"]:
-        rows.append(("older sessions", ", ".join(str(old["session_id"]) for old in report["older_sessions"])))
+        rows.append(
+            (
+                "older sessions",
+                ", ".join(f"{old['keyframes']} keyframes in {old['folder']}" for old in report["older_sessions"]),
+            )
+        )
+    if report["known_already"]:
+        rows.append(("in the loaded map", f"{report['known_already']} keyframes of the recording already"))
     return rows
 
 
@@ -106,6 +118,7 @@ def _tell(report: Mapping[str, Any]) -> None:
     """Print what has to be looked at, and the last rejection in words; all of them are in report.json."""
     for line in report["attention"]:
         print(f"ba: warning: {line}", file=sys.stderr)
-    notes = [*report["bag_notes"], *report["rejection_notes"]]
+    harmless = tuple(f"({reason} = " for reason in HARMLESS)
+    notes = [*report["bag_notes"], *(n for n in report["rejection_notes"] if not any(word in n for word in harmless))]
     if notes:
         print(f"ba: {notes[-1]}{' (more in report.json)' if len(notes) > 1 else ''}", file=sys.stderr)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 # What arrives twice changes nothing.
-_HARMLESS = ("duplicate_keyframe", "duplicate_observation")
+HARMLESS = ("duplicate_keyframe", "duplicate_observation")
 
 
 def attention(report: Mapping[str, Any]) -> list[str]:
@@ -22,6 +22,8 @@ def attention(report: Mapping[str, Any]) -> list[str]:
     for session in (*report["older_sessions"], report):
         lines += session["warnings"].values()
         of = f"session {session['session_id']}: " if report["older_sessions"] else ""
+        if session.get("unrefined"):
+            lines.append(f"{of}nothing was refined: {session['unrefined']}")
         for name in ("FAILED", "HELD"):
             count = session["solves_by_status"].get(name, 0)
             if count:
@@ -31,5 +33,5 @@ def attention(report: Mapping[str, Any]) -> list[str]:
 
 
 def _turned_away(rejected: Mapping[str, int], of: str) -> list[str]:
-    counts = {reason: count for reason, count in rejected.items() if reason not in _HARMLESS}
+    counts = {reason: count for reason, count in rejected.items() if reason not in HARMLESS}
     return [f"{of}turned away: {', '.join(f'{n} {reason}' for reason, n in counts.items())}"] if counts else []

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ba_node.backend import Backend
+from ba_node.backend import Admitted, Backend
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
@@ -28,7 +29,7 @@ from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
-from ba_node.measurements import Keyframe, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.conversion import output_messages
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import read_truth
@@ -87,8 +88,8 @@ def replay(
 ) -> dict[str, Any]:
     """Replay a recording and write the results; return the content of report.json.
 
-    The newest session's files go to ``out``, those of older sessions to ``out/session_<id>``. report.json is written
-    last: where it stands, all others are whole.
+    The newest session's files go to ``out``, those of older sessions to ``out/session_<id>``, with a number behind
+    where an id comes again. report.json is written last: where it stands, all others are whole.
 
     Raises:
         BagError: the recording cannot be read.
@@ -109,7 +110,7 @@ def replay(
             run.read((measurement for _, _, measurement in measurements), reader.message_count)
             run.end(options.optimize)
             if not run.sessions:
-                raise ReplayError(f"{bag}: no keyframe in it can be used{_why(reader, run)}")
+                raise ReplayError(f"{bag}: {_nothing_to_use(run)}{_why(reader, run)}")
             if run.backend.scene.cameras is None:
                 refused = run.backend.scene.refused_rig or "none came"
                 raise ReplayError(f"{bag}: no camera rig that can be used: {refused}")
@@ -117,6 +118,7 @@ def replay(
         report = {"bag": bag.name, **_write(out, run.sessions, truth)}
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
+        report["known_already"] = len(run.known_already)
         report["attention"] = attention(report)
         if options.save is not None:
             write_map(map_name(options.save), run.backend.snapshot())
@@ -135,12 +137,16 @@ class _Run:
         self._config = config
         self._writer = writer
         self._watch = watch
+        self.counted: Counter[type] = Counter()
+        self.known_already: set[int] = set()
+        self._known: set[int] = set()
         self._inputs: dict[int, Keyframe] = {}
         self._written = 0
 
     def load(self, path: Path) -> None:
         """Begin with a map."""
         self.backend.take_over(load_map(path, self._config.scene))
+        self._known = set(self.backend.scene.keyframes.keyframe_id.tolist())
         scene, table = self.backend.scene, self.backend.scene.keyframes
         orientation = geometry.quaternion_from_matrix(table.input_rotation)
         rows = zip(table.keyframe_id.tolist(), table.stamp_ns.tolist(), table.input_position, orientation, strict=True)
@@ -149,10 +155,10 @@ class _Run:
 
     def read(self, measurements: Iterable[Measurement], total: int) -> None:
         for done, measurement in enumerate(measurements, start=1):
-            if self.backend.completes(measurement):
-                self._solve()
-            self._add(measurement)
+            self.counted[type(measurement)] += 1
+            self._take(self.backend.admit(measurement))
             self._watch.progress(done, total)
+        self._take(self.backend.admit_rest())
         self.backend.flush(final=True)
         while self.backend.ready:
             self._solve()
@@ -164,15 +170,30 @@ class _Run:
             if isinstance(taken, full.Copy):
                 merged = self.backend.merge(taken, taken.solve(full.options(self._config.solver)))
                 self._record(merged[0] if merged else None)
+        if not self.sessions and len(self.backend.scene.keyframes):
+            # A loaded map to which the recording added nothing.
+            self._begin(self.backend.estimate())
         self._close(self.backend.scene)
 
-    def _add(self, measurement: Measurement) -> None:
-        backend, scene = self.backend, self.backend.scene
-        backend.add(measurement)
-        if backend.scene is not scene:
-            self._close(scene)
-        if isinstance(measurement, Keyframe) and backend.scene.find_keyframe(measurement.keyframe_id) is not None:
-            self._inputs.setdefault(measurement.keyframe_id, measurement)
+    def _take(self, several: Iterable[Admitted]) -> None:
+        """Take in what the back-end admits, with a solve before each new keyframe."""
+        backend = self.backend
+        for admitted in several:
+            if backend.completes(admitted):
+                self._solve()
+            scene = backend.scene
+            backend.take(admitted)
+            if backend.scene is not scene:
+                self._close(scene)
+                self._known = set()
+                if admitted.begins is not None and admitted.begins.replaces and self.sessions:
+                    self.sessions.pop()
+            one = admitted.measurement
+            if not isinstance(one, Keyframe) or backend.scene.find_keyframe(one.keyframe_id) is None:
+                continue
+            if one.keyframe_id in self._known and one.session_id == backend.scene.session_id:
+                self.known_already.add(one.keyframe_id)
+            self._inputs.setdefault(one.keyframe_id, one)
 
     def _solve(self) -> None:
         self._record(self.backend.solve())
@@ -180,10 +201,8 @@ class _Run:
     def _record(self, estimate: Estimate | None) -> None:
         if estimate is None:
             return
-        session = estimate.report.session_id
-        if not self.sessions or self.sessions[-1].session_id != session:
-            self.sessions.append(SessionRecord(session, inputs=self._inputs))
-            self._written = 0
+        if not self.sessions or self.sessions[-1].map_index != estimate.map_index:
+            self._begin(estimate)
         self.sessions[-1].add(estimate, self.backend.scene)
         if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
             self._written = len(estimate.trajectory)
@@ -191,10 +210,16 @@ class _Run:
         else:
             self._write(estimate, _AllTopics(without=_WHOLE_MAP))
 
+    def _begin(self, estimate: Estimate) -> None:
+        session = self.backend.scene.session_id or 0
+        record = SessionRecord(session, map_index=estimate.map_index, last=estimate, inputs=self._inputs)
+        self.sessions.append(record)
+        self._written = 0
+
     def _close(self, scene: Scene) -> None:
         """End a session: its whole map is written once more if the last estimate was not."""
-        if self.sessions and self.sessions[-1].session_id == scene.session_id:
-            record = self.sessions[-1]
+        record = self.sessions[-1] if self.sessions else None
+        if record is not None and not record.figures:
             record.close(scene, self._config)
             if record.last is not None and len(record.last.trajectory) > self._written:
                 self._write(record.last, _WHOLE_MAP)
@@ -219,14 +244,16 @@ class _AllTopics:
 
 def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dict[str, Any]:
     """Write the files of every session; return the figures of the newest, with those of the older ones in it."""
-    for index, record in enumerate(sessions):
-        folder = out if index == len(sessions) - 1 else out / f"session_{record.session_id}"
+    folders = [*(out / name for name in _folder_names(sessions[:-1])), out]
+    for folder, record in zip(folders, sessions, strict=True):
         folder.mkdir(exist_ok=True)
         assert record.last is not None
         write_tum(folder / "trajectory.tum", record.trajectory)
         write_tum(folder / "trajectory_input.tum", record.input_trajectory)
         write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
     figures = [record.as_dict() | _against(truth, record) for record in sessions]
+    for folder, entry in zip(folders[:-1], figures, strict=False):
+        entry["folder"] = folder.name
     if truth is not None:
         write_tum(out / "ground_truth.tum", truth)
     return {**figures[-1], "older_sessions": figures[:-1]}
@@ -244,6 +271,22 @@ def _against(truth: Poses | None, record: SessionRecord) -> dict[str, Any]:
     except EvaluationError as error:
         return {"trajectory_error_m": None, "trajectory_error_note": str(error)}
     return {"trajectory_error_m": errors}
+
+
+def _folder_names(sessions: list[SessionRecord]) -> Iterator[str]:
+    """Yield the name of each session's folder; a session that began anew under its id gets a number behind."""
+    times: Counter[int] = Counter()
+    for record in sessions:
+        times[record.session_id] += 1
+        again = times[record.session_id]
+        yield f"session_{record.session_id}" + (f"_{again}" if again > 1 else "")
+
+
+def _nothing_to_use(run: _Run) -> str:
+    """Say what there was of each kind of message, as no keyframe could be used."""
+    counts = [run.counted[kind] for kind in (Keyframe, FeatureTracks, CameraRig)]
+    told = "none of {} keyframes can be used" if counts[0] else "it holds no keyframes"
+    return f"{told.format(counts[0])} (tracks messages: {counts[1]}, camera rigs: {counts[2]})"
 
 
 def _why(reader: BagReader, run: _Run) -> str:

@@ -23,6 +23,7 @@ class SessionRecord:
 
     Attributes:
         session_id: the session.
+        map_index: which map of the back-end it is; several may have the same session id.
         last: newest estimate.
         forgotten: last values of the keyframes that the back-end has forgotten.
         inputs: accepted keyframe messages by id.
@@ -31,10 +32,12 @@ class SessionRecord:
         solver_time_s: in all, s.
         slowest: time and keyframe of the slowest solve.
         iterations: outer iterations in all.
+        unrefined: why no keyframe was refined, empty if one was; see :meth:`close`.
         figures: what is known only while the session's scene exists, see :meth:`close`.
     """
 
     session_id: int
+    map_index: int = 0
     last: Estimate | None = None
     forgotten: list[Poses] = field(default_factory=list)
     inputs: dict[int, Keyframe] = field(default_factory=dict)
@@ -43,6 +46,7 @@ class SessionRecord:
     solver_time_s: float = 0.0
     slowest: tuple[float, int] = (0.0, 0)
     iterations: int = 0
+    unrefined: str = ""
     figures: dict[str, Any] = field(default_factory=dict)
 
     def add(self, estimate: Estimate, scene: Scene) -> None:
@@ -63,6 +67,7 @@ class SessionRecord:
 
     def close(self, scene: Scene, config: Config) -> None:
         """Take the figures of the whole map from a scene that is about to go."""
+        self.unrefined = "" if self.refined else _why_unrefined(scene, self.statuses, self.last)
         of = {state: quality.summary(scene, config, state) for state in quality.STATES}
         self.figures = {
             **{name: {state: of[state][name] for state in of} for name in of["input"]},
@@ -100,6 +105,7 @@ class SessionRecord:
             "frame_id": self.last.frame_id,
             "keyframes": len(self.last.trajectory) + sum(map(len, self.forgotten)),
             "keyframes_refined": len(self.refined),
+            "unrefined": self.unrefined,
             "landmarks": len(self.last.cloud),
             **self.figures,
             "solves": sum(self.statuses.values()),
@@ -109,6 +115,18 @@ class SessionRecord:
             "slowest_solve_s": self.slowest[0],
             "slowest_solve_keyframe_id": self.slowest[1],
         }
+
+
+def _why_unrefined(scene: Scene, statuses: Counter[str], last: Estimate | None) -> str:
+    """Return why no keyframe of a session was refined, in words."""
+    if not statuses:
+        return "all keyframes of the recording are in the loaded map already"
+    empty = scene.log.notices["empty_tracks"]
+    if scene.cameras is None:
+        return "no cameras came, neither camera_rig nor camera_info"
+    if not len(scene.sightings):
+        return f"all {empty} tracks messages are empty" if empty else "no tracks came that could be used"
+    return last.report.reason if last is not None else ""
 
 
 def _joined(parts: list[Poses]) -> Poses:

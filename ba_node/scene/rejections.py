@@ -20,11 +20,15 @@ REASONS: dict[str, str] = {
     "unknown_model": "A camera rig with a camera that cannot be used (distortion model, coefficients).",
     "rig_changed": "Another camera rig while a session has observations; it is used from the next session on.",
     "unknown_camera": "A tracks message whose camera_index is not in the rig.",
-    "unknown_keyframe": "A tracks message whose keyframe never came.",
+    "unknown_keyframe": "A tracks message whose keyframe never came, or was turned away.",
     "duplicate_keyframe": "A keyframe whose id is known; the first one stays.",
+    "bad_stamp": "A keyframe whose stamp lies far from those before it and those after it.",
+    "frame_changed": "A keyframe in another frame than its session, which no second one confirmed.",
+    "stray_session": "A keyframe of a higher session, which no second one confirmed.",
     "duplicate_observation": "A second observation of a track by one camera in one keyframe; the first one stays.",
     "stale_session": "A message of a session before the current one.",
-    "pending_overflow": "A tracks message that waited for the camera rig longer than scene.max_pending messages.",
+    "pending_overflow": "A message that waited for the camera rig, or for the first keyframe of its session, longer"
+    " than scene.max_pending messages or until the end.",
 }
 
 # Things that are worth counting although nothing was lost by them.
@@ -32,6 +36,8 @@ NOTICES: dict[str, str] = {
     "reordered": "A keyframe whose stamp lies before the newest one; it was sorted in.",
     "repeated_guess": "A second guess for a track; the first one stays.",
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
+    "empty_tracks": "A tracks message without rows.",
+    "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
 }
 
 # What somebody has to know or mend: kind -> what it is about. Said on the terminal, in report.json, on /diagnostics and
@@ -39,6 +45,13 @@ NOTICES: dict[str, str] = {
 WARNINGS: dict[str, str] = {
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
     "distortion_folds": "A camera whose distortion folds over inside its image.",
+    "clock_jump": "The stamps went far back, or a recording plays again: a new session began.",
+    "lower_session": "Keyframes came of a lower session only: it began anew.",
+    "frame_changed": "The frame of the keyframes changed: a new session began.",
+    "bad_stamp": "A keyframe was turned away for its stamp.",
+    "stray_session": "A keyframe of a higher session was turned away, since no second one followed.",
+    "frame_name": "The fixed frame of the keyframes has no name, or one that tf2 refuses.",
+    "reused_id": "An id was used for a second keyframe of the session.",
 }
 
 NOTES_KEPT = 50

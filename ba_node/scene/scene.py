@@ -19,13 +19,15 @@ import numpy as np
 from ba_node.core import geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene import ingest
+from ba_node.scene.frame_names import plain
 from ba_node.scene.records import Block, Keyframes, Landmarks, Sightings
-from ba_node.scene.rejections import RejectionLog
+from ba_node.scene.rejections import WARNINGS, RejectionLog
 from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IdIndex, IntArray
 
 if TYPE_CHECKING:
     from ba_node.config import SceneConfig
     from ba_node.core.problem import Cameras
+    from ba_node.scene.candidates import Refusal
 
 
 class Scene:
@@ -58,6 +60,7 @@ class Scene:
         self.log = RejectionLog()
         self.pending: list[FeatureTracks] = []
         self._keyframe_rows: dict[int, int] = {}
+        self._reused: set[int] = set()
         self._landmark_rows = IdIndex()
         self._order: IntArray | None = None
 
@@ -112,6 +115,8 @@ class Scene:
             self._set_rig(measurement)
             return
         if self.session_id is not None and measurement.session_id != self.session_id:
+            if isinstance(measurement, Keyframe) and ingest.keyframe_pose(measurement, self.log) is None:
+                return
             what = f"{type(measurement).__name__} of session {measurement.session_id}, the current is {self.session_id}"
             self.log.reject("stale_session", what)
             return
@@ -122,6 +127,7 @@ class Scene:
         elif isinstance(measurement, FeatureTracks):
             tracks = ingest.clean_tracks(measurement, self.log)
             if tracks is not None:
+                self.log.notice("empty_tracks", len(measurement.track_id) == 0)
                 self._place(tracks)
         else:
             self._add_guesses(measurement)
@@ -134,6 +140,26 @@ class Scene:
         if isinstance(measurement, FeatureTracks):
             return ingest.clean_tracks(measurement, log) is not None
         return ingest.clean_guesses(measurement, log) is not None
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Turn away what was held, and the tracks that wait for it."""
+        self.log.reject(refusal.reason, refusal.text)
+        if refusal.reason in WARNINGS:
+            self.log.warn(refusal.reason, f"{refusal.text}: turned away")
+        refused = refusal.measurement
+        key = refused.keyframe_id if isinstance(refused, Keyframe) and refused.session_id == self.session_id else None
+        if key is None or key in self._keyframe_rows:
+            return
+        for tracks in (one for one in self.pending if one.keyframe_id == key):
+            what = f"tracks of camera {tracks.camera_index} in keyframe {key}, which was turned away"
+            self.log.reject("unknown_keyframe", what)
+        self.pending = [tracks for tracks in self.pending if tracks.keyframe_id != key]
+
+    def take_waiting(self, other: Scene) -> None:
+        """Take over the tracks that wait in another scene of this session for keyframes that it does not know."""
+        mine = [tracks for tracks in other.pending if other.find_keyframe(tracks.keyframe_id) is None]
+        other.pending = [tracks for tracks in other.pending if other.find_keyframe(tracks.keyframe_id) is not None]
+        self.pending += mine
 
     def end_pending(self) -> None:
         """Give up on everything that still waits."""
@@ -189,15 +215,15 @@ class Scene:
         self._place_pending()
 
     def _add_keyframe(self, keyframe: Keyframe) -> None:
-        if keyframe.keyframe_id in self._keyframe_rows:
-            self.log.reject("duplicate_keyframe", f"keyframe {keyframe.keyframe_id} is known already")
-            return
-        pose = ingest.keyframe_pose(keyframe, self.log)
+        known = self._keyframe_rows.get(keyframe.keyframe_id)
+        pose = ingest.keyframe_pose(keyframe, self.log) if known is None else None
+        if known is not None:
+            self._reject_known(keyframe, known)
         if pose is None:
             return
         if len(self.keyframes) and keyframe.stamp_ns < self.keyframes.stamp_ns.max():
             self.log.notice("reordered")
-        self.frame_id = self.frame_id or keyframe.frame_id
+        self.frame_id = self.frame_id or plain(keyframe.frame_id)
         row = self.keyframes.append(
             1,
             keyframe_id=keyframe.keyframe_id,
@@ -214,6 +240,20 @@ class Scene:
             self._forget_keyframes()
         self.settle_poses()
         self._place_pending()
+
+    def _reject_known(self, keyframe: Keyframe, row: int) -> None:
+        """Turn away a keyframe whose id is known, and remember the id if it is another keyframe."""
+        name, pose = f"keyframe {keyframe.keyframe_id}", ingest.keyframe_pose(keyframe, RejectionLog())
+        table = self.keyframes
+        if pose is None or np.array_equal(pose.position, table.input_position[row]):
+            self.log.reject("duplicate_keyframe", f"{name} is known already")
+            return
+        apart_s = abs(keyframe.stamp_ns - int(table.stamp_ns[row])) * 1e-9
+        apart_m = float(np.linalg.norm(pose.position - table.input_position[row]))
+        what = f"{name} is known already, {apart_s:.3f} s and {apart_m:.3f} m from this one"
+        self.log.reject("duplicate_keyframe", what)
+        self.log.warn("reused_id", what + ": the first one stays; ids must be unique within a session_id")
+        self._reused.add(keyframe.keyframe_id)
 
     def _add_guesses(self, message: LandmarkGuesses) -> None:
         guesses = ingest.clean_guesses(message, self.log)
@@ -240,6 +280,10 @@ class Scene:
         if not 0 <= tracks.camera_index < len(self.cameras.model):
             what = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}"
             self.log.reject("unknown_camera", f"{what}: the rig has {len(self.cameras.model)} cameras")
+            return
+        if tracks.keyframe_id in self._reused and tracks.camera_index in self.cameras_of(row):
+            what = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}, an id that came twice"
+            self.log.reject("duplicate_observation", what, len(tracks.track_id))
             return
         landmarks = self._rows_of(tracks.track_id)
         new = self._unseen(row, tracks, landmarks)

@@ -25,7 +25,7 @@ from ba_node.scene.map_content import (
     within,
 )
 from ba_node.scene.records import Block, Keyframes, Landmarks, Sightings
-from ba_node.scene.rejections import NOTES_KEPT, NOTICES, REASONS, RejectionLog
+from ba_node.scene.rejections import NOTES_KEPT, NOTICES, REASONS, WARNINGS, RejectionLog
 from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column, Table
 
@@ -73,6 +73,7 @@ def take(scene: Scene) -> MapContent:
         "rejected": dict(sorted(scene.log.rejected.items())),
         "notices": dict(sorted(scene.log.notices.items())),
         "rejection_notes": list(scene.log.notes),
+        "warnings": dict(scene.log.warnings),
     }
     return MapContent(arrays, facts)
 
@@ -210,3 +211,7 @@ def _restore_log(content: MapContent, scene: Scene) -> None:
     notes = content.fact("rejection_notes", list)
     require(all(isinstance(note, str) for note in notes), "rejection_notes: expected texts")
     scene.log.notes.extend(notes[-NOTES_KEPT:])
+    # Maps of the first version have none.
+    warnings = content.fact("warnings", dict) if "warnings" in content.facts else {}
+    require(all(isinstance(text, str) for text in warnings.values()), "warnings: expected texts")
+    scene.log.warnings.update({kind: text for kind, text in warnings.items() if kind in WARNINGS})

@@ -64,11 +64,22 @@ def test_errors_are_one_line(
     assert error.count("\n") == 1
 
 
-def test_a_replay_goes_on_from_a_map(saved: Path, bag: Path, tmp_path: Path) -> None:
-    """The same recording again brings nothing new, and changes nothing."""
+def test_a_map_that_holds_the_recording_already_stays_as_it_is(
+    saved: Path, bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same recording again brings nothing new: it is said how much is known, and the map is written."""
+    assert replay(bag, tmp_path / "first") == 0
+    n = len(read_tum(tmp_path / "first" / "trajectory.tum"))
+    capsys.readouterr()
     again = tmp_path / "again.npz"
-    assert replay(bag, tmp_path / "out", "--load-map", str(saved), "--save-map", str(again)) == 2
-    assert not again.exists()
+    assert replay(bag, tmp_path / "out", "--load-map", str(saved), "--save-map", str(again)) == 3
+    told = capsys.readouterr()
+    assert f"in the loaded map      {n} keyframes of the recording already" in told.out
+    assert "nothing was refined: all keyframes of the recording are in the loaded map already" in told.err
+    assert "18446744073709551615" not in told.err
+    for name in ("trajectory.tum", "points.ply"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "first" / name).read_bytes(), name
+    assert again.exists()
 
 
 def test_two_halves_with_a_map_between_give_the_whole(tmp_path: Path) -> None:
