@@ -69,7 +69,9 @@ def changed(group: Iterable[Measurement], **changes: Any) -> list[Measurement]:
 class Played(Backend):
     """A back-end and what it gave for each keyframe of a stream."""
 
-    def __init__(self, stream: Iterable[Measurement], final: bool = True, settings: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, stream: Iterable[Measurement], final: bool = True, settings: dict[str, Any] | None = None
+    ) -> None:
         super().__init__(Config().with_values(settings or {}))
         self.estimates: list[Estimate | None] = []
         self.play(stream, final)
@@ -431,6 +433,15 @@ def test_silence_begins_a_session_that_was_asked_for_and_no_other() -> None:
         played.flush()
         assert len(played.held) == (0 if begins else 1)
         assert len(played.scene.keyframes) == (1 if begins else 5)
+
+
+def test_silence_begins_a_session_where_the_first_keyframe_comes_again_with_its_tracks() -> None:
+    near = {"scene.max_reorder_s": 1.0}
+    for again, begins in ((groups()[0], True), (groups()[0][:1], False), (groups()[1], False)):
+        played = Played([*messages(), *again], final=False, settings=near)
+        played.flush()
+        assert len(played.scene.keyframes) == (1 if begins else N)
+        assert not played.rejected
 
 
 def test_the_same_stream_gives_the_same_bits_though_keyframes_are_held() -> None:
