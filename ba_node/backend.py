@@ -120,6 +120,24 @@ class Backend:
         return self.scene.log.rejected
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what somebody has to know or mend, in words."""
+        return tuple(self.scene.log.warnings.values())
+
+    @property
+    def report(self) -> SolveReport:
+        """Return the report of the last solve, with what has been turned away since."""
+        counts = dict(sorted(self.rejected.items()))
+        return dataclasses.replace(
+            self._report, session_id=self.scene.session_id or 0, rejected=counts, warnings=self.warnings
+        )
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the stamp of the newest keyframe, 0 before the first."""
+        return int(self.scene.keyframes.stamp_ns[self.scene.order[-1]]) if len(self.scene.order) else 0
+
+    @property
     def notices(self) -> Counter[str]:
         """Return what was unusual but used in this session, by kind (``rejections.NOTICES``)."""
         return self.scene.log.notices
@@ -354,7 +372,7 @@ class Backend:
             newest_keyframe_id=newest,
             method=self.config.solver.method,
             rejected=dict(sorted(self.rejected.items())),
-            warnings=tuple(self.scene.log.warnings.values()),
+            warnings=self.warnings,
         )
 
     def _estimate(self, refined: IntArray) -> Estimate:
@@ -362,7 +380,7 @@ class Backend:
         scene.settle_poses()
         trajectory = poses_of(scene, scene.order)
         return Estimate(
-            stamp_ns=int(scene.keyframes.stamp_ns[scene.order[-1]]) if len(scene.order) else 0,
+            stamp_ns=self.stamp_ns,
             frame_id=self.config.frames.map_frame,
             refined=trajectory[scene.places()[refined]],
             trajectory=trajectory,

@@ -6,10 +6,10 @@ Writes into DIR: trajectory.tum, trajectory_input.tum (the front-end's), points.
 topics), report.json, effective.yaml (all parameters), and ground_truth.tum if the recording has a ground truth.
 Older sessions of the recording go to DIR/session_<id>/, to DIR/session_<id>_2/ where the same id began a map again.
 
-Exit code: 0 all is well, 2 nothing was written (no keyframe in the recording can be used), 3 written, but something has
-to be looked at: input that was turned away, solutions that were not taken, nothing refined at all (no cameras, no
-tracks, all known already), stamps that jumped, a set-up that looks wrong. Each is said in a line of its own and under
-"attention" in report.json.
+Exit code: 0 all is well, 2 nothing was written (keyframes, tracks or cameras are missing, or none can be used), 3
+written, but something has to be looked at: input that was turned away, solutions that were not taken, nothing refined
+at all (empty tracks, one keyframe, all known already), stamps that jumped, a set-up that looks wrong. Each is said in a
+line of its own and under "attention" in report.json.
 """
 
 from __future__ import annotations

@@ -190,6 +190,8 @@ def _solver(health: Health, limits: DiagnosticsConfig) -> Finding:
         found.find(Level.ERROR, f"the last solve failed: {report.reason}")
     elif report.status is Status.HELD:
         found.find(Level.WARN, f"the last solution was not taken: {report.reason}")
+    elif not report.solve_count:
+        found.find(Level.OK, "no solve yet")
     elif report.status is Status.SKIPPED:
         found.find(Level.WARN, f"the last solve was skipped: {report.reason}")
     else:

@@ -56,7 +56,7 @@ def output_messages(
         if "pose" in wanted:
             out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
     if "report" in wanted:
-        out.append(("report", _report(factory, estimate)))
+        out.append(("report", report_message(factory, estimate.report, estimate.stamp_ns, estimate.frame_id)))
     if estimate.replaces_map:
         if "path" in wanted:
             poses = estimate.trajectory[-config.path_max_poses :]
@@ -99,13 +99,13 @@ def _points(estimate: Estimate, limit: int) -> bytes:
     return cloud_message(records, estimate.stamp_ns, estimate.frame_id, dense=dense)
 
 
-def _report(factory: MessageFactory, estimate: Estimate) -> Any:
-    report = estimate.report
+def report_message(factory: MessageFactory, report: SolveReport, stamp_ns: int, frame_id: str) -> Any:
+    """Return the message of a report, with the stamp of the newest keyframe and the frame of the map."""
     fields = {name: getattr(report, name) for name in SolveReport.__dataclass_fields__ if name != "rejected"}
     reasons = sorted(report.rejected)
     return factory.make(
         OUTPUT_TYPES["report"],
-        header=header_message(factory, estimate.stamp_ns, estimate.frame_id),
+        header=header_message(factory, stamp_ns, frame_id),
         rejected_reason=reasons,
         rejected_count=factory.array(np.array([report.rejected[reason] for reason in reasons], dtype=np.uint64)),
         **(fields | {"status": int(report.status), "warnings": list(report.warnings)}),

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ba_node.measurements import CameraRig
     from ba_node.ros.inbox import Inbox
     from ba_node.ros.relay import Relay
-    from ba_node.ros.worker import Notice, Worker
+    from ba_node.ros.worker import Account, Notice, Worker
 
 
 @dataclass
@@ -82,6 +82,9 @@ class Host:
 
 class Component:
     """A part of the node. Made when the node is configured; derived classes override what concerns them."""
+
+    def take_account(self, account: Account) -> None:
+        """Take a report on what was turned away, when no solve tells it."""
 
     def __init__(self, host: Host) -> None:
         """Make the entities. An exception refuses the configuration and destroys those made so far."""

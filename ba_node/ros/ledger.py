@@ -1,6 +1,9 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Account for every keyframe that the worker took: solved, solved with a newer one, turned away, forgotten, waiting."""
+"""Account for every keyframe that the worker took: solved, solved with a newer one, turned away, forgotten, waiting.
+
+Those that the back-end holds until others tell what they are wait too.
+"""
 
 from __future__ import annotations
 
@@ -46,15 +49,22 @@ class Ledger:
         """Return when a keyframe came in, None if it was solved before."""
         return self._unsolved.get((session_id, keyframe_id))
 
-    def settle(self, scene: Scene, refined: Collection[int]) -> None:
+    def refuse(self, session_id: int, keyframe_id: int) -> None:
+        """Enter that a keyframe was turned away, perhaps after it was held."""
+        self._unsolved.pop((session_id, keyframe_id), None)
+        self._unrefined.discard((session_id, keyframe_id))
+        self.rejected += 1
+
+    def settle(self, scene: Scene, refined: Collection[int], held: Collection[Key] = ()) -> None:
         """Close the accounts of a solve.
 
         Args:
             scene: the map after it.
             refined: ids of those that took part, if it is usable.
+            held: session and id of those that the map does not have yet.
         """
         n_solved = 0
-        for key in list(self._unsolved):
+        for key in [key for key in self._unsolved if key not in held]:
             row = scene.find_keyframe(key[1]) if key[0] == scene.session_id else None
             if row is None:
                 self.forgotten += 1
@@ -65,10 +75,11 @@ class Ledger:
             del self._unsolved[key]
         self.solved += min(n_solved, 1)
         self.coalesced += max(n_solved - 1, 0)
-        took_part = {key for key in self._unrefined if key[0] == scene.session_id and key[1] in refined}
+        here = {key for key in self._unrefined if key[0] == scene.session_id and key not in held}
+        took_part = {key for key in here if key[1] in refined}
         self.refined += len(took_part)
         self._unrefined = {
             key
             for key in self._unrefined - took_part
-            if key[0] == scene.session_id and scene.find_keyframe(key[1]) is not None
+            if key in held or (key[0] == scene.session_id and scene.find_keyframe(key[1]) is not None)
         }

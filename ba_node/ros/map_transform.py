@@ -27,7 +27,7 @@ class MapTransform(Component):
 
     The time of the data goes on from the newest keyframe as the node's clock does: so the stamps fit the data whether
     it comes from a robot, from a recording with its old stamps, or with simulated time. Within a session they only
-    rise, as tf asks.
+    rise, as tf asks; a session that began because the clock was set back has stamps of its own.
     """
 
     def __init__(self, host: Host) -> None:
@@ -54,13 +54,15 @@ class MapTransform(Component):
         self._estimate = None
 
     def take(self, estimate: Estimate, newest: bool) -> None:
-        """Take the newest correction."""
+        """Take the newest correction; that of another map ends with it, though the new one has none yet."""
+        if self._estimate is not None and self._estimate.map_index != estimate.map_index:
+            self._estimate = self._last_stamp_ns = None
         if not newest:
             return
         if estimate.correction is None:  # all was forgotten
             self._estimate = self._last_stamp_ns = None
             return
-        if self._estimate is None or self._estimate.report.session_id != estimate.report.session_id:
+        if self._estimate is None:
             self._last_stamp_ns = None
         self._estimate, self._taken_ns = estimate, self._now_ns()
         self._send(news=True)

@@ -41,7 +41,7 @@ from ba_node.ros.silence import Silence
 from ba_node.ros.simulated_time import SimulatedTime
 from ba_node.ros.static_frames import StaticFrames
 from ba_node.ros.throttle import Throttle
-from ba_node.ros.worker import Notice, Worker
+from ba_node.ros.worker import Account, Notice, Worker
 
 if TYPE_CHECKING:
     from ba_node.config import Config
@@ -189,10 +189,13 @@ class BaNode(ManagedNode):
                 for component in self._components:
                     self._deliver(component, output, newest=output is newest)
 
-    def _deliver(self, component: Component, estimate: Estimate, newest: bool) -> None:
-        """Give an estimate to a component; a fault in one must not keep it from the others."""
+    def _deliver(self, component: Component, output: Estimate | Account, newest: bool) -> None:
+        """Give an estimate or an account to a component; a fault in one must not keep it from the others."""
         try:
-            component.take(estimate, newest)
+            if isinstance(output, Estimate):
+                component.take(output, newest)
+            else:
+                component.take_account(output)
         except Exception as error:
             if not self.context.ok():
                 raise  # a signal ended the context between two messages

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ba_node.estimate import SolveReport, Status
 from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
+from ba_node.messages.outputs import report_message
 from ba_node.ros import qos
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -19,10 +20,13 @@ from ba_node.ros.throttle import Throttle
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate
+    from ba_node.ros.worker import Account
 
 _LOG_PERIOD_S = 5.0
 # Leave first; their age is in the report that follows.
 _POSES = {"refined_keyframes", "pose"}
+# Of a report, what is known on this thread alone.
+_TIMES = [f"{which}latency_{part}_s" for which in ("", "stamp_") for part in ("p50", "p95", "max")]
 
 
 class Publishing(Component):
@@ -60,6 +64,16 @@ class Publishing(Component):
         told = dataclasses.replace(report, rejected={**report.rejected, **self.host.counted})
         self._publish(dataclasses.replace(estimate, report=told), wanted - _POSES)
         self._log_report(report)
+
+    def take_account(self, account: Account) -> None:
+        """Publish a report without a solve: with the times of the last one."""
+        known = self.host.report
+        times = {} if known is None else {name: getattr(known, name) for name in _TIMES}
+        report = self.host.report = dataclasses.replace(account.report, **times)
+        if "report" in self._heard():
+            told = dataclasses.replace(report, rejected={**report.rejected, **self.host.counted})
+            frame = self.host.config.frames.map_frame
+            self._outputs["report"].publish(report_message(self._factory, told, account.stamp_ns, frame))
 
     def _heard(self) -> set[str]:
         return {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}

@@ -27,7 +27,7 @@ class SideOutputs(Component):
         super().__init__(host)
         self._factory = RclpyFactory()
         self._asked = Extras()
-        self._drawn_session: int | None = None
+        self._drawn_map: int | None = None
         self._publishers: dict[str, Any] = {}
         for topic, kind in SIDE_TYPES.items():
             profile = qos.latched() if topic == "markers" else qos.reliable(qos.OUTPUT_DEPTH)
@@ -36,17 +36,16 @@ class SideOutputs(Component):
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Publish what was asked for when the solve began."""
         if len(estimate.trajectory) == 0:
-            self._drawn_session = None
+            self._drawn_map = None
         if estimate.covariance is not None and self._wanted("pose_with_covariance"):
             for message in covariance_messages(self._factory, estimate):
                 self._publishers["pose_with_covariance"].publish(message)
         if newest and len(estimate.trajectory) == 0 and self._wanted("markers"):
-            self._drawn_session = None
+            self._drawn_map = None
             self._publishers["markers"].publish(no_markers(estimate))
         if newest and estimate.view is not None and self._wanted("markers"):
-            session = estimate.report.session_id
-            clear = session != self._drawn_session
-            self._drawn_session = session
+            clear = estimate.map_index != self._drawn_map
+            self._drawn_map = estimate.map_index
             self._publishers["markers"].publish(marker_array(estimate, self.host.config.output, clear=clear))
 
     def _wanted(self, topic: str) -> bool:

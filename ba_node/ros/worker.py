@@ -17,8 +17,9 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ba_node.estimate import Estimate, Status
+from ba_node.estimate import Estimate, SolveReport, Status
 from ba_node.measurements import Keyframe
+from ba_node.ros.lag import Lag
 from ba_node.ros.latency import Budget
 from ba_node.ros.ledger import Ledger
 
@@ -31,8 +32,12 @@ if TYPE_CHECKING:
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
 _MAX_OUTPUTS = 20
-# Reasons that count keyframes.
-_KEYFRAME_REASONS = ("bad_pose", "duplicate_keyframe", "malformed", "stale_session")
+# A report on what was turned away goes out without a solve, but not more often.
+_ACCOUNT_PERIOD_S = 1.0
+# Texts that begin alike say the same.
+_HEAD = 40
+# Falling behind for this long is warned about.
+_PATIENCE_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,15 @@ class Notice:
     is_error: bool = False
 
 
-Output = Estimate | Notice
+@dataclass(frozen=True)
+class Account:
+    """The report of the last solve with what has been turned away since, when there is no new solve to tell it."""
+
+    report: SolveReport
+    stamp_ns: int
+
+
+Output = Estimate | Notice | Account
 
 
 class Worker:
@@ -80,8 +93,14 @@ class Worker:
         self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
         self._budget = Budget(clock)
         self._ledger = Ledger()
+        self._lag = Lag(_PATIENCE_S)
         self._told: Counter[str] = Counter()
-        self._jumps = 0
+        self._told_map = 0
+        self._warned: set[str] = set()
+        # What the last report said of things turned away, when that was, and whether there is more to say.
+        self._accounted: object = None
+        self._account_s = -_ACCOUNT_PERIOD_S
+        self._owes = False
         self._settled = True
         self._behind = False
         self._failures: Counter[str] = Counter()
@@ -116,10 +135,18 @@ class Worker:
 
     def _run(self) -> None:
         while True:
-            arrivals = self._inbox.drain(0.0 if self._behind else None if self._settled else self._settle_time_s)
+            arrivals = self._inbox.drain(self._patience_s())
             if self._inbox.closed:
                 return
             self._guard(self.step, arrivals)
+
+    def _patience_s(self) -> float | None:
+        """Return how long to wait for messages: not while there is more to solve, and for ever once all is said."""
+        if self._behind:
+            return 0.0
+        if not self._settled:
+            return self._settle_time_s
+        return _ACCOUNT_PERIOD_S if self._owes else None
 
     def step(self, arrivals: list[Arrival]) -> None:
         """Take in what arrived (nothing means silence, unless there is more to solve), and solve if there is need."""
@@ -132,6 +159,7 @@ class Worker:
         if self._backend.ready:
             self._guard(self._solve)
         self._tell_rejections()
+        self._guard(self._account)
 
     def _take(self, arrival: Arrival) -> None:
         if callable(arrival.content):
@@ -139,18 +167,17 @@ class Worker:
             if estimate is not None and not self._inbox.closed:
                 self._put(self._finished(estimate, now_s, now_s))
             return
-        content, before = arrival.content, self._rejected_keyframes()
-        self._backend.add(content)
-        if not isinstance(content, Keyframe):
-            return
-        # Fewer than before: a new session has begun.
-        if self._rejected_keyframes() <= before:
+        content, backend = arrival.content, self._backend
+        backend.refused.clear()
+        backend.add(content)
+        refused = list(backend.refused)
+        if isinstance(content, Keyframe) and all(one is not content for one in refused):
             self._ledger.take(content.session_id, content.keyframe_id, arrival.time_s)
-        else:
-            self._ledger.rejected += 1
-
-    def _rejected_keyframes(self) -> int:
-        return sum(self._backend.rejected[reason] for reason in _KEYFRAME_REASONS)
+        for one in refused:
+            if one is content:
+                self._ledger.rejected += 1
+            else:
+                self._ledger.refuse(one.session_id, one.keyframe_id)
 
     def _solve(self) -> None:
         start_s = self._clock()
@@ -160,6 +187,9 @@ class Worker:
         estimate = self._backend.solve(on_iteration=self._goes_on)
         self._budget.end()
         n_solved = int(self._backend.scene.keyframes.solved.sum()) - before
+        lag = self._lag.update(start_s, self._clock(), n_solved, estimate, self._backend.config)
+        if lag:
+            self._put(Notice("falling_behind", lag))
         # More keyframes than a window holds take several solves; without progress the next try waits for new data.
         self._behind = n_solved > 0 and self._backend.ready
         if estimate is not None and not self._inbox.closed:
@@ -176,16 +206,27 @@ class Worker:
 
     def _finished(self, estimate: Estimate, start_s: float, arrived_s: float) -> Estimate:
         """Add to the report what only the worker knows."""
-        report, ledger, keyframes = estimate.report, self._ledger, self._inbox.keyframes
+        report, ledger = estimate.report, self._ledger
         refined = set(estimate.refined.keyframe_id.tolist()) if report.status.usable else set()
-        ledger.settle(self._backend.scene, refined)
+        held = {(one.session_id, one.keyframe_id) for one in self._backend.held}
+        ledger.settle(self._backend.scene, refined, held)
         budget_ms = self._backend.config.node.latency_budget_ms
         spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
         report = dataclasses.replace(
             report,
             reason=spent if self._budget.spent and report.status is Status.MAX_ITERATIONS else report.reason,
-            rejected={**report.rejected, **self._failures},
             queue_wait_s=start_s - arrived_s,
+        )
+        return dataclasses.replace(estimate, report=self._counted(report), arrived_s=arrived_s)
+
+    def _counted(self, report: SolveReport) -> SolveReport:
+        """Return a report with the accounts of the worker as they are now."""
+        ledger, keyframes = self._ledger, self._inbox.keyframes
+        self._accounted, self._owes = self._turned_away(), False
+        return dataclasses.replace(
+            report,
+            rejected={**report.rejected, **self._failures},
+            warnings=(*report.warnings, *self._lag.warnings),
             dropped=self._inbox.dropped,
             coalesced=ledger.coalesced,
             received=keyframes.received,
@@ -194,17 +235,35 @@ class Worker:
             rejected_keyframes=ledger.rejected,
             waiting=keyframes.waiting + ledger.waiting,
         )
-        return dataclasses.replace(estimate, report=report, arrived_s=arrived_s)
+
+    def _turned_away(self) -> object:
+        """Return what a report says of things turned away."""
+        return self._backend.map_index, Counter(self._backend.rejected), tuple(self._backend.warnings)
+
+    def _account(self) -> None:
+        """Report what was turned away since the last report, if no solve did."""
+        now_s = self._clock()
+        self._owes = self._turned_away() != self._accounted and bool(self._backend.rejected or self._backend.warnings)
+        if self._owes and now_s - self._account_s >= _ACCOUNT_PERIOD_S:
+            self._account_s = now_s
+            self._put(Account(self._counted(self._backend.report), self._backend.stamp_ns))
 
     def _tell_rejections(self) -> None:
-        rejected = Counter(self._backend.rejected)
+        rejected, told = Counter(self._backend.rejected), []
+        if self._backend.map_index != self._told_map:
+            self._told_map, self._told, self._warned = self._backend.map_index, Counter(), set()
         for reason in sorted(rejected - self._told):
             notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
-            self._put(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
+            told.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
         self._told = rejected
-        if self._backend.jumps != self._jumps:
-            self._jumps = self._backend.jumps
-            self._put(Notice("clock_jump", self._backend.jump_note))
+        # What is a rejection too has been told with its count.
+        heads = tuple(notice.text[:_HEAD] for notice in told)
+        warnings = self._backend.warnings
+        news = [text for text in warnings if text not in self._warned]
+        self._warned = set(warnings)
+        told += [Notice(f"warning {text[:_HEAD]}", text) for text in news if text[:_HEAD] not in heads]
+        for notice in told:
+            self._put(notice)
 
     def _guard(self, action: Callable[..., None], *arguments: object) -> None:
         """Run one step of the work; a fault in it is reported and costs that step only.

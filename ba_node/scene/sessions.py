@@ -112,11 +112,15 @@ class Sessions:
         return dropped(candidate, rest)
 
     def settle(self, scene: Scene) -> Decision:
-        """Return what becomes of what is held in a silence: a higher session id is taken at its word."""
+        """Return what becomes of what is held in a silence.
+
+        A higher session id is taken at its word, and so is a first keyframe that comes again with all its tracks: who
+        sends it may wait for an answer.
+        """
         candidate = self.state.candidate
-        if candidate is None or candidate.kind is not Kind.HIGHER:
-            return Decision(self.state)
-        return self._opened(scene, candidate)
+        if candidate is not None and (candidate.kind is Kind.HIGHER or _plays_again(scene, candidate)):
+            return self._opened(scene, candidate)
+        return Decision(self.state)
 
     def _keyframe(self, scene: Scene, keyframe: Keyframe) -> Decision:
         as_it_is = Decision(self.state, (Admitted(keyframe),))
@@ -262,3 +266,12 @@ def _is_theirs(scene: Scene, candidate: Candidate, tracks: FeatureTracks) -> boo
     if scene.find_keyframe(tracks.keyframe_id) is None:
         return False
     return candidate.holds(tracks) or (candidate.kind is Kind.REPEAT and candidate.run > 0)
+
+
+def _plays_again(scene: Scene, candidate: Candidate) -> bool:
+    """Return True if the oldest keyframe of the scene is held, with tracks of every camera that saw something in it."""
+    row = scene.find_keyframe(candidate.keyframes[0].keyframe_id)
+    if candidate.kind is not Kind.REPEAT or row is None or row != scene.order[0]:
+        return False
+    again = {item.camera_index for item in candidate.items if isinstance(item, FeatureTracks)}
+    return bool(again) and again >= scene.cameras_of(row)

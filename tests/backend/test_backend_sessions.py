@@ -435,6 +435,15 @@ def test_silence_begins_a_session_that_was_asked_for_and_no_other() -> None:
         assert len(played.scene.keyframes) == (1 if begins else 5)
 
 
+def test_silence_begins_a_session_where_the_first_keyframe_comes_again_with_its_tracks() -> None:
+    near = {"scene.max_reorder_s": 1.0}
+    for again, begins in ((groups()[0], True), (groups()[0][:1], False), (groups()[1], False)):
+        played = Played([*messages(), *again], final=False, settings=near)
+        played.flush()
+        assert len(played.scene.keyframes) == (1 if begins else N)
+        assert not played.rejected
+
+
 def test_the_same_stream_gives_the_same_bits_though_keyframes_are_held() -> None:
     parts = groups()
     parts[4], parts[7] = stamped(parts[4], at_ns=0), stamped(parts[7], YEAR)

@@ -16,7 +16,7 @@ from ba_node.config import Config
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.ros.inbox import Inbox
-from ba_node.ros.worker import Notice, Output, Worker
+from ba_node.ros.worker import Account, Notice, Output, Worker
 
 
 class FakeBackend:
@@ -25,7 +25,13 @@ class FakeBackend:
     def __init__(self) -> None:
         self.added: list[Measurement] = []
         self.rejected: Counter[str] = Counter()
-        self.jumps, self.jump_note = 0, ""
+        self.map_index, self.stamp_ns = 0, 0
+        self.warnings: tuple[str, ...] = ()
+        self.refused: deque[Measurement] = deque(maxlen=5)
+        self.held: list[Keyframe] = []
+        self.report = SolveReport()
+        self.holds: Keyframe | None = None
+        self.refuses: Keyframe | None = None
         self.rejection_notes: deque[str] = deque(maxlen=5)
         self.unsolved: list[Keyframe] = []
         self.window: list[Keyframe] = []
@@ -48,10 +54,17 @@ class FakeBackend:
         if self.fail == "add":
             raise RuntimeError("broken add")
         assert isinstance(measurement, Keyframe)
+        if measurement is self.holds:
+            self.held = [measurement]
+            return
+        if self.refuses is not None:
+            self.refused.append(self.refuses)
+            self.refuses = None
         if any(measurement.keyframe_id == keyframe.keyframe_id for keyframe in self.window):
             self.rejected["duplicate_keyframe"] += 1
             note = f"keyframe {measurement.keyframe_id}; dropped (duplicate_keyframe = {self.rejected.total()})"
             self.rejection_notes.append(note)
+            self.refused.append(measurement)
             return
         self.added.append(measurement)
         self.unsolved.append(measurement)
@@ -347,3 +360,62 @@ def test_a_latency_budget_ends_a_solve_in_time(budget_ms: float, expected: int) 
     assert report.reason == (
         f"the latency budget of {budget_ms:g} ms was spent after 0 iterations" if budget_ms else ""
     )
+
+
+def test_what_is_turned_away_is_reported_without_a_solve() -> None:
+    rig = Rig()
+    rig.keyframe(1)
+    rig.step()
+    rig.now_s = 10.0
+    rig.keyframe(1)
+    accounts = [output for output in rig.step() if isinstance(output, Account)]
+    assert [(one.report.rejected_keyframes, one.report.received) for one in accounts] == [(1, 2)]
+    # Not more often than once a second, and never twice the same.
+    rig.now_s = 10.5
+    rig.keyframe(1)
+    assert [output for output in rig.step() if isinstance(output, Account)] == []
+    assert rig.worker._patience_s() is not None
+    rig.now_s = 11.0
+    assert [one.report.rejected_keyframes for one in rig.step() if isinstance(one, Account)] == [2]
+    rig.now_s = 20.0
+    assert rig.step() == []
+    assert rig.worker._patience_s() is None, "all is said"
+
+
+def test_a_keyframe_that_is_held_waits_until_it_is_turned_away() -> None:
+    rig = Rig()
+    rig.keyframe(1)
+    rig.step()
+    pose = (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    odd = Keyframe(0, 2, -1, "odom", *pose)
+    rig.backend.holds = odd
+    rig.inbox.put(odd, 1.0)
+    rig.step()
+    rig.keyframe(3)
+    (report,) = reports(rig.step())
+    assert (report.received, report.solved, report.waiting, report.dropped_keyframes) == (3, 2, 1, 0)
+    rig.backend.holds = None
+    rig.backend.held = []
+    rig.backend.refuses = odd
+    rig.keyframe(4)
+    (report,) = reports(rig.step())
+    assert (report.received, report.solved, report.waiting, report.rejected_keyframes) == (4, 3, 0, 1)
+
+
+def test_falling_behind_is_said_once_with_what_to_change() -> None:
+    rig = Rig()
+    rig.backend.while_solving = lambda _: setattr(rig, "now_s", rig.now_s + 0.5)
+    said: list[str] = []
+    for number in range(0, 60, 3):
+        for k in range(3):
+            rig.keyframe(number + k, time_s=rig.now_s)
+        outputs = rig.step()
+        said += [output.text for output in outputs if isinstance(output, Notice)]
+    assert len(said) == 1, said
+    assert "falling behind for 5 s: 30 keyframes were solved in 10 solves of 500 ms" in said[0]
+    assert "lower window.max_keyframes (20)" in said[0]
+    assert reports(outputs)[0].warnings == (said[0],)
+    for number in range(100, 105):
+        rig.keyframe(number)
+        (report,) = reports(rig.step())
+    assert report.warnings == (), "it keeps up again"
