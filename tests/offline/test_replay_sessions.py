@@ -53,8 +53,10 @@ def case(name: str) -> Path:
 
 def error_m(trajectory: Path, truth: Path) -> float:
     found, true = (read_tum(path) for path in (trajectory, truth))
-    poses = [Poses(np.arange(len(t), dtype=np.uint64), t.stamp_ns, t.position, t.orientation) for t in (found, true)]
-    return absolute_error(*poses).translation.rmse
+    before, after = (
+        Poses(np.arange(len(t), dtype=np.uint64), t.stamp_ns, t.position, t.orientation) for t in (found, true)
+    )
+    return absolute_error(before, after).translation.rmse
 
 
 def test_case_clock_set_back(tmp_path: Path) -> None:
