@@ -197,9 +197,9 @@ class SolverConfig:
         minimum=0,
         maximum=256,
     )
-    loss: str = _param("huber", "Robust loss on each residual.", choices=LOSSES)
+    loss: str = _param("cauchy", "Robust loss on each residual.", choices=LOSSES)
     loss_scale_px: float = _param(
-        1.0,
+        2.0,
         "Residual, in units of sigma, where the robust loss leaves the square.",
         unit="px",
         minimum=1e-6,

@@ -3,10 +3,11 @@
 """Choose the first position of a landmark: the front-end's guess, or where its views agree that it is.
 
 A point is triangulated from the views that agree with each other (core/consensus.py), if they are more than a third of
-all, and show a parallax that is not noise. The gate on how far off a view may be and agree widens where most views
-agree with no other: the poses are still bad then, and the points are not to blame. A guess that passes the gate is
-taken. Otherwise the better of the two by robust error is taken, so that a whole map with bad start values (pixel errors
-of tens) is not thrown away. A guess must lie in front of two cameras (one with a measured depth).
+all, and show a parallax that is not noise. The gate on how far off a view may be and agree widens with the errors of
+the points that are known already, or, where none is, if hardly any view agrees with another: the poses are still bad
+then, and the points are not to blame. A guess that passes the gate is taken. Otherwise the better of the two by robust
+error is taken, so that a whole map with bad start values (pixel errors of tens) is not thrown away. A guess must lie in
+front of two cameras (one with a measured depth).
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ BULK = 10
 _LEAST_SUPPORT = 1.0 / 3.0
 # Two rays meet by chance more easily than three: they have to come as much nearer to each other.
 _TWO_VIEWS = 0.5
+# Where fewer views than this share agree with another, the poses are bad.
+_LEAST_AGREEMENT = 0.2
 # Parallax below this many standard deviations of the rays' directions is noise.
 _LEAST_PARALLAX = 4.0
 # Three standard deviations of a normal distribution, of which 1.4826 median absolute deviations are one.
@@ -67,7 +70,9 @@ class _Found:
     gate: float
 
 
-def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig, backend: str = "auto") -> FloatArray:
+def initial_points(
+    problem: Problem, guess: FloatArray, config: TracksConfig, backend: str = "auto", gate: float | None = None
+) -> FloatArray:
     """Return first positions (n_pt, 3) of the points of a problem, NaN where none can be had yet.
 
     Args:
@@ -75,8 +80,9 @@ def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig, ba
         guess: (n_pt, 3) guesses in the frame of the problem, NaN for none.
         config: the gates.
         backend: kernels.
+        gate: how far off a view may be and agree, sigmas; None for what the views themselves tell.
     """
-    found = agreed_points(problem, config, backend)
+    found = agreed_points(problem, config, backend, gate or _gate_of(problem, config, backend))
     points = np.where(found.good[:, None], found.points, np.nan)
     if np.isnan(guess).all():
         return points
@@ -87,23 +93,26 @@ def initial_points(problem: Problem, guess: FloatArray, config: TracksConfig, ba
     return np.where(take_guess[:, None], guess, points)
 
 
-def agreed_points(problem: Problem, config: TracksConfig, backend: str = "auto") -> _Found:
+def _gate_of(problem: Problem, config: TracksConfig, backend: str) -> float:
+    """Return a gate that widens where the poses are bad: where hardly any view agrees with another."""
+    rays, n = triangulation.rays_of(problem), problem.n_points
+    gate = config.max_triangulation_px
+    views = np.bincount(rays.point, minlength=n)
+    agrees = consensus.agreeing(rays, n, gate, backend) & (views > 1).take(rays.point)
+    if np.count_nonzero(agrees) >= _LEAST_AGREEMENT * int(views[views > 1].sum()):
+        return gate
+    rough = triangulation.triangulate(rays, n, backend)
+    fit = _fit(problem, rough.points, backend)
+    wide = rough.parallax_rad >= np.deg2rad(config.min_parallax_deg)
+    return widened(gate, fit.median[(wide | rough.measured) & (fit.in_front == views) & (views > 0)])
+
+
+def agreed_points(problem: Problem, config: TracksConfig, backend: str, gate: float) -> _Found:
     """Return where most views of each point agree that it is.
 
     Args: as of :func:`initial_points`.
     """
-    rays, n = triangulation.rays_of(problem), problem.n_points
-    gate = config.max_triangulation_px
-    found = _consensus(rays, n, gate, config, backend)
-    views = np.bincount(rays.point, minlength=n)
-    if 2 * int(found.support.sum()) < int(views[views > 1].sum()):
-        # Most views agree with no other: the poses are bad.
-        rough = triangulation.triangulate(rays, n, backend)
-        fit = _fit(problem, rough.points, backend)
-        wide = rough.parallax_rad >= np.deg2rad(config.min_parallax_deg)
-        gate = widened(gate, fit.median[(wide | rough.measured) & (fit.in_front == views) & (views > 0)])
-        found = _consensus(rays, n, gate, config, backend)
-    return found
+    return _consensus(triangulation.rays_of(problem), problem.n_points, gate, config, backend)
 
 
 def _consensus(rays: triangulation.Rays, n: int, gate: float, config: TracksConfig, backend: str) -> _Found:

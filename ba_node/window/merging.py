@@ -121,7 +121,7 @@ def _place_anew(
     if not len(rows):
         return
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
-    found = agreed_points(views, tracks, backend)
+    found = agreed_points(views, tracks, backend, widened(tracks.outlier_px, norm))
     start = dataclasses.replace(views.start, points=found.points)
     at = native_kernels.residual_norms(views, start, backend)
     supports = at <= tracks.outlier_px

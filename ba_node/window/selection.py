@@ -37,6 +37,8 @@ MIN_OBSERVATIONS = 4
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
 # the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
 _ABSURD = 25.0
+# As many residuals of known points tell how good the poses are.
+_BULK = 100
 
 
 @dataclass(frozen=True)
@@ -183,8 +185,20 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
     if len(rows):
         of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
         guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        points[new] = initial_points(of_new, guess, config.tracks, config.solver.backend)
+        points[new] = initial_points(
+            of_new, guess, config.tracks, config.solver.backend, _gate(scene, part, new, config)
+        )
     return _with_points(part.problem, points)
+
+
+def _gate(scene: Scene, part: _Part, new: BoolArray, config: Config) -> float | None:
+    """Return how far off a view of a new point may be: as those of the known points are; None without these."""
+    rows = np.flatnonzero(~new.take(part.problem.observations.point) & ~scene.sightings.outlier.take(part.rows))
+    if len(rows) < _BULK:
+        return None
+    known = some_observations(part.problem, rows)
+    norms = native_kernels.residual_norms(known, known.start, config.solver.backend)
+    return widened(config.tracks.max_triangulation_px, norms)
 
 
 def _with_points(problem: Problem, points: FloatArray) -> Problem:
