@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]
 
+# Stamps farther apart than two weeks are of no pair.
+MAX_DIFFERENCE_S = 1e6
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -115,6 +118,10 @@ def absolute_error(
     Raises:
         EvaluationError: no pose has a partner, or the pairs cannot be aligned.
     """
+    if not 0.0 <= max_difference_s <= MAX_DIFFERENCE_S:
+        raise EvaluationError(
+            f"largest difference of the stamps of a pair = {max_difference_s:g} s: expected 0 to {MAX_DIFFERENCE_S:g} s"
+        )
     rows, partners = associate(estimate.stamp_ns, reference.stamp_ns, max_difference_s)
     if len(rows) == 0:
         raise EvaluationError(

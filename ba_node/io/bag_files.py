@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 import re
-import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ba_node.io.bag_errors import BagError
+from ba_node.io.files import FileKindError, open_regular
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for, pieces
 from ba_node.io.yaml_file import YamlError, read_yaml
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 METADATA = "metadata.yaml"
 STORAGES = (".mcap", ".db3")
 PACKED = ".zstd"
+MAX_PACKED_BYTES = 2**40
 _KNOWN = ("mcap", "sqlite3")
 
 
@@ -128,24 +129,17 @@ def unpack_file(path: Path, folder: Path) -> Path:
     """
     target = folder / path.stem
     try:
-        require_regular(path)
         # A recording of black images packs well.
         limit = limit_for(path.stat().st_size, growth=1000, always=16 * ALWAYS_ALLOWED_BYTES)
-        with path.open("rb") as packed, target.open("xb") as out:
+        with open_regular(path, MAX_PACKED_BYTES) as packed, target.open("xb") as out:
             out.writelines(pieces("zstd", packed, limit))
-    except BagError as error:
-        raise BagError(f"{path}: {error}") from None
+    except FileKindError as error:
+        raise BagError(str(error)) from None
     except OSError as error:
         raise BagError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
     except Exception as error:  # what the library raises on damaged data is no OSError
         raise BagError(f"{path}: cannot be unpacked: {error}") from error
     return target
-
-
-def require_regular(path: Path) -> None:
-    """Raise BagError for a device or a pipe, which may have no end, OSError for what is not there."""
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise BagError("is not a regular file: expected a recording")
 
 
 def _shown(names: list[str]) -> str:

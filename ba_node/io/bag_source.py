@@ -13,8 +13,8 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
-from ba_node.io.bag_files import require_regular
 from ba_node.io.bag_index import BagIndex, read_index, read_messages
+from ba_node.io.files import FileKindError, open_regular
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from mcap.records import Channel
 
+# Any recording; devices and pipes are refused.
+MAX_BYTES = 2**62
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 _ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
@@ -88,13 +90,14 @@ def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
         BagError: it cannot be opened, is of another kind, or holds no message that can be read.
     """
     try:
-        require_regular(path)
-        stream = stack.enter_context(path.open("rb"))
+        stream = stack.enter_context(open_regular(path, MAX_BYTES))
         head = stream.read(len(_SQLITE_MAGIC))
         stream.seek(0)
         return SqliteSource(path, stack) if head == _SQLITE_MAGIC else McapSource(stream, path.stat().st_size)
     except BagError as error:
         raise type(error)(f"{name}: {error}") from None
+    except FileKindError as error:
+        raise BagError(str(error)) from None
     except OSError as error:
         raise BagError(f"{name}: cannot be opened: {error.strerror}") from error
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from ba_node import __version__, archive
 from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for
 from ba_node.scene.map_content import MapContent, MapError
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ VERSION = 1
 SUFFIX = ".npz"
 # Larger files are not read: such a map would not fit into the memory of most machines.
 MAX_BYTES = 2**32
+# What other tools have packed may grow by this factor.
+MAX_GROWTH = 20
 _HEAD = "map.json"
 _MAX_HEAD_BYTES = 2**24
 _ARRAY = ".npy"
@@ -116,6 +119,9 @@ def _read(stream: Any) -> MapContent:
         with zipfile.ZipFile(stream) as file:
             if any(item.compress_type not in _COMPRESSIONS for item in file.infolist()):
                 raise MapFileError("damaged: a member is compressed in a way that is not used")
+            claimed = sum(item.file_size for item in file.infolist())
+            if claimed > limit_for(stream.seek(0, io.SEEK_END), MAX_GROWTH, ALWAYS_ALLOWED_BYTES):
+                raise MapFileError(f"its members claim {claimed >> 20} MB, which no map packs into that file")
             if _HEAD not in file.namelist():
                 raise MapFileError(f"not a map: it has no {_HEAD}, which save_map writes")
             facts = _head(file.read(_HEAD))

@@ -12,6 +12,8 @@ from typing import Any
 import yaml
 
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations
+from ba_node.io.files import FileKindError
+from ba_node.io.yaml_file import YamlError, read_yaml
 
 NODE_NAME = "ba_node"
 _ROS_KEY = "ros__parameters"
@@ -28,11 +30,12 @@ def read_parameters(path: Path | str) -> dict[str, object]:
         ConfigError: the file cannot be read, is not YAML, or holds no mapping of parameters.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = read_yaml(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be opened: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    except (YamlError, FileKindError) as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -93,7 +96,10 @@ def _of_this_node(path: Path | str, content: dict[Any, Any]) -> dict[Any, Any]:
         raise ConfigError(f"{path}: parameters of {', '.join(by_node)} only: expected /** or {NODE_NAME}")
     merged: dict[Any, Any] = {}
     for name in sorted(ours, key=lambda name: name.endswith(NODE_NAME)):
-        merged.update(dict(_flatten(by_node[name][_ROS_KEY] or {})))
+        values = by_node[name][_ROS_KEY] or {}
+        if not isinstance(values, dict):
+            raise ConfigError(f"{path}: {name}: {_ROS_KEY} = {values!r}: expected a mapping of parameters")
+        merged.update(dict(_flatten(values)))
     return merged
 
 

@@ -9,20 +9,22 @@ other numbers are written so that they read back as the same float64.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation, localcontext
+from decimal import ROUND_HALF_EVEN, Decimal, DecimalException, InvalidOperation, localcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.io.files import whole_file
+from ba_node.io.files import FileKindError, open_regular, whole_file
 
 if TYPE_CHECKING:
     from ba_node.estimate import Poses
 
 FloatArray = NDArray[np.float64]
 
+# A million poses.
+MAX_BYTES = 2**27
 _NS = 1_000_000_000
 _COLUMNS = "stamp x y z qx qy qz qw"
 
@@ -70,7 +72,10 @@ def read_tum(path: Path | str) -> Trajectory:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        with open_regular(path, MAX_BYTES) as stream:
+            text = stream.read().decode("utf-8")
+    except FileKindError as error:
+        raise TrajectoryError(str(error)) from None
     except OSError as error:
         raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -112,7 +117,9 @@ def parse_stamp(text: str) -> int:
                 raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
             stamp_ns = int((stamp * _NS).to_integral_value(rounding=ROUND_HALF_EVEN))
         except InvalidOperation:
-            raise ValueError(f"stamp {text!r} is not a number") from None
+            raise ValueError(f"stamp {text[:40]!r} is not a number") from None
+        except DecimalException:
+            raise ValueError(f"stamp {text[:40]!r}: expected finite seconds, within int64 nanoseconds") from None
     if not -(2**63) <= stamp_ns < 2**63:
         raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
     return stamp_ns

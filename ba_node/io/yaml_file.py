@@ -9,7 +9,11 @@ from typing import Any
 
 import yaml
 
+from ba_node.io.files import open_regular
+
 MAX_BYTES = 2**20
+# Of a value without quotes, which may be a number: to read one takes a time that grows with the square of its length.
+_MAX_PLAIN = 1000
 
 
 class YamlError(ValueError):
@@ -18,11 +22,15 @@ class YamlError(ValueError):
 
 class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Refuse aliases."""
+        """Refuse aliases and endless numbers."""
         if self.check_event(yaml.AliasEvent):
             event = self.peek_event()  # type: ignore[no-untyped-call]
             where = f"line {event.start_mark.line + 1}"
             raise YamlError(f"{where}: alias *{event.anchor}: aliases are not read, as in ROS: write the value out")
+        if self.check_event(yaml.ScalarEvent):
+            event = self.peek_event()  # type: ignore[no-untyped-call]
+            if event.style is None and len(event.value) > _MAX_PLAIN:
+                raise YamlError(f"line {event.start_mark.line + 1}: a value of {len(event.value)} characters")
         return super().compose_node(parent, index)
 
 
@@ -30,13 +38,12 @@ def read_yaml(path: Path | str) -> Any:
     """Return the content of a file.
 
     Raises:
-        YamlError: it is not YAML, larger than 1 MB, nested too deep, or has aliases.
+        YamlError: it is not YAML, nested too deep, has aliases, or a number without end.
+        FileKindError: it is no regular file, or larger than 1 MB.
         OSError: it cannot be read.
     """
-    with Path(path).open("rb") as stream:
-        data = stream.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise YamlError(f"more than {MAX_BYTES >> 20} MB: expected a file of parameters or of metadata")
+    with open_regular(path, MAX_BYTES) as stream:
+        data = stream.read()
     try:
         return yaml.load(data.decode("utf-8"), _Loader)
     except RecursionError:

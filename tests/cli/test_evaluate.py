@@ -55,3 +55,15 @@ def test_bad_line_is_named(trajectories: tuple[str, str], tmp_path: Path, capsys
     bad.write_text("1.0 0 0 0 0 0 0 1\n2.0 x 0 0 0 0 0 1\n")
     assert main(["evaluate", str(bad), trajectories[1]]) == 2
     assert f"{bad}:2: x = 'x' is not a number" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "-1", "1e400", "1e300"])
+def test_a_difference_that_is_no_time_is_named(
+    trajectories: tuple[str, str], capsys: pytest.CaptureFixture[str], value: str
+) -> None:
+    assert main(["evaluate", *trajectories, f"--max-difference={value}"]) == 2
+    assert "expected 0 to 1e+06 s" in capsys.readouterr().err
+
+
+def test_no_difference_is_one(trajectories: tuple[str, str]) -> None:
+    assert main(["evaluate", *trajectories, "--max-difference", "0"]) == 0
