@@ -45,11 +45,17 @@ OUTPUTS = {
     "refined_keyframes": ("reliable", "Poses of the window after each solve, by id."),
     "pose": ("reliable", "The same, one message a keyframe with the keyframe's stamp."),
     "path": ("latched", "Poses of all keyframes kept, newest `output.path_max_poses`."),
-    "points": ("latched", "The map: fields x, y, z (m), rms_px (float32), views (uint32)."),
+    "points": ("latched", "The map: x, y, z (m), rms_px (float32), views (uint32)."),
     "report": ("reliable", "How each solve went, failed and skipped ones too."),
 }
 SIDE_OUTPUTS = {
-    "pose_with_covariance": ("reliable", "As `~/pose`, with a covariance; see docs/frames.md. Only while subscribed."),
+    "pose_with_covariance": (
+        "reliable",
+        (
+            "As `~/pose`, with a covariance against what the solve held fixed; with the default Huber loss its standard"
+            " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed."
+        ),
+    ),
     "markers": ("latched", "Frusta, links between keyframes, residual colours. Only while subscribed."),
 }
 SHARED_OUTPUTS = {

@@ -5,6 +5,9 @@
 Poses, points and each camera's f, k1, k2 are free. The defaults are those of the method: squared loss for
 local_dinm, points behind a camera keep their residual, as the published results count. Parameters of the node
 (solver.*) and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
+
+Exit code: 0 all is well, 2 nothing came of it, 3 the result has to be looked at: it is worse than the start, focal
+lengths are not positive, or many points lie behind their cameras.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
 
 SUMMARY = "solve a BAL file as a whole"
 EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json"
+# Nothing came of it; something came of it that has to be looked at.
+NOTHING, ATTENTION = 2, 3
 _HEAD = ("iter", "time [s]", "objective", "|gradient|", "linear", "step", "damping", "radius")
 _WIDTHS = (4, 9, 18, 11, 7, 9, 10, 10)
 
@@ -55,6 +60,11 @@ def run(args: argparse.Namespace) -> int:
     solution = solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
     figures = solution.as_dict()
     figures["peak_rss_mb"] = _peak_rss_mb()
+    if args.json:
+        write_json(args.json, figures)
+    if not solution.result.status.usable:
+        print(f"ba: error: {args.problem}: {solution.result.status.name.lower()}: {figures['reason']}", file=sys.stderr)
+        return NOTHING
     sizes, status = figures["problem"], figures["status"]
     print(
         f"{status.lower()}: {figures['reason']}\n"
@@ -64,11 +74,14 @@ def run(args: argparse.Namespace) -> int:
         f"linear solver: {figures['linear_solver']}\n"
         f"set-up {figures['setup_s']:.3f} s, solver {figures['solve_s']:.3f} s, memory {figures['peak_rss_mb']:.0f} MB"
     )
-    if args.json:
-        write_json(args.json, figures)
+    if solution.origin.any():
+        print("solved about the origin {:g} {:g} {:g}, as that of the file is far away".format(*solution.origin))
+    lines, grave = solution.attention()
+    for line in lines:
+        print(f"ba: warning: {line}" if grave else line, file=sys.stderr if grave else sys.stdout)
     if args.out:
         write_bal(args.out, solution.refined())
-    return 0 if solution.result.status.usable else 1
+    return ATTENTION if grave else 0
 
 
 def _show(row: Iteration) -> bool:

@@ -145,6 +145,20 @@ def to_problem(bal: BalProblem) -> Problem:
     )
 
 
+def translated(bal: BalProblem, offset: FloatArray) -> BalProblem:
+    """Return the same problem in a world whose points lie ``offset`` further, (3,)."""
+    cameras = bal.cameras.copy()
+    cameras[:, 3:6] -= so3_exp(cameras[:, :3]) @ offset
+    return replace(bal, cameras=cameras, points=bal.points + offset)
+
+
+def behind(bal: BalProblem) -> NDArray[np.bool_]:
+    """Return which observations, (l,), are of a point that is not in front of its camera, which looks along -z."""
+    forward = so3_exp(bal.cameras[:, :3])[:, 2]
+    seen = np.einsum("ij,ij->i", forward[bal.camera_index], bal.points[bal.point_index])
+    return np.asarray(seen + bal.cameras[bal.camera_index, 5] >= 0.0)
+
+
 def from_state(bal: BalProblem, state: State) -> BalProblem:
     """Return the problem with cameras and points of a solution of :func:`to_problem`."""
     cameras = np.hstack([so3_log(state.rotation), state.translation, state.intrinsics])

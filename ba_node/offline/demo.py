@@ -53,7 +53,7 @@ class Outcome:
         truth: true poses.
         cloud: the map.
         reports: ``ba_msgs/SolverReport`` of every solve.
-        frame_id: name of the fixed frame.
+        frame_id: name of the frame of the refined poses and the map.
         duration_s: from the start of the node to its end.
     """
 
@@ -112,8 +112,8 @@ def run(bag: Path, out: Path, say: Callable[[str], None]) -> Outcome:
             if not listener.reports:
                 raise DemoError(f"the node sent no report; {node.last_words()}")
         after = listener.poses()
-        cloud = _cloud(listener)
-    return Outcome(_poses(inputs), after, truth, cloud, listener.reports, inputs[0].frame_id, time.monotonic() - began)
+        cloud, frame_id = _cloud(listener), listener.points_frame
+    return Outcome(_poses(inputs), after, truth, cloud, listener.reports, frame_id, time.monotonic() - began)
 
 
 def write(outcome: Outcome, out: Path) -> dict[str, TrajectoryError]:

@@ -41,7 +41,8 @@ class SavedMap:
         way = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())
         rows = [
             ("session", "none yet" if scene.session_id is None else str(scene.session_id)),
-            ("fixed frame", scene.frame_id or "not named"),
+            ("frame of the map", self.estimate.frame_id),
+            ("frame of the input", scene.frame_id or "not named"),
             ("cameras", str(0 if scene.cameras is None else len(scene.cameras.model))),
             ("keyframes", f"{len(table)}, {np.count_nonzero(table.refined)} refined, {span:.1f} s, {way:.1f} m"),
             ("landmarks", f"{len(scene.landmarks)}, {len(self.estimate.cloud)} with position and two views"),

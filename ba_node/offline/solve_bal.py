@@ -10,13 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
 from ba_node.core.solver import solve
-from ba_node.io.bal import BalProblem, from_state, read_bal, to_problem
+from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated
 from ba_node.offline.solver_settings import describe
 from ba_node.window.quality import problem_rms_px
+
+# Points that lie so many times their own extent from the origin are moved there: coordinates of a whole country, as UTM
+# has them, leave too few digits to the steps of a solver.
+_FAR = 10.0
+# Observations behind their cameras from which on somebody has to look at the file; a few points may well end there.
+_MANY_BEHIND = 0.01
 
 
 @dataclass(frozen=True)
@@ -25,8 +34,9 @@ class Solution:
 
     Attributes:
         source: the file.
-        bal: what it held.
+        bal: what it held, moved by minus the origin.
         problem: the same in our terms.
+        origin: (3,) of the coordinates in which it was solved, in those of the file; zeros if they are the same.
         result: state and trace.
         options: with which it was solved.
         setup_s: time to read and prepare it, s.
@@ -36,19 +46,51 @@ class Solution:
     source: str
     bal: BalProblem
     problem: Problem
+    origin: NDArray[np.float64]
     result: Result
     options: SolverOptions
     setup_s: float
     solve_s: float
 
     def refined(self) -> BalProblem:
-        """Return the problem with the solution as start."""
-        return from_state(self.bal, self.result.state)
+        """Return the problem with the solution as start, in the coordinates of the file."""
+        refined = from_state(self.bal, self.result.state)
+        return translated(refined, self.origin) if self.origin.any() else refined
+
+    def attention(self) -> tuple[list[str], bool]:
+        """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
+        lines, grave = [], False
+        count, focal = len(self.bal.observations), self.bal.cameras[:, 6]
+        ends = (self.bal, from_state(self.bal, self.result.state))
+        before, after = (int(np.count_nonzero(behind(end))) for end in ends)
+        bad = np.flatnonzero(focal <= 0.0)
+        if len(bad):
+            grave = True
+            lines.append(
+                f"{len(bad)} of {len(focal)} cameras have a focal length that is not positive (camera {bad[0]}:"
+                f" f = {focal[bad[0]]:g} px): a BAL camera looks along -z and has f > 0; turn one that looks along +z"
+                " by 180 degrees about its x axis, and give f and the signs of the pixels as the format has them"
+            )
+        if before or after:
+            grave = grave or max(before, after) > _MANY_BEHIND * count
+            lines.append(
+                f"{before} of {count} observations are of points behind their camera at the start, {after} at the end:"
+                " they are not in the rms"
+            )
+        result = self.result
+        if result.status.usable and not result.objective_after <= result.objective_before:
+            grave = True
+            lines.append(
+                f"the objective at the end, {result.objective_after:.8g}, is worse than at the start,"
+                f" {result.objective_before:.8g}"
+            )
+        return lines, grave
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON; an infinite radius becomes null there."""
         result = self.result
-        rms_before, rms_after = problem_rms_px(self.problem, self.problem.start, result.state)
+        with np.errstate(all="ignore"):  # infinite where the solve failed
+            rms_before, rms_after = problem_rms_px(self.problem, self.problem.start, result.state)
         return {
             "problem": {
                 "file": Path(self.source).name,
@@ -58,6 +100,8 @@ class Solution:
             },
             "method": result.method,
             "linear_solver": result.linear_solver,
+            "origin": self.origin.tolist(),
+            "attention": self.attention()[0],
             "options": describe(self.options),
             "status": result.status.name,
             "reason": result.reason,
@@ -89,7 +133,18 @@ def solve_file(
     """
     began = clock()
     bal = read_bal(path)
+    origin = _origin(bal)
+    bal = translated(bal, -origin) if origin.any() else bal
     problem = to_problem(bal)
     ready = clock()
     result = solve(problem, options, clock=clock, on_iteration=on_iteration)
-    return Solution(str(path), bal, problem, result, options, ready - began, clock() - ready)
+    return Solution(str(path), bal, problem, origin, result, options, ready - began, clock() - ready)
+
+
+def _origin(bal: BalProblem) -> NDArray[np.float64]:
+    """Return the middle of the points if the origin of the file is far from all of them, otherwise zeros."""
+    if not len(bal.points):
+        return np.zeros(3)
+    middle = np.median(bal.points, axis=0)
+    extent = float(np.median(np.linalg.norm(bal.points - middle, axis=1)))
+    return middle if float(np.linalg.norm(middle)) > _FAR * extent > 0.0 else np.zeros(3)

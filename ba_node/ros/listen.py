@@ -34,12 +34,14 @@ class NodeListener:
         reports: ``ba_msgs/SolverReport`` of every solve, oldest first.
         points: newest cloud as ``POINT_DTYPE`` records.
         points_stamp_ns: its stamp, ns.
+        points_frame: its frame.
     """
 
     def __init__(self, node_name: str, domain: int | None = None) -> None:
         self.reports: list[Any] = []
         self.points: NDArray[np.void] = np.empty(0, dtype=POINT_DTYPE)
         self.points_stamp_ns: int | None = None
+        self.points_frame = ""
         self._node_name = node_name
         self._domain = domain
         self._poses: dict[int, tuple[int, NDArray[np.float64], NDArray[np.float64]]] = {}
@@ -103,3 +105,4 @@ class NodeListener:
     def _on_points(self, message: Any) -> None:
         self.points = np.frombuffer(bytes(message.data), dtype=POINT_DTYPE)
         self.points_stamp_ns = stamp_ns_from_message(message.header.stamp)
+        self.points_frame = str(message.header.frame_id)

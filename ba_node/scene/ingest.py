@@ -29,6 +29,7 @@ SIGMA_RANGE = (1e-6, 1e6)
 DEPTH_RANGE_M = (1e-3, 1e6)
 MAX_POSITION_M = 1e9
 MAX_GUESS_M = 1e12
+COARSE_M = 1e-3
 _MIN_QUATERNION_NORM = 1e-6
 # A distortion that folds over within this share of the way from the principal point to the border is no calibration.
 _FOLD_REFUSED = 0.5
@@ -56,7 +57,20 @@ def keyframe_pose(keyframe: Keyframe, log: RejectionLog) -> Pose | None:
     if not _within(position, MAX_POSITION_M) or not _is_rotation(quaternion):
         log.reject("bad_pose", f"{name}: position {position} m, quaternion {quaternion}, expected finite and not zero")
         return None
+    _check_distance(name, keyframe.frame_id, position, log)
     return Pose(geometry.matrix_from_quaternion(quaternion), position)
+
+
+def _check_distance(name: str, frame_id: str, position: FloatArray, log: RejectionLog) -> None:
+    """Warn where the cloud, as viewers take it, cannot tell points apart any more that the map can."""
+    step_m = float(np.spacing(np.abs(position).max().astype(np.float32)))
+    if step_m > COARSE_M:
+        text = (
+            f"{name} is {np.linalg.norm(position):.0f} m from the origin of {frame_id!r}: points on ~/points are"
+            f" float32, with steps of {1e3 * step_m:.2g} mm there; give poses relative to a place near the site (poses"
+            " and points.ply keep all digits)"
+        )
+        log.warn("far_from_origin", text=text)
 
 
 def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | None:

@@ -44,6 +44,7 @@ NOTICES: dict[str, str] = {
 # in ba_msgs/SolverReport; a replay that has any ends with another exit code than 0.
 WARNINGS: dict[str, str] = {
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
+    "far_from_origin": "Keyframes so far from the origin that the float32 of ~/points loses millimetres.",
     "distortion_folds": "A camera whose distortion folds over inside its image.",
     "clock_jump": "The stamps went far back, or a recording plays again: a new session began.",
     "lower_session": "Keyframes came of a lower session only: it began anew.",

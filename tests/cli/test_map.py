@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from ba_node.cli.main import main
+from ba_node.io.files import locked_folder
+from ba_node.io.map_file import is_map
 from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import Keyframe
@@ -32,6 +34,7 @@ def test_info(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "info", str(saved)]) == 0
     told = dict(line.split("  ", 1) for line in capsys.readouterr().out.splitlines())
     assert told["session"].strip() == "0"
+    assert (told["frame of the map"].strip(), told["frame of the input"].strip()) == ("map", "odom")
     assert told["cameras"].strip() == "2"
     assert told["keyframes"].strip().startswith("8, 8 refined, 1.8 s, ")
 
@@ -42,7 +45,23 @@ def test_export_gives_what_the_replay_gave(saved: Path, tmp_path: Path) -> None:
     assert tum.read_bytes() == (saved.parent / "out" / "trajectory.tum").read_bytes()
     assert ply.read_bytes() == (saved.parent / "out" / "points.ply").read_bytes()
     assert len(read_tum(tum)) == 8
-    assert len(read_ply(ply)[0]) > 50
+    points, frame = read_ply(ply)
+    assert (len(points) > 50, frame) == (True, "map")
+
+
+def test_the_suffix_is_added(bag: Path, tmp_path: Path) -> None:
+    assert replay(bag, tmp_path / "out", "--save-map", str(tmp_path / "site")) == 0
+    assert is_map(tmp_path / "site.npz")
+    assert not (tmp_path / "site").exists()
+
+
+def test_two_replays_into_one_folder_are_refused(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with locked_folder(tmp_path / "out"):
+        assert replay(bag, tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert f"ba: error: {tmp_path / 'out'}: another process writes its results there" in error
+    assert error.count("\n") == 1
+    assert replay(bag, tmp_path / "out") == 0
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,12 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.config import ConfigError
 from ba_node.core import methods
-from ba_node.io.bal import read_bal
+from ba_node.core.options import SolverOptions
+from ba_node.core.problem import Problem
+from ba_node.core.result import Result
+from ba_node.core.solver import solve
+from ba_node.io.bal import BalProblem, behind, read_bal, translated, write_bal
+from ba_node.offline import solve_bal
 from ba_node.offline.solver_settings import describe, option_names, solver_options
 
 ROW = {
@@ -181,3 +188,83 @@ def test_ladybug_meets_the_published_start_and_the_target(shared_data: Path, tmp
     report = json.loads(trace.read_text())
     assert f"{report['objective_before']:.2f}" == "850912.46"
     assert report["objective_after"] <= 13500.0, report["objective_after"]
+
+
+UTM = np.array([512_345.678, 5_412_345.678, 345.678])
+
+
+def _solved(tmp_path: Path, problem: BalProblem, *options: str) -> tuple[dict[str, Any], BalProblem]:
+    """Solve a problem and return the figures and what was written."""
+    source, figures, refined = tmp_path / "in.txt", tmp_path / "out.json", tmp_path / "out.txt"
+    write_bal(source, problem)
+    assert main(["solve", str(source), "--json", str(figures), "--out", str(refined), *options]) == 0
+    return json.loads(figures.read_text()), read_bal(refined)
+
+
+def test_coordinates_of_a_country_give_the_same_result(tmp_path: Path, bal_file: Path) -> None:
+    """A problem with noise, so that there is an objective to compare: about its own origin, and in UTM coordinates."""
+    problem, rng = read_bal(bal_file), np.random.default_rng(3)
+    problem = dataclasses.replace(problem, observations=problem.observations + rng.normal(0.0, 0.5, (120, 2)))
+    near, refined = _solved(tmp_path, problem, "--method", "auto", "--iterations", "200")
+    far, there = _solved(tmp_path, translated(problem, UTM), "--method", "auto", "--iterations", "200")
+    assert near["origin"] == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(far["origin"], np.median(problem.points, axis=0) + UTM, atol=1e-6)
+    assert far["objective_before"] == pytest.approx(near["objective_before"], rel=1e-6)
+    assert far["objective_after"] == pytest.approx(near["objective_after"], rel=1e-3)
+    again, _ = _solved(tmp_path, there, "--iterations", "1")
+    assert again["objective_before"] == pytest.approx(far["objective_after"], rel=1e-6), (
+        "in the coordinates of the file"
+    )
+    extent = np.linalg.norm(refined.points - refined.points[0], axis=1).max()
+    assert extent > 1.0 and np.abs(there.points - UTM).max() < 100.0
+
+
+def test_moving_a_problem_there_and_back_changes_nothing(bal_file: Path) -> None:
+    problem = read_bal(bal_file)
+    back = translated(translated(problem, UTM), -UTM)
+    np.testing.assert_allclose(back.cameras, problem.cameras, atol=1e-8)
+    np.testing.assert_allclose(back.points, problem.points, atol=1e-8)
+    assert not behind(problem).any()
+    assert behind(dataclasses.replace(problem, points=-problem.points)).all()
+
+
+def test_a_negative_focal_length_is_said(tmp_path: Path, bal_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Cameras that look along +z, with f < 0 so that the pixels fit: nothing is in front, so the rms was 0."""
+    problem = read_bal(bal_file)
+    cameras, points = problem.cameras.copy(), problem.points * [-1.0, -1.0, -1.0]
+    cameras[:, 3:6] *= -1.0
+    cameras[:, 6] *= -1.0
+    write_bal(
+        tmp_path / "in.txt",
+        dataclasses.replace(problem, cameras=cameras, points=points, observations=-problem.observations),
+    )
+    assert main(["solve", str(tmp_path / "in.txt"), "--iterations", "3"]) == 3
+    told = capsys.readouterr().err
+    assert "4 of 4 cameras have a focal length that is not positive (camera 0: f = -500 px): a BAL camera" in told
+    assert "120 of 120 observations are of points behind their camera at the start" in told
+
+
+def test_a_solve_that_fails_says_why(tmp_path: Path, bal_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = read_bal(bal_file)
+    cameras = problem.cameras.copy()
+    cameras[2, 6] = 1e200
+    write_bal(tmp_path / "in.txt", dataclasses.replace(problem, cameras=cameras))
+    figures, refined = tmp_path / "out.json", tmp_path / "out.txt"
+    assert main(["solve", str(tmp_path / "in.txt"), "--json", str(figures), "--out", str(refined)]) == 2
+    told = capsys.readouterr()
+    assert "in.txt: failed: the objective or its derivatives are not finite at the start" in told.err
+    assert "objective 0" not in told.out
+    assert json.loads(figures.read_text())["status"] == "FAILED"
+    assert not refined.exists(), "there is nothing to write"
+
+
+def test_a_result_worse_than_its_start_is_said(
+    bal_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse(problem: Problem, options: SolverOptions, **others: Any) -> Result:
+        result = solve(problem, options, **others)
+        return dataclasses.replace(result, trace=result.trace[::-1])
+
+    monkeypatch.setattr(solve_bal, "solve", worse)
+    assert main(["solve", str(bal_file), "--iterations", "5"]) == 3
+    assert "is worse than at the start" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
 import struct
 from pathlib import Path
 
@@ -21,15 +22,15 @@ def test_layout_byte_by_byte(tmp_path: Path, estimate: Estimate) -> None:
         "format binary_little_endian 1.0",
         "comment frame map",
         "element vertex 100",
-        "property float x",
-        "property float y",
-        "property float z",
+        "property double x",
+        "property double y",
+        "property double z",
         "property float rms_px",
         "property uint views",
     ]
-    assert len(body) == 100 * 20
-    x, y, z, rms, views = struct.unpack_from("<ffffI", body, 20 * 7)
-    assert [x, y, z] == estimate.cloud.position[7].astype(np.float32).tolist()
+    assert len(body) == 100 * 32
+    x, y, z, rms, views = struct.unpack_from("<dddfI", body, 32 * 7)
+    assert [x, y, z] == estimate.cloud.position[7].tolist()
     assert (rms, views) == (float(estimate.cloud.rms_px[7]), int(estimate.cloud.views[7]))
 
 
@@ -40,7 +41,16 @@ def test_any_frame_survives(tmp_path: Path, estimate: Estimate, frame: str) -> N
     points, found = read_ply(path)
     assert found == frame
     np.testing.assert_array_equal(points["views"], estimate.cloud.views)
-    np.testing.assert_array_equal(points["z"], estimate.cloud.position[:, 2].astype(np.float32))
+    np.testing.assert_array_equal(points["z"], estimate.cloud.position[:, 2])
+
+
+def test_coordinates_of_a_country_keep_their_digits(tmp_path: Path, estimate: Estimate) -> None:
+    """A float32 has steps of 0.5 m at 5 412 345 m."""
+    site = np.array([512_345.678, 5_412_345.678, 345.0])
+    cloud = dataclasses.replace(estimate.cloud, position=estimate.cloud.position + site)
+    write_ply(tmp_path / "c.ply", cloud, "map")
+    points, _ = read_ply(tmp_path / "c.ply")
+    np.testing.assert_array_equal(np.column_stack([points[axis] for axis in "xyz"]), cloud.position)
 
 
 def test_what_is_no_cloud_of_ours_is_an_error(tmp_path: Path, estimate: Estimate) -> None:

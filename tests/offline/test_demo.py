@@ -39,7 +39,8 @@ def test_demo_improves_the_trajectory(tmp_path: Path) -> None:
     assert "60 of 60 came back refined" in run.stdout
     assert len(read_tum(tmp_path / "trajectory.tum")) == 60
     assert len(read_tum(tmp_path / "ground_truth.tum")) == 60
-    assert len(read_ply(tmp_path / "points.ply")[0]) > 500
+    points, frame = read_ply(tmp_path / "points.ply")
+    assert (len(points) > 500, frame) == (True, "map")
     assert (tmp_path / "trajectory.png").read_bytes().startswith(b"\x89PNG")
     assert "stopped: 60 keyframes refined" in (tmp_path / "node.log").read_text(), "the node ends by SIGINT"
 

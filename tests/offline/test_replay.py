@@ -23,6 +23,7 @@ from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.messages.outputs import POINT_DTYPE
 from ba_node.offline.bal_timeline import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
@@ -115,7 +116,7 @@ def test_refined_recording_is_what_a_node_publishes(shipped: Run) -> None:
     np.testing.assert_array_equal([poses[stamp] for stamp in trajectory.stamp_ns.tolist()], trajectory.position)
     cloud = [message for topic, _, message in messages if topic.endswith("/points")][-1]
     points, _ = read_ply(shipped.out / "points.ply")
-    assert bytes(cloud.data) == points.tobytes()
+    assert bytes(cloud.data) == points.astype(POINT_DTYPE).tobytes()
 
 
 def test_effective_parameters_are_written(shipped: Run, tmp_path: Path) -> None:

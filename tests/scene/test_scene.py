@@ -184,6 +184,15 @@ def test_every_reason_is_documented() -> None:
     assert {reason for reason, _ in BAD_MESSAGES} | {reason for reason, _, _ in BAD_ROWS} <= set(REASONS)
 
 
+@pytest.mark.parametrize(("east_m", "words"), [(16_000.0, ""), (16_400.0, "2 mm"), (-5_412_345.0, "5e+02 mm")])
+def test_far_from_the_origin_is_warned_about(east_m: float, words: str) -> None:
+    """From 2^14 m on the float32 of a cloud has steps of more than a millimetre."""
+    scene = Scene(SceneConfig())
+    scene.add(keyframe(1, position=np.array([0.0, east_m, 0.0])))
+    told = scene.log.warnings.get("far_from_origin", "")
+    assert bool(told) == bool(words) and words in told, told
+
+
 def test_an_identical_rig_again_is_fine() -> None:
     scene = scene_of(rig(), keyframe(4), tracks(4), rig())
     assert not scene.log.rejected
