@@ -124,8 +124,8 @@ class SceneConfig:
     )
     max_reorder_s: float = _param(
         10.0,
-        "A keyframe whose stamp is further than this before the newest begins a new session, as when a bag plays again;"
-        " closer ones are sorted in. 0: never.",
+        "Keyframes whose stamps are further than this before the newest begin a new session, as when the clock is set"
+        " back, and one alone is rejected; closer ones are sorted in. One this far ahead waits for the next. 0: never.",
         unit="s",
         minimum=0.0,
         maximum=1e9,
@@ -412,13 +412,20 @@ class Config:
         return changed
 
     def check(self) -> None:
-        """Raise ConfigError if parameters contradict each other, each of which is valid by itself."""
+        """Raise ConfigError if parameters contradict each other or ROS, each of which is valid by itself."""
         window, scene = self.window.max_keyframes, self.scene.max_keyframes
         if window > scene:
             raise ConfigError(
                 f"parameter window.max_keyframes = {window}: more than are kept (scene.max_keyframes = {scene});"
                 f" lower the first or raise the second"
             )
+        for name in ("map_frame", "odom_frame", "base_frame"):
+            frame = str(getattr(self.frames, name))
+            if frame.startswith("/"):
+                raise ConfigError(
+                    f"parameter frames.{name} = {frame!r}: tf2 refuses a name that begins with a slash;"
+                    f" take {frame.lstrip('/')!r}"
+                )
         if self.solver.method.startswith("irls_") and self.solver.loss == "squared":
             raise ConfigError(
                 f"parameter solver.loss = 'squared': method {self.solver.method!r} reweights residuals, which the"

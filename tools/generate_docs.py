@@ -46,7 +46,10 @@ OUTPUTS = {
     "pose": ("reliable", "The same, one message a keyframe with the keyframe's stamp."),
     "path": ("latched", "Poses of all keyframes kept, newest `output.path_max_poses`."),
     "points": ("latched", "The map: x, y, z (m), rms_px (float32), views (uint32)."),
-    "report": ("reliable", "How each solve went, failed and skipped ones too."),
+    "report": (
+        "reliable",
+        "How each solve went, failed and skipped ones too; without a solve, what was turned away.",
+    ),
 }
 SIDE_OUTPUTS = {
     "pose_with_covariance": (

@@ -98,12 +98,12 @@ class Scene:
         """Return the indices of the cameras that delivered for a keyframe."""
         return {block.camera for block in self.blocks[keyframe_row]}
 
-    def views_of(self, landmarks: IntArray) -> IntArray:
-        """Return the rows of all observations of some landmarks, in no particular order."""
-        found = []
+    def views_of(self, landmarks: IntArray, newest: int | None = None) -> IntArray:
+        """Return the rows of all observations of some landmarks, or of the newest of each, in no particular order."""
+        found: list[IntArray] = []
         front = self.landmarks.last[landmarks]
         front = front[front >= 0]
-        while len(front):
+        while len(front) and (newest is None or len(found) < newest):
             found.append(front)
             front = self.sightings.previous[front]
             front = front[front >= 0]

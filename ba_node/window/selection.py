@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
+# Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
+_VIEWS = 400
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
 # the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
 _ABSURD = 25.0
@@ -148,7 +150,7 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     ranges = [np.arange(b.begin, b.end) for row in window for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
     landmarks = _distinct(table.landmark[own], len(scene.landmarks))
-    rows = scene.views_of(landmarks)
+    rows = scene.views_of(landmarks, _views_needed(scene, window))
     n = len(scene.keyframes)
     in_window = np.zeros(n, bool)
     in_window[window] = True
@@ -167,6 +169,17 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     positions = scene.landmarks.position[landmarks] - origin
     problem = problem_of(scene, rows, keyframes, landmarks, origin, positions, config)
     return _Part(problem, rows, keyframes, landmarks, origin)
+
+
+def _views_needed(scene: Scene, window: IntArray) -> int | None:
+    """Return how many of the newest views of a point may matter, None for all of them.
+
+    Who stands still sees the same points in thousands of keyframes, and to gather all of these takes longer and longer.
+    Those before the newest few hundred keyframes share no more points with the window than these do.
+    """
+    if not len(window) or window[-1] != scene.order[-1]:
+        return None  # newer keyframes wait behind the window
+    return _VIEWS + sum(len(scene.blocks[row]) for row in window)
 
 
 def _distinct(rows: NDArray[np.int32], n: int) -> IntArray:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ba_node.backend import Backend
-from ba_node.config import Config
+from ba_node.config import Config, ConfigError
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
@@ -457,3 +457,9 @@ def test_a_rig_is_never_held() -> None:
     assert isinstance(data().rig, CameraRig)
     backend = Backend(Config())
     assert len(backend.admit(data().rig)) == 1
+
+
+@pytest.mark.parametrize("name", ["map_frame", "odom_frame", "base_frame"])
+def test_a_parameter_that_names_a_frame_with_a_slash_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"frames.{name} = '/here': tf2 refuses .* take 'here'"):
+        Config().with_values({f"frames.{name}": "/here"})

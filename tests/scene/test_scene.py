@@ -221,6 +221,16 @@ def test_a_late_stamp_is_sorted_in() -> None:
     assert not scene.log.rejected
 
 
+@pytest.mark.parametrize("newest", [1, 3, 7, 100])
+def test_the_newest_views_are_the_last_rows_of_each_landmark(newest: int) -> None:
+    scene = scene_of(rig(), *(m for i in range(8) for m in (keyframe(i), tracks(i, ids=IDS[: 2 + i % 3]))))
+    landmarks = np.array([0, 2, 3])
+    found = scene.views_of(landmarks, newest)
+    for row in landmarks:
+        expected = np.flatnonzero(scene.sightings.landmark == row)[-newest:]
+        assert sorted(found[scene.sightings.landmark[found] == row].tolist()) == expected.tolist()
+
+
 def test_new_keyframes_follow_the_correction_of_their_predecessor() -> None:
     scene = scene_of(keyframe(1), keyframe(2))
     turn = geometry.so3_exp(np.array([0.0, 0.0, 0.3]))

@@ -14,6 +14,7 @@ from ba_node.core import geometry, objective
 from ba_node.core.result import Result, Status
 from ba_node.measurements import FeatureTracks, Keyframe, Measurement
 from ba_node.scene.scene import Scene
+from ba_node.scene.tables import IntArray
 from ba_node.synthetic import SyntheticOptions, generate
 
 TRACKS = Config().tracks
@@ -68,6 +69,37 @@ def test_newest_are_free_older_that_share_most_are_fixed() -> None:
     in_window = set().union(*seen[-4:])
     shared = {row: sum(landmark in in_window for landmark in views[i]) for i, row in enumerate(order[:-4])}
     assert min(shared[row] for row in fixed) >= max(shared[row] for row in order[:-4] if row not in fixed)
+
+
+def test_who_stands_still_gathers_no_more_views_than_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same images again and again: what is gathered stays bounded, and the newest keyframes are held fixed."""
+    settings = config(window__max_keyframes=4, window__max_fixed_keyframes=3)
+    monkeypatch.setattr("ba_node.window.selection._VIEWS", 20)
+    scene = scene_of(settings, guesses=True)
+    data = generate(SyntheticOptions(**QUIET))
+    keyframe, (left, right) = data.keyframes[-1], data.tracks[-1]
+    first = selected(scene, settings)
+    scene.landmarks.position[first.landmarks] = first.problem.start.points + first.origin
+    scene.landmarks.has_position[first.landmarks] = True
+    scene.landmarks.has_guess[:] = False
+    gathered: list[int] = []
+    views_of = scene.views_of
+
+    def counted(landmarks: IntArray, newest: int | None = None) -> IntArray:
+        found = views_of(landmarks, newest)
+        gathered.append(len(found))
+        return found
+
+    monkeypatch.setattr(scene, "views_of", counted)
+    for i in range(1, 60):
+        scene.add(dataclasses.replace(keyframe, keyframe_id=i, stamp_ns=keyframe.stamp_ns + i * 10**8))
+        for image in (left, right):
+            scene.add(dataclasses.replace(image, keyframe_id=i))
+        scene.keyframes.refined[:] = True
+        selection = selected(scene, settings)
+    assert selection.keyframes.tolist() == scene.order[-7:].tolist()
+    most = len(left.track_id) * (20 + 4 * 2)
+    assert max(gathered) <= most < len(left.track_id) * 2 * 60
 
 
 def test_older_keyframes_that_were_never_refined_hold_nothing() -> None:
