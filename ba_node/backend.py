@@ -44,8 +44,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node import archive, window
-from ba_node.core import geometry, methods, solver
-from ba_node.estimate import Correction, Estimate, Extras, SolveReport
+from ba_node.core import geometry
+from ba_node.estimate import Correction, Estimate, Extras, SolveReport, Status
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
@@ -53,8 +53,10 @@ from ba_node.scene.frame_names import check_name
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import extras, full, quality
+from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection, Transform
 from ba_node.window.known import cloud_of, poses_of, taking_part_of
+from ba_node.window.trust import Trust
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -113,6 +115,7 @@ class Backend:
         self._delivered: deque[int] = deque(maxlen=_LEARN_FROM)
         self._report = SolveReport(reason=_UNSOLVED)
         self._correction = MapCorrection()
+        self._trust = Trust()
 
     @property
     def rejected(self) -> Counter[str]:
@@ -251,16 +254,13 @@ class Backend:
             return None
         due = self._due()
         end = self._end(due)
-        selection = window.select(self.scene, self.config, end)
         taking_part = window.rows_of(self.scene, self.config, end)
         self.solve_count += 1
         newest = int(self.scene.keyframes.keyframe_id[taking_part[-1]])
         extra: dict[str, Any] = {}
-        if isinstance(selection, str):
-            self._report = dataclasses.replace(self._base_report(newest), reason=selection)
-        else:
+        selection, state = self._solve(newest, end, on_iteration)
+        if selection is not None:
             taking_part = taking_part_of(self.scene, selection)
-            self._report, state = self._solve(newest, selection, on_iteration)
             if state is not None:
                 self._correct(int(taking_part[-1]))
                 extra = extras.work_out(self.extras, self.scene, self.config, selection, state, taking_part)
@@ -324,6 +324,7 @@ class Backend:
         self.scene.config = self.config.scene
         self.map_index += 1
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
+        self._trust = Trust()
         self.finished = known.finished[-FINISHED_KEPT:]
         self._current = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
         self._settled = known.settled
@@ -341,18 +342,40 @@ class Backend:
         return quality.rms_px(self.scene, self.config, state)
 
     def _solve(
-        self, newest: int, selection: window.Selection, on_iteration: Callable[[Iteration], bool] | None
-    ) -> tuple[SolveReport, State | None]:
+        self, newest: int, end: int, on_iteration: Callable[[Iteration], bool] | None
+    ) -> tuple[window.Selection | None, State | None]:
+        """Solve the newest window and report; return what was solved, and the solution if it was taken."""
         began = self._clock()
-        problem = selection.problem
-        result = solver.solve(
-            problem, methods.from_config(self.config.solver), clock=self._clock, on_iteration=on_iteration
-        )
+        tried = attempt(self.scene, self.config, end, self._trust, clock=self._clock, on_iteration=on_iteration)
+        if isinstance(tried, str):
+            self._report = dataclasses.replace(self._base_report(newest), reason=tried)
+            return None, None
         elapsed = self._clock() - began
-        merged = window.merge(self.scene, selection, result, self.config.tracks, self.config.solver.backend)
-        figures = quality.figures(selection, result, merged.norms)
-        report = dataclasses.replace(self._base_report(newest), **figures, solve_time_s=elapsed)
-        return report, merged.state
+        selection, (norms, state) = tried.selection, tried.found
+        if tried.held:
+            self._hold(tried.held)
+            state = None
+        elif state is not None:
+            norms = window.put(self.scene, selection, state, self.config.tracks, self.config.solver.backend)
+            self.scene.keyframes.refined[list(tried.without)] = False
+        figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
+        if tried.held:
+            figures |= {"status": Status.HELD, "reason": tried.held}
+        self._report = dataclasses.replace(self._base_report(newest), **figures, solve_time_s=elapsed)
+        return selection, state
+
+    def _hold(self, reason: str) -> None:
+        """Say that a solution is held; give up what was taken of a young map if many are."""
+        text = f"a solution was held, the front-end's poses stand: {reason}"
+        if self._trust.lost and self._young():
+            self.scene.forget_solutions()
+            self._correction = MapCorrection()
+            text = f"solutions are held, and what was taken before is given up: {reason}"
+        self.scene.log.warn("held", text)
+
+    def _young(self) -> bool:
+        """Return True while no more was refined than two windows hold."""
+        return int(np.count_nonzero(self.scene.keyframes.refined)) <= 2 * self.config.window.max_keyframes
 
     def _correct(self, row: int) -> None:
         """Let the correction map -> odom follow what was found at a keyframe, and tell its size in the report."""
@@ -477,3 +500,4 @@ class Backend:
         self._delivered.clear()
         self._report = SolveReport(reason=_UNSOLVED)
         self._correction = MapCorrection()
+        self._trust = Trust()

@@ -227,6 +227,66 @@ class SolverConfig:
 
 
 @dataclass(frozen=True)
+class GuardConfig:
+    """When a solution is held back, so that the front-end's poses stand. See docs/concepts.md."""
+
+    enabled: bool = _param(
+        True, "Hold solutions back that are not determined, not plausible, or no better than the input."
+    )
+    step_sigma_m: float = _param(
+        0.03,
+        "What the front-end's step between two keyframes is off at least: standard deviation along each axis.",
+        unit="m",
+        minimum=1e-6,
+        maximum=1e6,
+    )
+    step_sigma_share: float = _param(
+        0.1, "The same, as a share of the length of the step, on top of it.", minimum=1e-6, maximum=10.0
+    )
+    turn_sigma_rad: float = _param(
+        0.02, "The same for its turn, about each axis.", unit="rad", minimum=1e-6, maximum=1.0
+    )
+    turn_sigma_share: float = _param(0.1, "The same, as a share of the turn, on top of it.", minimum=1e-6, maximum=10.0)
+    turn_sigma_rad_per_m: float = _param(
+        0.02, "The same, for each metre of the step, on top of it.", unit="rad/m", minimum=0.0, maximum=10.0
+    )
+    max_sigmas: float = _param(
+        5.0,
+        "A step of a solution that is this many sigmas off the front-end's, and not borne out by tracks, is held.",
+        minimum=0.5,
+        maximum=1e6,
+    )
+    max_typical_sigmas: float = _param(
+        2.5, "A solution of which half the steps are this many sigmas off is held.", minimum=0.5, maximum=1e6
+    )
+    max_scale_error: float = _param(
+        0.12,
+        "A solution whose steps or turns are all longer or shorter than the front-end's by this share is held.",
+        minimum=1e-3,
+        maximum=1e6,
+    )
+    min_inlier_share: float = _param(
+        0.4,
+        "A solution that fewer of its observations agree with (within tracks.outlier_px) is held.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    min_points: int = _param(5, "A keyframe that sees fewer points of a solve is not refined.", minimum=2, maximum=1000)
+    held_out_tracks: int = _param(
+        24,
+        "Tracks that a solution is tried on and that take no part in it, at most one in 16; 0: none, no trial.",
+        minimum=0,
+        maximum=10_000,
+    )
+    max_worse_share: float = _param(
+        0.15,
+        "A solution that explains these tracks worse than the front-end's poses by this share is held.",
+        minimum=0.0,
+        maximum=10.0,
+    )
+
+
+@dataclass(frozen=True)
 class FramesConfig:
     """Names of frames, and how the correction map -> odom moves. See docs/frames.md."""
 
@@ -388,6 +448,7 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
+    guard: GuardConfig = field(default_factory=GuardConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     node: NodeConfig = field(default_factory=NodeConfig)

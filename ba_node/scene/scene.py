@@ -185,6 +185,14 @@ class Scene:
         moved = geometry.compose(rotation, translation, table.input_rotation[rows], table.input_position[rows])
         table.rotation[rows], table.position[rows] = moved
 
+    def forget_solutions(self) -> None:
+        """Put keyframes back to where the front-end has them; forget where points are and which views are outliers."""
+        table = self.keyframes
+        table.rotation[:], table.position[:] = table.input_rotation, table.input_position
+        table.refined[:] = False
+        self.landmarks.has_position[:] = False
+        self.sightings.outlier[:] = False
+
     def corrections(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the transform from the front-end's fixed frame to the refined map, as it is at some keyframes."""
         table = self.keyframes

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ba_node.core import geometry, native_kernels
+from ba_node.core import geometry, native_kernels, triangulation
 from ba_node.window import gauge
 from ba_node.window.initial_points import agreed_points, widened
-from ba_node.window.problems import part_of
+from ba_node.window.problems import part_of, some_observations
 
 if TYPE_CHECKING:
     from ba_node.config import TracksConfig
@@ -37,10 +37,38 @@ class Merged(NamedTuple):
 
 def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
     """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
+    found = outcome(scene, selection, result, backend)
+    if found.state is None:
+        return found
+    return Merged(put(scene, selection, found.state, tracks, backend), found.state)
+
+
+def outcome(scene: Scene, selection: Selection, result: Result, backend: str = "auto") -> Merged:
+    """Return what came of a result, in the scale of the map; the scene stays as it is."""
     state = result.state
     if not result.status.usable or not state.is_finite():
         return Merged(selection.norms, None)
     state = scaled(selection, scene.keyframes.input_position[selection.keyframes], state)
+    if selection.held_out.any():
+        state = _with_held_out(selection, state, backend)
+    return Merged(native_kernels.residual_norms(selection.whole, state, backend), state)
+
+
+def _with_held_out(selection: Selection, state: State, backend: str) -> State:
+    """Place the points that took no part by their rays, where these give a place."""
+    rows = np.flatnonzero(selection.held_out.take(selection.sightings.point))
+    problem = dataclasses.replace(some_observations(selection.whole, rows), start=state)
+    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points, backend)
+    placed = selection.held_out & ~np.isnan(found.points[:, 0])
+    return dataclasses.replace(state, points=np.where(placed[:, None], found.points, state.points))
+
+
+def put(scene: Scene, selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> FloatArray:
+    """Put a solution, in the scale of the map, into the scene and judge its observations anew.
+
+    Returns:
+        (n_all,) sizes of the residuals, as ``Selection.norms``.
+    """
     free = ~selection.problem.fixed
     rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
     rows = selection.keyframes[free]
@@ -51,7 +79,7 @@ def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConf
     scene.landmarks.has_position[selection.landmarks] = True
     norms = judge(scene, selection, state, tracks, backend)
     _displace(scene, selection.lost)
-    return Merged(norms, state)
+    return norms
 
 
 def scaled(selection: Selection, measured: FloatArray, state: State) -> State:

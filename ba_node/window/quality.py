@@ -66,7 +66,8 @@ def figures(selection: Selection, result: Result, norms: FloatArray) -> dict[str
         "fixed_keyframes": int(np.count_nonzero(problem.fixed)),
         "landmarks": problem.n_points,
         "observations": len(problem.observations),
-        "outliers": len(selection.rows) - len(problem.observations),
+        "held_keyframes": len(selection.window) - int(np.count_nonzero(np.isin(selection.window, selection.keyframes))),
+        "outliers": int(np.count_nonzero(~selection.believed & ~selection.held_out[selection.sightings.point])),
     }
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.core import native_kernels
-from ba_node.window import gauge
+from ba_node.window import arrival, gauge, trial
 from ba_node.window.initial_points import SPREAD, initial_points, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
 
@@ -59,6 +59,8 @@ class Selection:
         lost: rows of landmarks that have a position which their views contradict; they sit this solve out.
         origin: (3,) of the problem in the map, m.
         unscaled: see ``gauge.Gauge``.
+        tried: points whose tracks a solution is tried on, see ``trial.py``.
+        held_out: (n_pt,) those of them that are not in the problem, but for their start.
     """
 
     problem: Problem
@@ -72,6 +74,13 @@ class Selection:
     lost: IntArray
     origin: FloatArray
     unscaled: IntArray
+    tried: IntArray
+    held_out: BoolArray
+
+    @property
+    def whole(self) -> Problem:
+        """Return the problem with all observations, those that are left out too."""
+        return dataclasses.replace(self.problem, observations=self.sightings)
 
 
 @dataclass(frozen=True)
@@ -95,40 +104,57 @@ def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
     return scene.order[:end][-config.window.max_keyframes :]
 
 
-def select(scene: Scene, config: Config, end: int | None = None) -> Selection | str:
-    """Return the problem of the newest window among the first ``end`` keyframes, or why there is none."""
+def select(scene: Scene, config: Config, end: int | None = None, without: tuple[int, ...] = ()) -> Selection | str:
+    """Return the problem of the newest window among the first ``end`` keyframes, or why there is none.
+
+    Args:
+        scene: what is known.
+        config: all parameters.
+        end: keyframes to look at.
+        without: rows of keyframes that are to sit it out.
+    """
     window = rows_of(scene, config, end)
     reason = _nothing(scene, window)
     if reason:
         return reason
     scene.settle_poses()
-    part = _reach(scene, window, config)
+    lost_keyframes = arrival.place(scene, config, window) if config.guard.enabled else window[:0]
+    part = _reach(scene, window, config, np.concatenate([lost_keyframes, np.array(without, np.intp)]))
     part = dataclasses.replace(part, problem=_placed(scene, part, config))
     start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
     norms = native_kernels.residual_norms(part.problem, start, config.solver.backend)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
-    kept, keyframes, points = _determined(part.problem, usable, config.window.max_landmarks)
+    least = config.guard.min_points if config.guard.enabled else 2
+    kept, keyframes, points = _determined(part.problem, usable, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     is_new = np.zeros(len(scene.keyframes), bool)
     is_new[window] = True
     is_old = ~is_new[part.keyframes]
     if is_old.all():
         return "no keyframe of the window sees enough points that a second image sees"
-    active = some_observations(part.problem, np.flatnonzero(usable))
+    obs = part.problem.observations
+    track_id = scene.landmarks.track_id[part.landmarks]
+    tried, aside = trial.choose(track_id, obs.point[usable], config.guard.held_out_tracks)
+    held_out = np.zeros(len(part.landmarks), bool)
+    held_out[aside] = True
+    believed = usable & ~held_out.take(obs.point)
+    active = some_observations(part.problem, np.flatnonzero(believed))
     held = gauge.choose(active, is_old)
     return Selection(
         dataclasses.replace(active, fixed=held.fixed),
-        part.problem.observations,
+        obs,
         norms,
         part.rows,
-        usable,
+        believed,
         part.keyframes,
         part.landmarks,
         window,
         lost,
         part.origin,
         held.unscaled,
+        tried,
+        held_out,
     )
 
 
@@ -144,10 +170,14 @@ def _nothing(scene: Scene, window: IntArray) -> str:
     return ""
 
 
-def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
-    """Return all observations of the window's landmarks by the window and the older keyframes that share most."""
+def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) -> _Part:
+    """Return all observations of the window's landmarks by the window and the older keyframes that share most.
+
+    Keyframes of ``without`` take no part, nor do landmarks that they alone see.
+    """
     table = scene.sightings
-    ranges = [np.arange(b.begin, b.end) for row in window for b in scene.blocks[row]]
+    taking_part = window[~np.isin(window, without)] if len(without) else window
+    ranges = [np.arange(b.begin, b.end) for row in taking_part for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
     landmarks = _distinct(table.landmark[own], len(scene.landmarks))
     rows = scene.views_of(landmarks, _views_needed(scene, window))
@@ -160,7 +190,8 @@ def _reach(scene: Scene, window: IntArray, config: Config) -> _Part:
     # would only hold the others to the front-end's drift.
     older = scene.order[: int(np.argmax(in_window[scene.order]))][::-1]
     older = older[(shared[older] > 0) & scene.keyframes.refined[older]]
-    in_part = in_window
+    in_part = np.zeros(n, bool)
+    in_part[taking_part] = True
     in_part[older[np.argsort(-shared[older], kind="stable")[: config.window.max_fixed_keyframes]]] = True
     rows = rows[in_part.take(keyframe)]
     keyframes = scene.order[in_part[scene.order]]
@@ -274,15 +305,21 @@ def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     return part.landmarks[scene.landmarks.has_position[part.landmarks] & (before >= 2) & (after < 2)]
 
 
-def _determined(problem: Problem, usable: BoolArray, max_landmarks: int) -> tuple[IntArray, BoolArray, BoolArray]:
+def _determined(
+    problem: Problem, usable: BoolArray, max_landmarks: int, min_points: int
+) -> tuple[IntArray, BoolArray, BoolArray]:
     """Return which observations, keyframes and points are left without all that does not determine anything."""
     obs, n_kf, n_pt = problem.observations, problem.n_keyframes, problem.n_points
     keep_pt = ~np.isnan(problem.start.points[:, 0])
     if np.count_nonzero(keep_pt) > max_landmarks:
         keep_pt = _most_seen(keep_pt, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
+    # Views of a point by several cameras of a keyframe are neighbours, and count once.
+    first = np.ones(len(obs), bool)
+    first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
     while True:
         used = usable & keep_pt.take(obs.point)
         keep_kf = np.bincount(obs.keyframe, used, n_kf) >= MIN_OBSERVATIONS
+        keep_kf &= np.bincount(obs.keyframe[used & first], minlength=n_kf) >= min_points
         used &= keep_kf.take(obs.keyframe)
         determined = np.bincount(obs.point, used, n_pt) >= 2
         if len(obs.depth_m):

@@ -25,7 +25,9 @@ QUIET: dict[str, Any] = {
 
 
 def config(**changes: Any) -> Config:
-    return Config().with_values({name.replace("__", "."): value for name, value in changes.items()})
+    """Return parameters; no track is held out of a solve, so that all that is selected is solved."""
+    values = {name.replace("__", "."): value for name, value in changes.items()}
+    return Config().with_values({"guard.held_out_tracks": 0, **values})
 
 
 def scene_of(settings: Config, offset: float = 0.0, **options: Any) -> Scene:

@@ -1,0 +1,140 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where does a new keyframe begin whose front-end's pose its tracks contradict?
+
+A keyframe that was not refined yet stands where the front-end's step from the one before puts it. If the points that
+are known already lie nowhere near where it sees them, the front-end has jumped or the tracks are wrong. Then its pose
+is sought from other starts: where the keyframes before it are, where they were heading, and where the correction of
+each of them puts it. From each the robust error is lowered with the points held, the loss narrowing from coarse to
+fine; the pose that most views agree with is where it begins. If half of them agree with none, it sits the solve out.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry, native_kernels
+from ba_node.core.objective import Objective, Rules
+from ba_node.core.problem import Problem, State
+from ba_node.window.problems import problem_of
+
+if TYPE_CHECKING:
+    from ba_node.config import Config
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import FloatArray, IntArray
+
+# Fewer known points than this place no keyframe.
+_MIN_POINTS = 10
+# An error of the front-end's turn (rad) beyond which it is not left to the solve to mend.
+_FAR_RAD = 0.2
+# Views agree within this many outlier gates: the newest points are not placed well yet.
+_WIDE = 5.0
+_AGREEING = 0.5
+# Widths of the loss, sigmas, and steps with each.
+_WIDTHS = (200.0, 60.0, 20.0, 6.0, 3.0)
+_ROUNDS = 3
+# So many keyframes before it are asked where it might be, and so many of the answers are tried.
+_ASKED = 3
+_TRIED = 3
+# Only these newest keyframes are sought: what was not found then is not found later.
+_SOUGHT = 2
+
+
+def place(scene: Scene, config: Config, window: IntArray) -> IntArray:
+    """Move keyframes that begin in the wrong place; return the rows of those whose place is not found.
+
+    Args:
+        scene: poses of keyframes that were not refined are changed, until they are settled anew.
+        config: the outlier gate.
+        window: rows of keyframes, oldest first.
+    """
+    new = window[~scene.keyframes.refined[window]]
+    if config.tracks.outlier_px <= 0 or len(new) == len(scene.keyframes):
+        return new[:0]
+    newest = window[-_SOUGHT:]
+    lost = [row for row in new if not _found(scene, config, int(row), bool((newest == row).any()))]
+    return np.array(lost, np.intp)
+
+
+def _found(scene: Scene, config: Config, row: int, sought: bool) -> bool:
+    """Return whether a keyframe begins where its tracks can bring it in; move it if it is ``sought`` and found."""
+    problem = _views(scene, config, row)
+    if problem is None or _near(problem, problem.start, config) >= _AGREEING * len(problem.observations):
+        return True
+    best, most = problem.start, 0
+    starts = [
+        State(rotation[None], translation[None], problem.start.points, problem.start.intrinsics)
+        for rotation, translation in (_starts(scene, row) if sought else [])
+    ]
+    starts.sort(key=lambda start: -_near(problem, start, config))
+    for start in starts[:_TRIED]:
+        state = _lowered(problem, start)
+        norms = native_kernels.residual_norms(problem, state, config.solver.backend)
+        agreeing = int(np.count_nonzero(norms <= _WIDE * config.tracks.outlier_px))
+        if agreeing > most:
+            best, most = state, agreeing
+    if most < max(_MIN_POINTS, _AGREEING * len(problem.observations)):
+        return False
+    rotation, position = geometry.inverse(best.rotation[0], best.translation[0])
+    scene.keyframes.rotation[row] = geometry.nearest_rotation(rotation)
+    scene.keyframes.position[row] = position + scene.keyframes.position[scene.order[0]]
+    return True
+
+
+def _views(scene: Scene, config: Config, row: int) -> Problem | None:
+    """Return the views of known points by a keyframe, at the points as they are; None if there are too few."""
+    table, points = scene.sightings, scene.landmarks
+    rows = np.concatenate([np.arange(b.begin, b.end) for b in scene.blocks[row]] or [np.empty(0, np.intp)])
+    rows = rows[points.has_position[table.landmark[rows]] & ~table.outlier[rows]]
+    landmarks = np.unique(table.landmark[rows]).astype(np.intp)
+    if len(landmarks) < _MIN_POINTS:
+        return None
+    origin = scene.keyframes.position[scene.order[0]]
+    return problem_of(scene, rows, np.array([row]), landmarks, origin, points.position[landmarks] - origin, config)
+
+
+def _near(problem: Problem, state: State, config: Config) -> int:
+    """Return how many points are near enough to their views for the solve to mend the pose."""
+    norms = native_kernels.residual_norms(problem, state, config.solver.backend)
+    focal = float(np.median(problem.cameras.params[:, :2]))
+    limit = _FAR_RAD * focal / float(np.median(problem.observations.sigma_px))
+    return int(np.count_nonzero(norms <= limit))
+
+
+def _starts(scene: Scene, row: int) -> list[tuple[FloatArray, FloatArray]]:
+    """Return poses (body from world, in the problem) to begin with: where others are or would put the keyframe."""
+    table, order = scene.keyframes, scene.order
+    origin = table.position[order[0]]
+    at = int(scene.places()[row])
+    before = order[:at][::-1][:_ASKED]
+    poses = [(table.rotation[k], table.position[k]) for k in (row, *before)]
+    if len(before) > 1:
+        step = geometry.compose(*geometry.inverse(*poses[2]), *poses[1])
+        poses.append(geometry.compose(*poses[1], *step))
+    given = (table.input_rotation[row], table.input_position[row])
+    poses += [geometry.compose(*scene.corrections(np.array(k)), *given) for k in before]
+    return [geometry.inverse(rotation, position - origin) for rotation, position in poses]
+
+
+def _lowered(problem: Problem, state: State) -> State:
+    """Return the pose after steps of a robust loss that narrows; points are held."""
+    with np.errstate(all="ignore"):
+        for width in _WIDTHS:
+            measure = Objective(problem, Rules(loss="geman_mcclure", loss_scale=width, cheirality="constant"))
+            value, mu = measure.value(state), 1e-4
+            for _ in range(_ROUNDS):
+                at = measure.linearise(state)
+                rows, residual = at.d_keyframe.reshape(-1, 6), at.residual.reshape(-1)
+                normal = rows.T @ rows
+                normal[np.diag_indices(6)] *= 1.0 + mu
+                normal[np.diag_indices(6)] += 1e-9
+                step = np.linalg.lstsq(normal, -(rows.T @ residual), rcond=None)[0]
+                moved = measure.retract(state, np.asarray(step[None], float), np.zeros_like(state.points))
+                after = measure.value(moved)
+                if np.isfinite(after) and after < value:
+                    state, value, mu = moved, after, mu / 5.0
+                else:
+                    mu *= 25.0
+    return state

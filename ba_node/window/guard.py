@@ -1,0 +1,318 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""May a solution be taken? It must be determined, plausible, and better than what came in.
+
+- **Determined**: most observations agree with it within the nominal gate. Keyframes that see too few points were left
+  out of the solve by the selection.
+- **Plausible**: its steps from keyframe to keyframe are near the front-end's, by what those are worth (``guard.*``).
+  A step further off is taken where it is what the solve began with (an earlier solve found it, or the tracks did, see
+  ``arrival.py``), or where several solves agree on it and the tracks that span it bear it out: so a loop may close.
+  Where half the steps are off, or all are too long or turn too far by one factor, no track helps: the cameras or the
+  depths are not what they are said to be, and fit each other all the same.
+- **Better**: it explains some tracks, most of which took no part, no worse than the front-end's poses do, for all
+  cameras together and for each alone (``trial.py``).
+
+Nothing here changes the scene. What is held leaves it as it was but for the count of solves; keyframes that were never
+taken follow the front-end by the correction of the last one that was (``Scene.settle_poses``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.window import steps
+from ba_node.window.trial import MIN_PARALLAX, Trial
+from ba_node.window.trust import Odd, Trust, agree
+
+if TYPE_CHECKING:
+    from ba_node.config import Config
+    from ba_node.core.problem import Problem, State
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
+    from ba_node.window.selection import Selection
+
+# A common factor, or half the steps being off, is not judged from fewer steps.
+_MIN_STEPS = 4
+# Measured depths that are looked at.
+_DEPTHS = 256
+# A step is borne out by so many points that are seen on both sides of it, and this share of them at least.
+_MIN_SPANNING = 10
+_SPANNING_SHARE = 0.5
+# A point that so many keyframes agree on ties them together.
+_TIED = 3
+# If more of the keyframes would have to be held one by one, it is the solution that is wrong.
+_MAX_HELD_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Health:
+    """Figures of a solve for the report; see ``ba_msgs/SolverReport``."""
+
+    inlier_share: float = 0.0
+    parallax_deg: float = 0.0
+    held_out_px_before: float = 0.0
+    held_out_px_after: float = 0.0
+    weakest_m: float = 0.0
+    weakest_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is to become of a solution.
+
+    Attributes:
+        reason: why it is held, in words; empty if it may be taken.
+        health: figures for the report.
+        keyframes: rows in the scene of keyframes that alone are wrong: without them it may be worth another solve.
+        odd: steps that need another solve to agree.
+        systematic: a window that is wrong as a whole, not a part of it.
+    """
+
+    reason: str = ""
+    health: Health = field(default_factory=Health)
+    keyframes: tuple[int, ...] = ()
+    odd: Odd | None = None
+    systematic: bool = False
+
+
+def judge(
+    scene: Scene, config: Config, selection: Selection, state: State, norms: FloatArray, trust: Trust | None = None
+) -> Verdict:
+    """Return whether a solution may be taken.
+
+    Args:
+        scene: into which it would go; not changed.
+        config: all parameters.
+        selection: what was solved.
+        state: the solution, in the scale of the map.
+        norms: (n_all,) sizes of the residuals after it, as ``Selection.norms``.
+        trust: what the solves before are worth.
+    """
+    trust = trust or Trust()
+    config = replace(config, guard=trust.bounds(config.guard))
+    gate = config.tracks.outlier_px or np.inf
+    share = float(np.count_nonzero(norms <= gate)) / max(len(norms), 1)
+    table, rows = scene.keyframes, selection.keyframes
+    measured = geometry.inverse(table.input_rotation[rows], table.input_position[rows] - selection.origin)
+    health, unexplained = _tried(config, selection, state, measured)
+    health = replace(health, inlier_share=share)
+    if not config.guard.enabled:
+        return Verdict(health=health)
+    found = _Found.of(scene, config, selection, state, measured, norms)
+    reason = _misfit(selection, state, share, config) or found.systematic()
+    if reason or unexplained:
+        return Verdict(reason or unexplained, health, systematic=True)
+    return found.verdict(health, trust.confirmed(config.frames.gate_confirmations))
+
+
+def _misfit(selection: Selection, state: State, share: float, config: Config) -> str:
+    """Return in words whether fewer observations agree with a solution, or fewer measured depths, than have to."""
+    least, gate = config.guard.min_inlier_share, config.tracks.outlier_px or np.inf
+    if share < least:
+        return (
+            f"only {100 * share:.0f} % of the observations agree with it within {gate:g} sigmas: cameras, their places"
+            " on the body, or track ids are not what they are said to be"
+        )
+    off = _depth_errors(selection.whole, state)
+    share = float(np.count_nonzero(off <= gate)) / max(len(off), 1)
+    if len(off) and share < least:
+        return (
+            f"only {100 * share:.0f} % of the measured depths agree with it within {gate:g} sigmas: they are not in"
+            " metres, not along the optical axis, or not as precise as tracks.depth_sigma_ratio says"
+        )
+    return ""
+
+
+def _depth_errors(problem: Problem, state: State) -> FloatArray:
+    """Return how far some of the measured depths are off a solution, sigmas."""
+    obs, cams = problem.observations, problem.cameras
+    if not len(obs.depth_m):
+        return np.empty(0)
+    rows = np.flatnonzero(np.isfinite(obs.depth_m))
+    rows = rows[:: 1 + len(rows) // _DEPTHS]
+    camera, keyframe = obs.camera[rows], obs.keyframe[rows]
+    body = (state.rotation[keyframe] @ state.points[obs.point[rows]][:, :, None])[..., 0] + state.translation[keyframe]
+    depth = np.sum(cams.rotation[camera, 2] * body, axis=1) + cams.translation[camera, 2]
+    return np.asarray(np.abs(depth - obs.depth_m[rows]) / obs.depth_sigma_m[rows])
+
+
+def _tried(
+    config: Config, selection: Selection, state: State, measured: tuple[FloatArray, FloatArray]
+) -> tuple[Health, str]:
+    """Return the health, and in words whether the tried tracks are explained worse than by the front-end's poses."""
+    whole = selection.whole
+    trial = Trial(whole, selection.tried, int(np.count_nonzero(selection.held_out)), config.solver.backend)
+    found = trial.explained(measured, (state.rotation, state.translation))
+    sigma = float(np.median(selection.sightings.sigma_px)) if len(selection.sightings) else 1.0
+    health = Health(
+        parallax_deg=float(np.degrees(found.parallax_rad)),
+        held_out_px_before=found.held_out[0] * sigma,
+        held_out_px_after=found.held_out[1] * sigma,
+    )
+    noise = sigma / float(np.median(whole.cameras.params[:, :2]))
+    if not len(whole.observations.depth_m) and found.parallax_rad < MIN_PARALLAX * noise:
+        return health, (
+            f"the rays to its points meet at {health.parallax_deg:.3f} deg, with a noise of {np.degrees(noise):.3f}"
+            " deg: that does not tell how far away they are, nor how far the keyframes are apart"
+        )
+    bad = found.worse(config.guard.max_worse_share)
+    if not len(bad):
+        return health, ""
+    k = int(bad[0])
+    figures = f"mean residual {found.mean[0, k]:.2f} -> {found.mean[1, k]:.2f} sigmas"
+    if k == 0:
+        return health, f"it explains the tracks that it was tried on worse than the poses that came in ({figures})"
+    text = f"camera {k - 1} alone is explained worse than by the poses that came in ({figures}): the cameras do not sit"
+    return health, f"{text} on the body as the rig says, or their calibration is wrong"
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The steps of a solution, those of the front-end, and those that the solve began with."""
+
+    selection: Selection
+    norms: FloatArray
+    config: Config
+    keyframe_id: IdArray
+    first: IntArray
+    second: IntArray
+    solved: steps.Steps
+    measured: steps.Steps
+    began: steps.Steps
+    off: steps.Comparison
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        config: Config,
+        selection: Selection,
+        state: State,
+        measured: tuple[FloatArray, FloatArray],
+        norms: FloatArray,
+    ) -> _Found:
+        place = scene.places()[selection.keyframes]
+        fixed = selection.problem.fixed
+        # Keyframes of the problem are oldest first; those between which others are left out make one step too.
+        adjacent = np.diff(place) <= 1 + len(selection.window)
+        first = np.flatnonzero(adjacent & ~(fixed[1:] & fixed[:-1]))
+        second = first + 1
+        solved = steps.between(state.rotation, state.translation, first, second)
+        front_end = steps.between(*measured, first, second)
+        start = selection.problem.start
+        began = steps.between(start.rotation, start.translation, first, second)
+        off = steps.compare(solved, front_end, config.guard)
+        ids = scene.keyframes.keyframe_id[selection.keyframes]
+        return cls(selection, norms, config, ids, first, second, solved, front_end, began, off)
+
+    def systematic(self) -> str:
+        """Return what is wrong with the steps as a whole, in words."""
+        if len(self.first) < _MIN_STEPS:
+            return ""
+        guard, limit = self.config.guard, np.log1p(self.config.guard.max_scale_error)
+        scale = steps.scale_error(self.solved, self.measured, self.off)
+        if abs(np.log(scale)) > limit:
+            text = f"its steps are {scale:.3g} times as long as the front-end's"
+            problem = self.selection.problem
+            if len(problem.cameras.model) == 1 and not len(problem.observations.depth_m):
+                return f"{text}: one camera does not see the scale, and here it has drifted away"
+            return f"{text}: the scale of depths, baseline or focal length is not that of the front-end"
+        turn = steps.turn_error(self.solved, self.measured, self.off)
+        if abs(np.log(turn)) > limit:
+            return f"it turns {turn:.3g} times as far as the front-end: the focal length is not the true one"
+        # The lower of two in the middle: of four steps two may lead to one keyframe that is far off.
+        typical = float(np.sort(self.off.sigmas)[(len(self.first) - 1) // 2])
+        if typical > guard.max_typical_sigmas:
+            move, angle = float(np.median(self.off.move_m)), float(np.degrees(np.median(self.off.turn_rad)))
+            return (
+                f"half its steps are more than {move:.2g} m or {angle:.2g} deg ({typical:.1f} sigmas) off the"
+                " front-end's: cameras, their places on the body, or the poses are not what they are said to be"
+            )
+        return ""
+
+    def verdict(self, health: Health, confirmed: Odd | None) -> Verdict:
+        """Return what is to become of a solution that is right as a whole."""
+        limit = self.config.guard.max_sigmas
+        odd = self.off.sigmas > limit
+        if not odd.any():
+            return Verdict(health=health)
+        known = steps.compare(self.solved, self.began, self.config.guard).sigmas <= limit
+        if confirmed is not None:
+            known |= agree(self._odd(odd), confirmed, self.config, self._keys(np.arange(len(odd))))
+        spanned = np.zeros(len(odd), bool)
+        spanned[odd] = [self._borne_out(int(k)) for k in np.flatnonzero(odd)]
+        odd &= ~(known & spanned)
+        if not odd.any():
+            return Verdict(health=health)
+        worst = int(np.argmax(np.where(odd, self.off.sigmas, 0.0)))
+        text = (
+            f"its step to keyframe {self.keyframe_id[self.second[worst]]} is {self.off.move_m[worst]:.3g} m and"
+            f" {np.degrees(self.off.turn_rad[worst]):.3g} deg ({self.off.sigmas[worst]:.0f} sigmas) off the front-end's"
+        )
+        if spanned[odd].all():
+            return Verdict(f"{text}; it waits for more solves that agree", health, odd=self._odd(odd))
+        rows = self._to_blame(odd & ~spanned)
+        return Verdict(f"{text}, and no tracks bear it out", health, rows, systematic=not rows)
+
+    def _keys(self, which: IntArray) -> list[tuple[int, int]]:
+        rows = self.selection.keyframes
+        return [(int(rows[self.first[k]]), int(rows[self.second[k]])) for k in which]
+
+    def _odd(self, odd: BoolArray) -> Odd:
+        return Odd(tuple(self._keys(np.flatnonzero(odd))), steps.Steps(self.solved.turn[odd], self.solved.move[odd]))
+
+    def _borne_out(self, k: int) -> bool:
+        """Return True if at both ends of a step most points that are seen across it agree, and there are enough."""
+        point, keyframe, agrees = self._views
+        n = self.selection.problem.n_points
+        before = keyframe <= self.first[k]
+        across = _both(point[before], point[~before], n) & (np.bincount(point, minlength=n) >= _TIED)
+        good = _both(point[before & agrees], point[~before & agrees], n)
+        good &= np.bincount(point[agrees], minlength=n) >= _TIED
+        for end in (self.first[k], self.second[k]):
+            own = keyframe == end
+            agreeing = np.count_nonzero(good[point[own & agrees]])
+            if agreeing < max(_MIN_SPANNING, _SPANNING_SHARE * np.count_nonzero(across[point[own]])):
+                return False
+        return True
+
+    def _to_blame(self, odd: BoolArray) -> tuple[int, ...]:
+        """Return the keyframes (rows in the scene) without which no step is odd; none if they are too many."""
+        n, free = self.selection.problem.n_keyframes, ~self.selection.problem.fixed
+        steps_at, odd_at = np.zeros(n, int), np.zeros(n, int)
+        for end in (self.first, self.second):
+            np.add.at(steps_at, end, 1)
+            np.add.at(odd_at, end, odd)
+        # Both steps are odd, or the only one of the last keyframe is; else the end that fewer views tie to the others.
+        blamed = (odd_at > 0) & (odd_at == steps_at) & free
+        ties = np.where(free, self._ties(), np.iinfo(int).max)
+        for k in np.flatnonzero(odd & ~blamed[self.first] & ~blamed[self.second]):
+            first, second = int(self.first[k]), int(self.second[k])
+            blamed[first if ties[first] < ties[second] else second] = True
+        if np.count_nonzero(blamed) > max(1, _MAX_HELD_SHARE * n):
+            return ()
+        return tuple(int(row) for row in self.selection.keyframes[blamed])
+
+    def _ties(self) -> IntArray:
+        """Return for each keyframe the views that agree, of points on which three keyframes agree."""
+        point, keyframe = (column[self._views[2]] for column in self._views[:2])
+        tied = np.bincount(point, minlength=self.selection.problem.n_points)[point] >= _TIED
+        return np.bincount(keyframe[tied], minlength=self.selection.problem.n_keyframes)
+
+    @cached_property
+    def _views(self) -> tuple[IntArray, IntArray, BoolArray]:
+        """Return point, keyframe, and whether all cameras agree, of each pair of point and keyframe."""
+        obs, n = self.selection.sightings, self.selection.problem.n_keyframes
+        pairs, of = np.unique(obs.point * n + obs.keyframe, return_inverse=True)
+        wrong = np.bincount(of, self.norms > (self.config.tracks.outlier_px or np.inf), len(pairs))
+        return *np.divmod(pairs, n), wrong == 0
+
+
+def _both(some: IntArray, others: IntArray, n: int) -> BoolArray:
+    """Return which of n numbers are in both lists."""
+    return np.asarray((np.bincount(some, minlength=n) > 0) & (np.bincount(others, minlength=n) > 0))

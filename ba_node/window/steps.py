@@ -1,0 +1,128 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the steps from keyframe to keyframe of a solution with those of the front-end.
+
+A step is the pose of a keyframe in the body of the one before, which does not depend on where either map lies. What the
+front-end's step is worth is a standard deviation for its length and one for its turn (``guard.step_*``, ``turn_*``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry
+
+if TYPE_CHECKING:
+    from ba_node.config import GuardConfig
+    from ba_node.scene.tables import FloatArray, IntArray
+
+# Steps shorter, and turns smaller, than this many sigmas of the front-end say nothing of its scale.
+_TELLING = 3.0
+# One standard deviation of a normal distribution, in median absolute deviations; and of the median of n of its samples.
+_SPREAD = 1.4826
+_MEDIAN = 1.2533
+# Fewer steps than this show no common factor.
+_FEW = 5
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps between keyframes: (n, 3, 3) turns and (n, 3) moves in the body of the first, m."""
+
+    turn: FloatArray
+    move: FloatArray
+
+    @property
+    def length(self) -> FloatArray:
+        """Return the length of each, m."""
+        return np.asarray(np.sqrt(np.sum(self.move**2, axis=1)))
+
+
+def between(rotation: FloatArray, translation: FloatArray, first: IntArray, second: IntArray) -> Steps:
+    """Return the steps from some keyframes to others.
+
+    Args:
+        rotation: (n_kf, 3, 3) body from world.
+        translation: (n_kf, 3) body from world, m.
+        first: (n,) keyframes that steps begin at.
+        second: (n,) keyframes that they lead to.
+    """
+    turn = rotation[first] @ np.swapaxes(rotation[second], 1, 2)
+    return Steps(turn, translation[first] - (turn @ translation[second][:, :, None])[..., 0])
+
+
+def angle_of(turn: FloatArray) -> FloatArray:
+    """Return the angle of rotations, (n,) rad."""
+    off = np.sqrt(np.sum((turn - np.eye(3)) ** 2, axis=(1, 2)))
+    return np.asarray(2.0 * np.arcsin(np.minimum(off / np.sqrt(8.0), 1.0)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How far steps are off those of the front-end.
+
+    Attributes:
+        sigmas: (n,) the larger of the error of the move and of the turn, each by its standard deviation.
+        move_m: (n,) error of the move.
+        turn_rad: (n,) error of the turn.
+        sigma_m: (n,) what the front-end's move is worth.
+        sigma_rad: (n,) what its turn is worth.
+    """
+
+    sigmas: FloatArray
+    move_m: FloatArray
+    turn_rad: FloatArray
+    sigma_m: FloatArray
+    sigma_rad: FloatArray
+
+
+def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
+    """Return how far steps are off measured ones."""
+    length, turned = measured.length, angle_of(measured.turn)
+    sigma_m = config.step_sigma_m + config.step_sigma_share * length
+    sigma_rad = config.turn_sigma_rad + config.turn_sigma_share * turned + config.turn_sigma_rad_per_m * length
+    move = np.sqrt(np.sum((steps.move - measured.move) ** 2, axis=1))
+    turn = angle_of(np.swapaxes(measured.turn, 1, 2) @ steps.turn)
+    return Comparison(np.maximum(move / sigma_m, turn / sigma_rad), move, turn, sigma_m, sigma_rad)
+
+
+def scale_error(steps: Steps, measured: Steps, found: Comparison) -> float:
+    """Return by what factor all steps are longer than the front-end's; 1 where that cannot be told from its errors."""
+    return _common(steps.move, measured.move, found.sigma_m)
+
+
+def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
+    """Return by what factor all turns are larger than the front-end's; 1 where that cannot be told from its errors."""
+    telling = angle_of(measured.turn) > found.sigma_rad
+    if np.count_nonzero(telling) < _FEW:
+        return 1.0
+    turns, wanted = (geometry.so3_log(one.turn[telling]) for one in (steps, measured))
+    return _common(turns, wanted, found.sigma_rad[telling])
+
+
+def _common(found: FloatArray, measured: FloatArray, sigma: FloatArray) -> float:
+    """Return the median of the ratios of two lists of vectors where it stands out of the scatter, else 1.
+
+    Both are measured along the mean of the two: errors across do not make one longer than the other, and large errors
+    of either do not decide which vectors are looked at.
+
+    Args:
+        found: (n, 3).
+        measured: (n, 3).
+        sigma: (n,) standard deviation of the latter.
+    """
+    both = found + measured
+    length = np.sqrt(np.sum(both**2, axis=1))
+    ours, theirs = (np.sum(one * both, axis=1) / np.maximum(length, 1e-12) for one in (found, measured))
+    telling = (0.5 * length > _TELLING * sigma) & (ours > 0.0) & (theirs > 0.0)
+    n = int(np.count_nonzero(telling))
+    if n < _FEW:
+        return 1.0
+    logs = np.log(ours[telling] / theirs[telling])
+    middle = float(np.median(logs))
+    scatter = _MEDIAN * _SPREAD * float(np.median(np.abs(logs - middle))) / np.sqrt(n)
+    expected = _MEDIAN * float(np.median(2.0 * sigma[telling] / length[telling])) / np.sqrt(n)
+    return float(np.exp(middle)) if abs(middle) > max(3.0 * scatter, 2.0 * expected) else 1.0
