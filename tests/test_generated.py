@@ -29,7 +29,15 @@ def generator() -> ModuleType:
 
 
 @pytest.mark.parametrize(
-    "name", ["config/ba_node.yaml", "docs/methods.md", "docs/parameters.md", "docs/thesis.md", "docs/topics.md"]
+    "name",
+    [
+        "config/ba_node.yaml",
+        "docs/methods.md",
+        "docs/parameters.md",
+        "docs/robustness.md",
+        "docs/thesis.md",
+        "docs/topics.md",
+    ],
 )
 def test_file_is_up_to_date(name: str, generator: ModuleType) -> None:
     assert (ROOT / name).read_text() == generator.pages()[name], f"{name} is stale: run {generator.MADE_BY}"

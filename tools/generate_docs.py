@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write config/ba_node.yaml, docs/parameters.md, docs/topics.md and the tables of docs/methods.md from the code.
 
-docs/thesis.md and docs/open_problems.md are written from docs/thesis_results.json, which `ba thesis --all` makes.
+docs/thesis.md and docs/open_problems.md are written from docs/thesis_results.json, which `ba thesis --all` makes,
+docs/robustness.md from docs/robustness_results.json, which is results.json of `ba robustness`.
 
 Run it without arguments to write them, with --check to learn whether they are up to date (exit code 1 if not).
 """
@@ -22,6 +23,7 @@ from ba_node.io.parameters import parameters_markdown, parameters_yaml
 from ba_node.messages.commands import ACTION_TYPES, SERVICE_TYPES
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
+from ba_node.offline.robustness.page import page as robustness_page
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
 from ba_node.thesis.open_page import open_page
@@ -190,6 +192,7 @@ def yaml_file() -> str:
 def pages() -> dict[str, str]:
     """Return the content of every generated file by its path from the root."""
     results = json.loads((ROOT / "docs" / "thesis_results.json").read_text(encoding="utf-8"))
+    robustness = json.loads((ROOT / "docs" / "robustness_results.json").read_text(encoding="utf-8"))
     note = f"<!-- Written by `{MADE_BY}`: do not edit. -->\n\n"
     return {
         "config/ba_node.yaml": yaml_file(),
@@ -197,6 +200,7 @@ def pages() -> dict[str, str]:
         "docs/methods.md": methods_page(),
         "docs/thesis.md": note + claims_page(results),
         "docs/open_problems.md": note + open_page(results),
+        "docs/robustness.md": note + robustness_page(robustness),
         "docs/topics.md": note + topics_markdown(),
     }
 

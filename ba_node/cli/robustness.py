@@ -5,7 +5,7 @@
 Faults are those of ba_node/synthetic/faults, by every rig and amount; outliers are of three kinds, by share and rig,
 against the same recording without them. --only takes names of faults, or faults, outliers, sound. Written to DIR:
 results.jsonl, a line a recording (what is in it is not run again: take another DIR after a change of the code),
-report.md and images/.
+results.json with the figures of this call, report.md and images/.
 
 Exit code: 0 no harm, 3 a recording with a fault became worse than it came in.
 """
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Run what is missing and write the page."""
     from ba_node.offline.robustness.page import page  # noqa: PLC0415
     from ba_node.offline.robustness.plots import draw  # noqa: PLC0415
-    from ba_node.offline.robustness.runs import run_all, tasks  # noqa: PLC0415
+    from ba_node.offline.robustness.runs import run_all, tasks, write_rows  # noqa: PLC0415
 
     wanted = tasks(max(1, args.seeds), args.only)
     with progress_bar("robustness", "recordings") as progress:
@@ -45,5 +45,6 @@ def run(args: argparse.Namespace) -> int:
     print(text)
     draw(args.out / "images", rows)
     (args.out / "report.md").write_text(text, encoding="utf-8")
+    write_rows(args.out / "results.json", rows)
     print(f"written: {args.out / 'report.md'}")
     return HARM if any(row.get("verdict") in ("harm", "crash") for row in rows) else 0

@@ -16,11 +16,9 @@ from tests.cases.conftest import Replay, harmless
 # Faults that are not mended yet; a name goes as soon as its tests pass.
 PENDING = {
     *("baseline_reversed", "cameras_swapped", "extrinsics_inverted", "axes_confused", "camera_turned", "depth_in_mm"),
-    *("poses_inverted", "focal_off", "roi_ignored", "binning_ignored"),
-    *("rectified_with_distortion", "clock_set_back", "one_stamp_zero", "one_stamp_future", "session_lowered"),
-    *("useless_messages", "duplicates", "frame_slash", "frame_empty", "frame_changes", "ids_reused", "wrong_ids"),
-    *("outliers_uniform", "outliers_jumping", "outliers_moving", "one_keyframe_far", "few_points", "few_observations"),
-    *("stands_still", "stands_still_mismatched", "pure_rotation", "far_points"),
+    *("poses_inverted", "focal_off", "roi_ignored", "binning_ignored", "rectified_with_distortion", "ids_reused"),
+    *("wrong_ids", "outliers_moving", "one_keyframe_far", "few_points", "few_observations", "stands_still"),
+    *("stands_still_mismatched", "pure_rotation", "far_points"),
 }
 
 
@@ -58,3 +56,13 @@ def test_no_harm_and_the_cause_is_named(
     if outcome.report:
         harmless(outcome.errors(recording.truth), fault.least, len(recording.keyframes))
     outcome.tells(*fault.told)
+
+
+@pytest.mark.xfail(strict=False, reason="not mended yet")
+@pytest.mark.parametrize("name", ["camera_turned", "depth_in_mm", "extrinsics_inverted"])
+def test_odometry_that_is_better_than_the_tracks_is_kept(name: str, tmp_path: Path, run: Replay) -> None:
+    recording = spoiled(name, seed=301, keyframes=60, drift_rotation_deg=0.01, drift_translation=0.001)
+    outcome = run(write(tmp_path, recording))
+    assert outcome.code in FAULTS[name].codes
+    harmless(outcome.errors(recording.truth), 1.0, 60)
+    outcome.tells(*FAULTS[name].told)

@@ -131,6 +131,12 @@ def run_all(wanted: Sequence[Task], out: Path, jobs: int, progress: Callable[[in
     return [rows[task.key] for task in wanted]
 
 
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows without their words, one a line, for docs/robustness_results.json."""
+    lines = (json.dumps({key: _short(value) for key, value in row.items() if key != "words"}) for row in rows)
+    path.write_text("[\n" + ",\n".join(lines) + "\n]\n", encoding="utf-8")
+
+
 def run(task: Task) -> Row:
     """Replay one recording, an outlier's without its outliers too; return the row of results."""
     row: Row = {"key": task.key, "table": task.table, "fault": task.fault, "rig": task.rig}
@@ -211,6 +217,10 @@ def _figures(errors: Sequence[SessionError]) -> Row:
         "input_deg": total([error.input_deg for error in errors]),
         "published_deg": total([error.published_deg for error in errors]),
     }
+
+
+def _short(value: Any) -> Any:
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def _results(missing: Sequence[Task], jobs: int) -> Iterator[Row]:

@@ -118,7 +118,11 @@ def roi_given(recording: Recording, amount: float, rng: np.random.Generator) -> 
 
 def binning_ignored(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
     """Take pixels of an image that the camera has made smaller; K is of the whole sensor."""
-    return recording.changed(FeatureTracks, lambda image: _with_pixels(image, image.uv / amount))
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        return dataclasses.replace(_with_pixels(image, image.uv / amount), sigma_px=image.sigma_px / amount)
+
+    return recording.changed(FeatureTracks, change)
 
 
 def binning_given(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
