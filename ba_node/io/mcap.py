@@ -113,6 +113,15 @@ class BagReader:
             channel = self._channels[number]
             yield channel.topic, channel.type_name, log_time, data
 
+    def late_cameras(self) -> list[tuple[str, bytes]]:
+        """Return topic and bytes of the first message of each camera topic that comes after others of the inputs."""
+        kinds = [INPUT_TYPES[name] for name in CAMERAS]
+        cameras = [topic for topic, kind in self.topics.items() if kind in kinds]
+        others = [topic for topic, kind in self.topics.items() if kind in INPUT_TYPES.values() and kind not in kinds]
+        first = next((time for _, _, time, _ in self.messages(others)), None) if others else None
+        found = [next(self.messages([topic]), None) for topic in cameras]
+        return [(raw[0], raw[3]) for raw in found if raw is not None and first is not None and raw[2] > first]
+
     def decode(self, topic: str, data: bytes) -> Any:
         """Return the message in the bytes of a topic, by the definition in the recording.
 
