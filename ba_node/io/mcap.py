@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-import pickle
 import tempfile
 from collections import Counter, deque
 from itertools import chain, pairwise
@@ -236,9 +235,10 @@ class BagReader:
             frames |= {str(part.header.frame_id).removeprefix("/") for part in parts}
         return frozenset(frames)
 
-    def _content_of(self, topic: str) -> object:
+    def _content_of(self, topic: str) -> CameraRig | None:
         for number, message in self._first_messages(topic):
-            return pickle.dumps(measurement_from_message(self._channels[number].type_name, message))
+            found = measurement_from_message(self._channels[number].type_name, message)
+            return found if isinstance(found, CameraRig) else None
         return None
 
     def _raw(self, numbers: Collection[int]) -> Iterator[_Raw]:
