@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_node.core.objective import MIN_DEPTH, Objective, Rules
+from ba_node.core.cameras import MIN_DEPTH
+from ba_node.core.objective import Objective, Rules
 from ba_node.io.bal import read_bal
 from benchmarks.generators import loop, sphere, window
 from benchmarks.problem_file import Case, case_problem, read_case, sorted_by_point, write_case

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ba_node.core.objective import MIN_DEPTH, Objective, Rules
+from ba_node.core.cameras import MIN_DEPTH
+from ba_node.core.objective import Objective, Rules
 from benchmarks import metrics
 from benchmarks.floor import Peak, floor_s
 from benchmarks.problem_file import Case, case_problem

@@ -10,9 +10,11 @@ With ``a = X/Z``, ``b = Y/Z``, ``s = a^2 + b^2``:
       a' = g a + 2 p1 a b + p2 (s + 2 a^2)
       b' = g b + p1 (s + 2 b^2) + 2 p2 a b
 
-- equidistant (Kannala-Brandt, as in OpenCV's fisheye module), ``th = atan(sqrt(s))``::
+- equidistant (Kannala-Brandt, as in OpenCV's fisheye module), ``r = sqrt(X^2 + Y^2)``, ``th = atan2(r, Z)``::
 
-      g  = th (1 + k1 th^2 + k2 th^4 + k3 th^6 + k4 th^8) / sqrt(s);   a' = g a;  b' = g b
+      g  = th (1 + k1 th^2 + k2 th^4 + k3 th^6 + k4 th^8) / r;   a' = g X;  b' = g Y
+
+  so that points behind the image plane are seen as well, up to :data:`MAX_ANGLE` from the axis;
 
 then ``u = fx a' + cx`` and ``v = fy b' + cy``. The Snavely camera of the BAL data sets (2.17-2.21) is plumb_bob
 with fx = fy = f and k1, k2 alone, after ``diag(1, -1, -1)``.
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 from ba_node.core import columns
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 ModelArray = NDArray[np.uint8]
 
 # Columns of a row of camera parameters.
@@ -35,6 +38,12 @@ FX, FY, CX, CY = range(4)
 DISTORTION = slice(4, 12)
 N_PARAMS = 12
 
+# A point nearer to the camera plane than this (m) counts as on it.
+MIN_DEPTH = 1e-6
+# How far from the axis an equidistant camera sees: more than any lens, and away from the pole behind it.
+MAX_ANGLE = np.deg2rad(150.0)
+LEAST_COSINE = float(np.cos(MAX_ANGLE))
+_NEWTON_STEPS = 20
 # For th below this the ratios of the equidistant model are taken from their series.
 _SMALL_RADIUS2 = 1e-12
 # Angles at which a lens is looked at for where its distortion folds over.
@@ -122,19 +131,47 @@ def widest(model: Model, params: FloatArray) -> float:
     return float(radius[turns[0]]) if len(turns) else np.inf
 
 
+def behind(x_cam: FloatArray, model: ModelArray) -> BoolArray:
+    """Return which points no camera of their row's model can see: (n,).
+
+    Those on or behind the camera plane; for the equidistant model, which sees beyond it, those near the axis behind.
+
+    Args:
+        x_cam: (n, 3), m.
+        model: (n,) or (1,).
+    """
+    hidden = x_cam[:, 2] <= MIN_DEPTH
+    fisheye = model == Model.EQUIDISTANT
+    if fisheye.any():
+        distance = np.linalg.norm(x_cam, axis=1)
+        hidden = np.where(fisheye, (x_cam[:, 2] <= LEAST_COSINE * distance) | (distance <= MIN_DEPTH), hidden)
+    return np.asarray(hidden)
+
+
 def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
     """Project points in camera frames to pixels.
 
     Args:
-        x_cam: (n, 3) in the optical frame of each row's camera, m. Z = 0 gives infinities: callers sort these out.
+        x_cam: (n, 3) in the optical frame of each row's camera, m. What is :func:`behind` gives infinities or pixels
+            without meaning: callers sort these out.
         model: (n,) Model of each row, or (1,) of all.
         params: (n, 12) parameters of each row, or (1, 12) of all; without distortion beyond k1 and k2 six will do.
 
     Returns:
         (n, 2) u, v, px.
     """
-    normalised = x_cam[:, :2] / x_cam[:, 2:]
-    distorted = _distort(normalised, model, params)
+    fisheye = model == Model.EQUIDISTANT
+    if not fisheye.any():
+        ray = x_cam[:, :2] / x_cam[:, 2:]
+        distorted = _rational(ray, params[:, DISTORTION])[0] if params[:, DISTORTION].any() else ray
+    elif fisheye.all():
+        distorted = _equidistant(x_cam, params[:, DISTORTION])[0]
+    else:
+        distorted = np.empty((len(x_cam), 2))
+        straight = ~fisheye
+        ray = x_cam[straight, :2] / x_cam[straight, 2:]
+        distorted[straight] = _rational(ray, params[straight, DISTORTION])[0]
+        distorted[fisheye] = _equidistant(x_cam[fisheye], params[fisheye, DISTORTION])[0]
     return params[:, FX : FY + 1] * distorted + params[:, CX : CY + 1]
 
 
@@ -153,41 +190,91 @@ def project_jacobian(
         uv: (n, 2) px; d uv / d x_cam: (n, 2, 3) px/m; d uv / d (f, k1, k2): (n, 2, 3) where f scales fx and fy
         alike (fx = fy = f when the camera's own fx and fy are 1), or (n, 2, 0) where it is not wanted.
     """
-    inverse_z = 1.0 / x_cam[:, 2:]
-    ray = x_cam[:, :2] * inverse_z
-    distorted, jacobian, by_k12 = _distort_jacobian(ray, model, params)
+    fisheye = model == Model.EQUIDISTANT
+    if fisheye.any() and not fisheye.all():
+        return _mixed_jacobian(x_cam, fisheye, params, intrinsics=intrinsics)
     focal = params[:, FX : FY + 1]
-    uv = focal * distorted + params[:, CX : CY + 1]
     d_x = columns.empty(len(x_cam), 2, 3)
-    for i in range(2):
-        np.multiply(jacobian[:, i], focal[:, i, None] * inverse_z, out=d_x[:, i, :2])
-    d_x[:, :, 2] = -(d_x[:, :, 0] * ray[:, :1] + d_x[:, :, 1] * ray[:, 1:])
+    if fisheye.any():
+        distorted, jacobian, by_k12 = _equidistant(x_cam, params[:, DISTORTION])
+        base = x_cam[:, :2]
+        for i in range(2):
+            np.multiply(jacobian[:, i], focal[:, i, None], out=d_x[:, i])
+    else:
+        inverse_z = 1.0 / x_cam[:, 2:]
+        base = x_cam[:, :2] * inverse_z
+        distorted, jacobian, by_k12 = _rational(base, params[:, DISTORTION])
+        for i in range(2):
+            np.multiply(jacobian[:, i], focal[:, i, None] * inverse_z, out=d_x[:, i, :2])
+        d_x[:, :, 2] = -(d_x[:, :, 0] * base[:, :1] + d_x[:, :, 1] * base[:, 1:])
     d_intrinsics = columns.empty(len(x_cam), 2, 3 if intrinsics else 0)
     if intrinsics:
         d_intrinsics[:, :, 0] = distorted
-        d_intrinsics[:, :, 1:] = (ray * focal)[:, :, None] * by_k12[:, None, :]
-    return uv, d_x, d_intrinsics
+        d_intrinsics[:, :, 1:] = (base * focal)[:, :, None] * by_k12[:, None, :]
+    return focal * distorted + params[:, CX : CY + 1], d_x, d_intrinsics
 
 
-def normalise(uv: FloatArray, model: ModelArray, params: FloatArray, iterations: int = 20) -> FloatArray:
-    """Return the undistorted ray of pixels, the inverse of :func:`project`, by Newton's method.
+def _mixed_jacobian(
+    x_cam: FloatArray, fisheye: BoolArray, params: FloatArray, *, intrinsics: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Do the work of project_jacobian for rows of both models."""
+    out = (
+        np.empty((len(x_cam), 2)),
+        columns.empty(len(x_cam), 2, 3),
+        columns.empty(len(x_cam), 2, 3 if intrinsics else 0),
+    )
+    for rows, model in ((~fisheye, Model.RATIONAL), (fisheye, Model.EQUIDISTANT)):
+        one = np.array([model], np.uint8)
+        parts = project_jacobian(x_cam[rows], one, params[rows], intrinsics=intrinsics)
+        for whole, part in zip(out, parts, strict=True):
+            whole[rows] = part
+    return out
+
+
+def rays(uv: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
+    """Return the directions in which cameras see pixels, the inverse of :func:`project`.
 
     Args:
         uv: (n, 2) px.
         model: (n,).
         params: (n, 12).
-        iterations: cap on Newton steps.
 
     Returns:
-        (n, 2) X/Z, Y/Z; NaN where no ray projects to the pixel (outside the model's domain).
+        (n, 3) unit vectors in the optical frame; NaN where no ray projects to the pixel (outside the model's domain).
     """
-    target = (uv - params[:, CX : CY + 1]) / params[:, FX : FY + 1]
-    if not params[:, DISTORTION].any() and not (model == Model.EQUIDISTANT).any():
+    fisheye = model == Model.EQUIDISTANT
+    out = np.ones((len(uv), 3))
+    straight = ~fisheye
+    out[straight, :2] = _undistort(uv[straight], params[straight])
+    out[straight] /= np.linalg.norm(out[straight], axis=1)[:, None]
+    if fisheye.any():
+        out[fisheye] = _fisheye_rays(uv[fisheye], params[fisheye])
+    return out
+
+
+def normalise(uv: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
+    """Return X/Z, Y/Z of the rays of pixels (n, 2); NaN where there is none, or one that is beyond 90 degrees."""
+    fisheye = model == Model.EQUIDISTANT
+    if not fisheye.any():
+        return _undistort(uv, params)
+    ray = rays(uv, model, params)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(ray[:, 2:] > 0.0, ray[:, :2] / ray[:, 2:], np.nan)
+
+
+def _target(uv: FloatArray, params: FloatArray) -> FloatArray:
+    return np.asarray((uv - params[:, CX : CY + 1]) / params[:, FX : FY + 1])
+
+
+def _undistort(uv: FloatArray, params: FloatArray) -> FloatArray:
+    """Return X/Z, Y/Z of pixels of rational cameras, by Newton's method."""
+    target = _target(uv, params)
+    if not params[:, DISTORTION].any():
         return target
-    ray = _first_ray(target, model)
+    ray = target
     with np.errstate(all="ignore"):
-        for _ in range(iterations):
-            distorted, jacobian, _ = _distort_jacobian(ray, model, params)
+        for _ in range(_NEWTON_STEPS):
+            distorted, jacobian, _ = _rational(ray, params[:, DISTORTION])
             step = _solve2(jacobian, target - distorted)
             # Limited steps: far out in a strong distortion the full Newton step overshoots the domain.
             limit = 0.5 * (1.0 + np.linalg.norm(ray, axis=1, keepdims=True))
@@ -195,17 +282,28 @@ def normalise(uv: FloatArray, model: ModelArray, params: FloatArray, iterations:
             ray = ray + step * np.minimum(1.0, limit / np.maximum(size, 1e-300))
             if not np.any(size > 1e-13 * limit):
                 break
-        error = np.abs(_distort(ray, model, params) - target).max(axis=1, initial=0.0)
+        error = np.abs(_rational(ray, params[:, DISTORTION])[0] - target).max(axis=1, initial=0.0)
     return np.where((error < 1e-7)[:, None], ray, np.nan)
 
 
-def _first_ray(target: FloatArray, model: ModelArray) -> FloatArray:
-    """Return a start for Newton: the pixel itself, or the undistorted fisheye angle."""
+def _fisheye_rays(uv: FloatArray, params: FloatArray) -> FloatArray:
+    """Return unit rays of pixels of equidistant cameras: Newton's method for the angle to the axis."""
+    target = _target(uv, params)
     radius = np.linalg.norm(target, axis=1)
-    angle = np.minimum(radius, 1.5)
-    stretch = np.where(radius > 1e-9, np.tan(angle) / np.maximum(radius, 1e-9), 1.0)
-    result: FloatArray = np.where((model == Model.EQUIDISTANT)[:, None], target * stretch[:, None], target)
-    return result
+    k = params[:, DISTORTION]
+    angle = np.minimum(radius, MAX_ANGLE)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            bent, slope = _bent_angle(angle, k)
+            step = (bent - radius) / slope
+            angle = np.clip(angle - np.clip(step, -0.5, 0.5), 0.0, MAX_ANGLE)
+            if not np.any(np.abs(step) > 1e-15):
+                break
+        bent, slope = _bent_angle(angle, k)
+        sound = (np.abs(bent - radius) < 1e-9) & (slope > 0.0)
+        across = np.sin(angle) * np.where(radius > 0.0, 1.0 / radius, 1.0)
+    ray = np.stack([target[:, 0] * across, target[:, 1] * across, np.cos(angle)], axis=1)
+    return np.where(sound[:, None], ray, np.nan)
 
 
 def _solve2(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
@@ -215,32 +313,6 @@ def _solve2(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     return np.stack(
         [(d * rhs[:, 0] - b * rhs[:, 1]) / determinant, (a * rhs[:, 1] - c * rhs[:, 0]) / determinant], axis=1
     )
-
-
-def _distort(ray: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
-    """Return the distorted rays (n, 2)."""
-    if not params[:, DISTORTION].any() and not (model == Model.EQUIDISTANT).any():
-        return ray
-    distorted, _, _ = _distort_jacobian(ray, model, params)
-    return distorted
-
-
-def _distort_jacobian(
-    ray: FloatArray, model: ModelArray, params: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return distorted rays (n, 2), their derivatives by the ray (n, 2, 2), and (n, 2) factors of the ray.
-
-    The derivatives by k1 and by k2 are the ray times these factors.
-    """
-    fisheye = model == Model.EQUIDISTANT
-    if not fisheye.any():
-        return _rational(ray, params[:, DISTORTION])
-    if fisheye.all():
-        return _equidistant(ray, params[:, DISTORTION])
-    distorted, jacobian, by_k12 = np.empty_like(ray), columns.empty(len(ray), 2, 2), np.empty_like(ray)
-    for rows, distort in ((~fisheye, _rational), (fisheye, _equidistant)):
-        distorted[rows], jacobian[rows], by_k12[rows] = distort(ray[rows], params[rows, DISTORTION])
-    return distorted, jacobian, by_k12
 
 
 def _rational(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -279,17 +351,38 @@ def _radial(
     return g[:, None] * ray, jacobian, np.stack(by_k12).T
 
 
-def _equidistant(ray: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distort by the equidistant model; ``k`` is (n, 8) k1 k2 k3 k4 and zeros."""
-    s = ray[:, 0] * ray[:, 0] + ray[:, 1] * ray[:, 1]
-    small = s < _SMALL_RADIUS2
-    r = np.sqrt(np.where(small, 1.0, s))
-    th = np.arctan(r)
-    t2 = th * th
+def _bent_angle(angle: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the radius in the image of an angle to the axis, and its derivative; ``k`` is (n, 8) k1 k2 k3 k4."""
+    t2 = angle * angle
     poly = 1.0 + t2 * (k[:, 0] + t2 * (k[:, 1] + t2 * (k[:, 2] + t2 * k[:, 3])))
     slope = 1.0 + t2 * (3 * k[:, 0] + t2 * (5 * k[:, 1] + t2 * (7 * k[:, 2] + 9 * t2 * k[:, 3])))
-    # g = th poly / r;  dg/ds = (slope / (1 + s) - g) / (2 s).
-    g = np.where(small, 1.0, th * poly / r)
-    dg = np.where(small, k[:, 0] - 1.0 / 3.0, (slope / (1.0 + s) - g) / (2.0 * np.where(small, 1.0, s)))
-    factor = np.where(small, s, th * t2 / r)
-    return _radial(ray, g, dg, (factor, factor * np.where(small, s, t2)))
+    return angle * poly, slope
+
+
+def _equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Project points (n, 3) by the equidistant model; ``k`` is (n, 8) k1 k2 k3 k4 and zeros.
+
+    Returns:
+        (n, 2) a', b'; their derivatives by the points (n, 2, 3); and (n, 2) by what to multiply X and Y for the
+        derivatives by k1 and by k2.
+    """
+    flat2 = x[:, 0] * x[:, 0] + x[:, 1] * x[:, 1]
+    z = x[:, 2]
+    small = flat2 < _SMALL_RADIUS2 * z * z
+    flat = np.sqrt(np.where(small, 1.0, flat2))
+    angle = np.arctan2(flat, z)
+    bent, slope = _bent_angle(angle, k)
+    over = 1.0 / (flat2 + z * z)
+    # a' = g X;  dg/dX = X bend;  dg/dZ = -slope over.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        g = np.where(small, 1.0 / z, bent / flat)
+        bend = np.where(small, 2.0 * (k[:, 0] - 1.0 / 3.0) / z**3, (slope * z * over - g) / np.where(small, 1.0, flat2))
+        slope = np.where(small, 1.0, slope)
+        k1 = np.where(small, flat2 / z**3, angle**3 / flat)
+        k2 = np.where(small, 0.0, k1 * angle * angle)
+    jacobian = columns.empty(len(x), 2, 3)
+    jacobian[:, 0, 0] = g + bend * x[:, 0] * x[:, 0]
+    jacobian[:, 0, 1] = jacobian[:, 1, 0] = bend * x[:, 0] * x[:, 1]
+    jacobian[:, 1, 1] = g + bend * x[:, 1] * x[:, 1]
+    jacobian[:, :, 2] = -(slope * over)[:, None] * x[:, :2]
+    return g[:, None] * x[:, :2], jacobian, np.stack([k1, k2]).T

@@ -60,7 +60,7 @@ def missing(rules: Rules, demands: Demands) -> str:
 
 
 def residual_norms(problem: Problem, state: State, backend: str = "auto") -> FloatArray:
-    """Return the size of each residual, (n_obs,) in sigmas, inf for points on or behind the camera plane."""
+    """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see."""
     if backend != "numpy" and native.kernels is not None and not problem.free_intrinsics:
         obs, cams = problem.observations, problem.cameras
         norms: FloatArray = native.kernels.residual_norms(

@@ -23,8 +23,6 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-# A point nearer to the camera plane than this (m) counts as on it.
-MIN_DEPTH = 1e-6
 # What a point behind its camera costs under ``constant``: as much as a residual of this norm.
 _BEHIND_NORM = 100.0
 
@@ -152,17 +150,17 @@ class Objective:
             np.zeros(0, dtype=bool),
         )
         if rules.cheirality == "drop":
-            self._all = replace(self._all, ignored=self.in_camera(problem.start)[:, 2] <= MIN_DEPTH)
+            self._all = replace(self._all, ignored=cameras.behind(self.in_camera(problem.start), self._all.model))
 
     def in_camera(self, state: State) -> FloatArray:
         """Return the observed points in their camera's optical frame, (n_obs, 3), m."""
         return self._in_camera(state, self._all)[0]
 
     def errors(self, state: State) -> FloatArray:
-        """Return predicted minus measured, (n_obs, 2) px, NaN for points on or behind the camera plane."""
+        """Return predicted minus measured, (n_obs, 2) px, NaN for points that their camera cannot see."""
         of = self._all
         x_cam = self.in_camera(state)
-        behind = np.flatnonzero(x_cam[:, 2] <= MIN_DEPTH)
+        behind = np.flatnonzero(cameras.behind(x_cam, of.model))
         x_cam[behind] = (0.0, 0.0, 1.0)
         errors = cameras.project(x_cam, of.model, self._params(state, of)) - of.uv
         errors[behind] = np.nan
@@ -265,8 +263,10 @@ class Objective:
 
     def _mask(self, x_cam: FloatArray, of: _Known) -> IntArray:
         """Return which observations push nothing, and move their points off the plane so that nothing is infinite."""
-        z = x_cam[:, 2]
-        hidden = np.abs(z) < MIN_DEPTH * 1e-6 if self.rules.cheirality == "keep" else z <= MIN_DEPTH
+        hidden = cameras.behind(x_cam, of.model)
+        if self.rules.cheirality == "keep":
+            on_plane = np.abs(x_cam[:, 2]) < cameras.MIN_DEPTH * 1e-6
+            hidden = np.where(of.model == cameras.Model.EQUIDISTANT, hidden, on_plane)
         masked = np.flatnonzero(hidden | of.ignored if len(of.ignored) else hidden)
         x_cam[masked] = (0.0, 0.0, 1.0)
         return masked
@@ -335,5 +335,5 @@ def _lenses(problem: Problem, used: IntArray) -> tuple[NDArray[np.uint8], FloatA
 
 
 def reprojection_errors(problem: Problem, state: State) -> FloatArray:
-    """Return predicted minus measured, (n_obs, 2) px, NaN for points on or behind the camera plane."""
+    """Return predicted minus measured, (n_obs, 2) px, NaN for points that their camera cannot see."""
     return Objective(problem, Rules()).errors(state)

@@ -36,6 +36,8 @@ _PLAIN_ROUNDS = 3
 _ROBUST_ROUNDS = 5
 # Where the robust weight leaves 1, in sigmas.
 _HUBER = 1.5
+# Of the angle between a ray and its camera's axis, where a depth tells a distance.
+_LEAST_COSINE = 0.01
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ROWS, _COLUMNS = np.transpose(_SYMMETRIC)
 _DIAGONAL = np.arange(3)
@@ -90,15 +92,15 @@ def rays_of(problem: Problem) -> Rays:
     world_from_body = np.swapaxes(rotation, -1, -2)
     centre = (world_from_body @ (body_centre - problem.start.translation[obs.keyframe])[:, :, None])[..., 0]
     params = cams.params[obs.camera]
-    ray = np.ones((len(obs), 3))
-    ray[:, :2] = cameras.normalise(obs.uv, cams.model[obs.camera], params)
-    length = np.linalg.norm(ray, axis=1)
-    direction = (world_from_body @ (np.swapaxes(rotation_cb, -1, -2) @ (ray / length[:, None])[:, :, None]))[..., 0]
+    ray = cameras.rays(obs.uv, cams.model[obs.camera], params)
+    direction = (world_from_body @ (np.swapaxes(rotation_cb, -1, -2) @ ray[:, :, None]))[..., 0]
+    # A depth is along the axis: of a ray that is across it, or points back, it tells no distance.
+    length = 1.0 / np.where(ray[:, 2] > _LEAST_COSINE, ray[:, 2], np.nan)
     focal = np.sqrt(params[:, cameras.FX] * params[:, cameras.FY])
     has_depth = len(obs.depth_m) > 0
     depth = obs.depth_m if has_depth else np.full(len(obs), np.nan)
     sigma = obs.depth_sigma_m if has_depth else np.full(len(obs), np.nan)
-    good = np.isfinite(length)
+    good = np.isfinite(ray[:, 2])
     return Rays(
         obs.point[good],
         centre[good],

@@ -9,13 +9,19 @@ several, nothing is guessed: the user has to say.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ba_node.io.bag_errors import BagError
+from ba_node.measurements import CameraRig
 from ba_node.messages.conversion import INPUT_TYPES
 
 CAMERAS = ("camera_rig", "camera_info")
+# Numbers of a camera that differ by less than this, relative or px, are the same: they may have gone through a text.
+_SAME = 1e-3
 
 
 @dataclass(frozen=True)
@@ -65,14 +71,14 @@ class Chooser:
     Args:
         found: topics with messages of the type of each input.
         frames_of: the frames that the first messages of a topic name.
-        content_of: what the first message of a camera topic says, to be compared; None if it cannot be read.
+        content_of: the cameras in the first message of a topic, None if it cannot be read.
     """
 
     def __init__(
         self,
         found: Mapping[str, list[str]],
         frames_of: Callable[[str], frozenset[str]],
-        content_of: Callable[[str], object],
+        content_of: Callable[[str], CameraRig | None],
     ) -> None:
         self._found = {name: sorted(found.get(name, [])) for name in INPUT_TYPES}
         self._frames_of = frames_of
@@ -150,8 +156,8 @@ class Chooser:
         return bool(tracks and self._frames_of(tracks) & self._frames_of(topic))
 
     def _agree(self, topics: list[str]) -> bool:
-        contents = [self._content_of(topic) for topic in topics]
-        return contents[0] is not None and all(content == contents[0] for content in contents)
+        rigs = [self._content_of(topic) for topic in topics]
+        return rigs[0] is not None and all(pickle.dumps(rig) == pickle.dumps(rigs[0]) for rig in rigs)
 
     def _which(self, name: str, topics: list[str]) -> str:
         shown = topics
@@ -173,8 +179,19 @@ class Chooser:
                     continue
                 reason = f"{self._result.taken.get(name, 'no other')} is taken as {name}"
                 if name == "camera_info" and rig:
-                    reason = f"{rig} tells the cameras"
+                    reason = f"{rig} tells the cameras{self._other_numbers(topic, rig)}"
                 self._result.left[topic] = reason
+
+    def _other_numbers(self, topic: str, rig: str) -> str:
+        """Return in words where a lone camera is in the rig with other numbers."""
+        lone, whole = self._content_of(topic), self._content_of(rig)
+        if not isinstance(lone, CameraRig) or not isinstance(whole, CameraRig) or lone.malformed or whole.malformed:
+            return ""
+        for name, intrinsics in zip(whole.names, whole.intrinsics, strict=True):
+            if name == lone.names[0] and not np.allclose(intrinsics, lone.intrinsics[0], rtol=_SAME, atol=_SAME):
+                fx, expected = lone.intrinsics[0, 0], intrinsics[0]
+                return f", with other numbers for {name!r}: fx = {expected:g} px where this says {fx:g}"
+        return ""
 
 
 def _space(topic: str) -> str:

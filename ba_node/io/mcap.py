@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-import pickle
 import tempfile
 from collections import Counter, deque
 from itertools import chain, pairwise
@@ -112,6 +111,15 @@ class BagReader:
         for number, log_time, data in self._raw(self._numbers(topics)):
             channel = self._channels[number]
             yield channel.topic, channel.type_name, log_time, data
+
+    def late_cameras(self) -> list[tuple[str, bytes]]:
+        """Return topic and bytes of the first message of each camera topic that comes after others of the inputs."""
+        kinds = [INPUT_TYPES[name] for name in CAMERAS]
+        cameras = [topic for topic, kind in self.topics.items() if kind in kinds]
+        others = [topic for topic, kind in self.topics.items() if kind in INPUT_TYPES.values() and kind not in kinds]
+        first = next((time for _, _, time, _ in self.messages(others)), None) if others else None
+        found = [next(self.messages([topic]), None) for topic in cameras]
+        return [(raw[0], raw[3]) for raw in found if raw is not None and first is not None and raw[2] > first]
 
     def decode(self, topic: str, data: bytes) -> Any:
         """Return the message in the bytes of a topic, by the definition in the recording.
@@ -227,9 +235,10 @@ class BagReader:
             frames |= {str(part.header.frame_id).removeprefix("/") for part in parts}
         return frozenset(frames)
 
-    def _content_of(self, topic: str) -> object:
+    def _content_of(self, topic: str) -> CameraRig | None:
         for number, message in self._first_messages(topic):
-            return pickle.dumps(measurement_from_message(self._channels[number].type_name, message))
+            found = measurement_from_message(self._channels[number].type_name, message)
+            return found if isinstance(found, CameraRig) else None
         return None
 
     def _raw(self, numbers: Collection[int]) -> Iterator[_Raw]:

@@ -234,6 +234,10 @@ class _Player:
         """Publish from the start to the end."""
         begin_ns = self._begin_ns
         total = self._reader.message_count
+        # Cameras are latched: one that was recorded late was known to all from the beginning.
+        for topic, data in self._reader.late_cameras():
+            if topic in self._publishers:
+                self._publish(self._publishers[topic], data)
         start = time.monotonic()
         for done, (topic, _, log_time_ns, data) in enumerate(self._reader.messages(), start=1):
             latched = self._reader.topics[topic] in _LATCHED_TYPES

@@ -169,3 +169,70 @@ def test_sound_distortions_do_not_fold() -> None:
     assert _turning_point("plumb_bob", [0.1, 0.02, 0.0, 0.0]) == (np.inf, np.inf)
     assert _turning_point("equidistant", [0.01, 0.001, 0.0, 0.0]) == (np.inf, np.inf)
     assert _turning_point("plumb_bob", [0.0] * 5) == (np.inf, np.inf)
+
+
+def around(n: int, widest_deg: float, seed: int = 0) -> np.ndarray:
+    """Return points all around a camera, up to an angle from its axis."""
+    rng = np.random.default_rng(seed)
+    angle = np.deg2rad(widest_deg) * np.sqrt(rng.random(n))
+    turn, distance = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(0.5, 8.0, n)
+    ray = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
+    return ray * distance[:, None]
+
+
+def wide(n: int) -> tuple[np.ndarray, np.ndarray]:
+    model, params = cameras.parameters("equidistant", K, np.array([0.01, -2e-3, 3e-4, -2e-5]))
+    return np.full(n, model, np.uint8), np.tile(params, (n, 1))
+
+
+def test_a_fisheye_sees_behind_its_image_plane() -> None:
+    """By the definition, point by point."""
+    x = around(200, 148.0)
+    model, params = wide(200)
+    assert 50 < np.count_nonzero(x[:, 2] < 0.0) < 180
+    assert not cameras.behind(x, model).any()
+    for point, uv in zip(x, cameras.project(x, model, params), strict=True):
+        angle = np.arccos(point[2] / np.linalg.norm(point))
+        k1, k2, k3, k4 = params[0, 4:8]
+        radius = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+        turn = np.arctan2(point[1], point[0])
+        expected = K[:2] * radius * [np.cos(turn), np.sin(turn)] + K[2:]
+        np.testing.assert_allclose(uv, expected, rtol=1e-11)
+
+
+def test_derivatives_beyond_90_degrees_agree_with_central_differences() -> None:
+    x, h = around(200, 148.0, seed=1), 1e-6
+    model, params = wide(200)
+    uv, d_x, d_i = cameras.project_jacobian(x, model, params)
+    np.testing.assert_allclose(uv, cameras.project(x, model, params), atol=1e-10)
+    for j, axis in enumerate(np.eye(3)):
+        there, back = (cameras.project(x + step * axis, model, params) for step in (h, -h))
+        np.testing.assert_allclose(d_x[:, :, j], (there - back) / (2 * h), atol=3e-5)
+    for j, column in enumerate((4, 5), start=1):
+        step = h * np.eye(cameras.N_PARAMS)[column]
+        there, back = (cameras.project(x, model, params + sign * step) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(d_i[:, :, j], (there - back) / (2 * h), atol=1e-5)
+
+
+def test_rays_invert_project_all_around() -> None:
+    x = around(300, 149.0, seed=2)
+    x[0] = (0.0, 0.0, 2.0)
+    model, params = wide(300)
+    ray = cameras.rays(cameras.project(x, model, params), model, params)
+    np.testing.assert_allclose(ray, x / np.linalg.norm(x, axis=1)[:, None], atol=1e-9)
+    flat = cameras.normalise(cameras.project(x, model, params), model, params)
+    np.testing.assert_array_equal(np.isnan(flat[:, 0]), x[:, 2] < 0.0)
+
+
+def test_what_a_camera_cannot_see() -> None:
+    x = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, -0.5], [0.1, 0.0, -1.0], [0.0, 0.0, 0.0], [1e-9, 0, 0]])
+    straight, fisheye = (np.array([model], np.uint8) for model in (0, 1))
+    assert cameras.behind(x, straight).tolist() == [False, True, True, True, True, True]
+    assert cameras.behind(x, fisheye).tolist() == [False, False, False, True, True, True]
+    assert cameras.behind(x[1:3], np.array([0, 1], np.uint8)).tolist() == [True, False]
+
+
+def test_pixels_outside_the_image_circle_have_no_ray() -> None:
+    model, params = wide(2)
+    far = np.array([[K[0] * 3.0, 0.0], [5000.0, 0.0]]) + K[2:]
+    assert np.isnan(cameras.rays(far, model, params)).all()

@@ -244,6 +244,34 @@ def test_native_has_every_camera_model(name: str, make_problem: Make) -> None:
 
 
 @built
+@pytest.mark.parametrize("rules", RULES)
+def test_native_sees_as_far_round_as_numpy(rules: Rules, make_problem: Make) -> None:
+    """A fisheye and a plain camera in one rig, points on all sides of both."""
+    problem, _ = make_problem(stereo=True, points=120, start_error=0.02)
+    coefficients = np.array([0.01, -2e-3, 3e-4, -2e-5])
+    model, params = cameras.parameters("equidistant", np.array([200.0, 210.0, 320.0, 240.0]), coefficients)
+    cams = problem.cameras
+    both = dataclasses.replace(cams, model=np.array([model, 0], np.uint8), params=np.stack([params, cams.params[1]]))
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(120, 3))
+    points *= rng.uniform(2.0, 6.0, (120, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    start = dataclasses.replace(problem.start, points=points)
+    problem = dataclasses.replace(problem, cameras=both, start=start)
+    seen = Objective(problem, rules)
+    x_cam = seen.in_camera(start)[problem.observations.camera == 0]
+    assert np.count_nonzero((x_cam[:, 2] < 0.0) & ~cameras.behind(x_cam, np.array([1], np.uint8))) > 50
+    of_fisheye = (problem.observations.camera == 0)[:, None]
+    uv = problem.observations.uv + np.where(of_fisheye, np.nan_to_num(seen.errors(start)) + rng.normal(), 0.0)
+    problem = dataclasses.replace(problem, observations=dataclasses.replace(problem.observations, uv=uv))
+    expected, found = (native_kernels.residual_norms(problem, start, name) for name in ("numpy", "native"))
+    np.testing.assert_array_equal(np.isinf(found), np.isinf(expected))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    oracle, kernels = pair(problem, rules)
+    systems = [kernel.reduce(*kernel.diagonals()).dense() for kernel in (oracle, kernels)]
+    near(systems[0], systems[1])
+
+
+@built
 def test_native_numbers_images_of_many_keyframes_and_cameras(make_problem: Make) -> None:
     """More than 2^20 pairs of keyframe and camera, few of them seen, in no order."""
     small, _ = make_problem(stereo=True)

@@ -218,6 +218,10 @@ def test_a_rig_that_comes_last_is_there_for_all(tmp_path: Path, single: Path) ->
         found = [m for _, _, m in reader.measurements()]
         assert isinstance(found[0], CameraRig)
         assert sum(isinstance(m, CameraRig) for m in found) == 1
+        rigs = [(topic, data) for topic, _, _, data in messages if "camera" in topic]
+        assert reader.late_cameras() == rigs[:1]
+    with BagReader(single) as reader:
+        assert reader.late_cameras() == []
 
 
 def test_cameras_of_a_loaded_map_are_used(tmp_path: Path, single: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ba_node.cli.main import main
@@ -28,7 +29,13 @@ def choose(found: dict[str, list[str]], choice: TopicChoice = NO_CHOICE, frames:
     def frame(topic: str) -> str:
         return (frames or {}).get(topic, topic)
 
-    return Chooser(found, lambda topic: frozenset({frame(topic)}), frame).choose(choice)
+    return Chooser(found, lambda topic: frozenset({frame(topic)}), lambda topic: camera(frame(topic))).choose(choice)
+
+
+def camera(frame: str, focal: float = 400.0) -> CameraRig:
+    pose = np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])
+    intrinsics, size = np.array([[focal, focal, 320.0, 240.0]]), np.array([[640, 480]])
+    return CameraRig("body", (frame,), ("plumb_bob",), intrinsics, (np.zeros(5),), size, *pose)
 
 
 def robots(*names: str, guesses: bool = False) -> dict[str, list[str]]:
@@ -64,6 +71,14 @@ def test_a_rig_leaves_camera_info_aside() -> None:
     chosen = choose(found)
     assert INFO not in chosen.taken
     assert chosen.left == {"/a": "/camera_rig tells the cameras", "/b": "/camera_rig tells the cameras"}
+
+
+def test_a_lone_camera_that_says_other_numbers_than_the_rig_is_named() -> None:
+    found = {KF: ["/keyframes"], FT: ["/feature_tracks"], RIG: ["/camera_rig"], INFO: ["/a", "/b"]}
+    said = {"/camera_rig": camera("left"), "/a": camera("left", 500.0), "/b": camera("left", 400.0001)}
+    chosen = Chooser(found, lambda topic: frozenset({topic}), said.__getitem__).choose(NO_CHOICE)
+    assert chosen.left["/b"] == "/camera_rig tells the cameras"
+    assert chosen.left["/a"].endswith("with other numbers for 'left': fx = 400 px where this says 500")
 
 
 def test_two_robots_need_a_namespace() -> None:

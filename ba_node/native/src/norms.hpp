@@ -46,13 +46,14 @@ void residual_norms_as(const ProblemView& p, const StateView& s, double* out) {
       const std::int64_t o = first + l;
       const double du = q.uv[0][l] - p.uv[2 * o], dv = q.uv[1][l] - p.uv[2 * o + 1];
       const double norm = std::sqrt(du * du + dv * dv) / p.sigma[o];
-      const bool counts = x[2][l] > kMinDepth && !std::isnan(norm);
+      const double y[3] = {x[0][l], x[1][l], x[2][l]};
+      const bool counts = !is_behind(y, kLens == Lens::kMixed && cameras.fisheye[l] != 0.0) && !std::isnan(norm);
       out[o] = counts ? norm : std::numeric_limits<double>::infinity();
     }
   }
 }
 
-// out: n_obs, sigmas; infinite for points on or behind the camera plane.
+// out: n_obs, sigmas; infinite for points that their camera cannot see.
 inline void residual_norms(const ProblemView& p, const StateView& s, double* out) {
   if (std::any_of(p.model, p.model + p.n_cameras, [](std::uint8_t model) { return model != 0; }))
     residual_norms_as<Lens::kMixed>(p, s, out);

@@ -12,6 +12,8 @@
 namespace ba {
 
 constexpr int kParams = 12;
+// As in core/cameras.py: nearest depth, m; cosine of the largest angle to the axis of an equidistant camera.
+constexpr double kMinDepth = 1e-6, kLeastCosine = -0.8660254037844387;
 
 // What a whole problem needs; a lane with less distortion has zeros in the rest.
 enum class Lens : std::uint8_t { kPinhole, kRadial, kRational, kMixed };
@@ -34,28 +36,6 @@ struct Bend {
   V8 g, dg, k1, k2, p1, p2;
 };
 
-inline void bend_fisheye(const Cameras& c, V8 s8, Bend& out) {
-  for (int l = 0; l < kLanes; ++l) {
-    if (c.fisheye[l] == 0.0) continue;
-    const double s = s8[l], k1 = c.param[4][l], k2 = c.param[5][l], k3 = c.param[6][l], k4 = c.param[7][l];
-    out.p1[l] = out.p2[l] = 0.0;
-    if (s < 1e-12) {
-      out.g[l] = 1.0;
-      out.dg[l] = k1 - 1.0 / 3.0;
-      out.k1[l] = s;
-      out.k2[l] = s * s;
-      continue;
-    }
-    const double r = std::sqrt(s), th = std::atan(r), t2 = th * th;
-    const double g = th * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r;
-    const double slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + 9 * t2 * k4)));
-    out.g[l] = g;
-    out.dg[l] = (slope / (1 + s) - g) / (2 * s);
-    out.k1[l] = th * t2 / r;
-    out.k2[l] = out.k1[l] * t2;
-  }
-}
-
 template <Lens kLens>
 [[gnu::always_inline]] inline Bend bend(const Cameras& c, V8 s) {
   const V8 k1 = c.param[4], k2 = c.param[5];
@@ -75,8 +55,65 @@ template <Lens kLens>
     out.p1 = c.param[6];
     out.p2 = c.param[7];
   }
-  if constexpr (kLens == Lens::kMixed) bend_fisheye(c, s, out);
   return out;
+}
+
+// The lanes of equidistant cameras: the angle to the axis itself, so that points behind the image plane are seen too.
+template <bool kDerivatives>
+inline void project_fisheye(const V8 (&x)[3], const Cameras& c, Projected& out) {
+  for (int l = 0; l < kLanes; ++l) {
+    if (c.fisheye[l] == 0.0) continue;
+    const double X = x[0][l], Y = x[1][l], Z = x[2][l], fx = c.param[0][l], fy = c.param[1][l];
+    const double k1 = c.param[4][l], k2 = c.param[5][l], k3 = c.param[6][l], k4 = c.param[7][l];
+    const double flat2 = X * X + Y * Y, over = 1.0 / (flat2 + Z * Z);
+    double g, bend, slope = 1.0, by_k1, by_k2 = 0.0;
+    if (flat2 < 1e-12 * Z * Z) {
+      const double z3 = Z * Z * Z;
+      g = 1.0 / Z;
+      bend = 2.0 * (k1 - 1.0 / 3.0) / z3;
+      by_k1 = flat2 / z3;
+    } else {
+      const double flat = std::sqrt(flat2), th = std::atan2(flat, Z), t2 = th * th;
+      g = th * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / flat;
+      slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + 9 * t2 * k4)));
+      bend = (slope * Z * over - g) / flat2;
+      by_k1 = th * t2 / flat;
+      by_k2 = by_k1 * t2;
+    }
+    out.uv[0][l] = fx * g * X + c.param[2][l];
+    out.uv[1][l] = fy * g * Y + c.param[3][l];
+    if constexpr (kDerivatives) {
+      out.d_x[0][0][l] = fx * (g + bend * X * X);
+      out.d_x[0][1][l] = fx * bend * X * Y;
+      out.d_x[0][2][l] = -fx * slope * over * X;
+      out.d_x[1][0][l] = fy * bend * X * Y;
+      out.d_x[1][1][l] = fy * (g + bend * Y * Y);
+      out.d_x[1][2][l] = -fy * slope * over * Y;
+      out.d_intrinsics[0][0][l] = g * X;
+      out.d_intrinsics[0][1][l] = fx * by_k1 * X;
+      out.d_intrinsics[0][2][l] = fx * by_k2 * X;
+      out.d_intrinsics[1][0][l] = g * Y;
+      out.d_intrinsics[1][1][l] = fy * by_k1 * Y;
+      out.d_intrinsics[1][2][l] = fy * by_k2 * Y;
+    }
+  }
+}
+
+// Which lanes no camera of their model can see, cameras.behind of core/cameras.py; with keep, as far as a number is left.
+template <Lens kLens>
+[[gnu::always_inline]] inline Mask behind(const V8 (&x)[3], const Cameras& c, bool keep) {
+  const Mask plane = keep ? magnitude(x[2]) < kMinDepth * 1e-6 : x[2] <= kMinDepth;
+  if constexpr (kLens != Lens::kMixed) return plane;
+  const V8 distance = root(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
+  const Mask beyond = (x[2] <= kLeastCosine * distance) | (distance <= kMinDepth);
+  const Mask fisheye = c.fisheye != 0.0;
+  return (fisheye & beyond) | (~fisheye & plane);
+}
+
+inline bool is_behind(const double (&x)[3], bool fisheye) {
+  if (!fisheye) return x[2] <= kMinDepth;
+  const double distance = std::sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
+  return x[2] <= kLeastCosine * distance || distance <= kMinDepth;
 }
 
 template <Lens kLens, bool kDerivatives>
@@ -122,6 +159,7 @@ template <Lens kLens, bool kDerivatives>
     out.d_intrinsics[1][1] = fy * n.k1 * b;
     out.d_intrinsics[1][2] = fy * n.k2 * b;
   }
+  if constexpr (kLens == Lens::kMixed) project_fisheye<kDerivatives>(x, c, out);
 }
 
 }  // namespace ba

@@ -26,7 +26,6 @@ struct Rules {
   Cheirality cheirality = Cheirality::kKeep;
 };
 
-constexpr double kMinDepth = 1e-6;
 constexpr double kBehindNorm = 100.0;
 
 // The images of eight observations.
@@ -155,8 +154,7 @@ class Rows {
       y[i] = im.rotation[3 * i] * x[0] + im.rotation[3 * i + 1] * x[1] + im.rotation[3 * i + 2] * x[2] + im.translation[i];
     const V8 whiten = load(&l_.inverse_sigma[at]);
     const bool keep = rules_.cheirality == Cheirality::kKeep;
-    const Mask behind = keep ? magnitude(y[2]) < kMinDepth * 1e-6 : y[2] <= kMinDepth;
-    const Mask none = whiten == 0.0, off = behind | none;
+    const Mask hidden = behind<kLens>(y, im.cameras, keep), none = whiten == 0.0, off = hidden | none;
     y[0] = select(off, V8{}, y[0]);
     y[1] = select(off, V8{}, y[1]);
     y[2] = select(off, splat(1.0), y[2]);
@@ -166,7 +164,7 @@ class Rows {
     out.residual[0] = (q.uv[0] - load(&l_.u[at])) * scale;
     out.residual[1] = (q.uv[1] - load(&l_.v[at])) * scale;
     robust(out.residual[0] * out.residual[0] + out.residual[1] * out.residual[1], out.cost, out.weight[0]);
-    if (!keep) out.cost = select(behind & ~none, splat(cost_of(kBehindNorm)), out.cost);
+    if (!keep) out.cost = select(hidden & ~none, splat(cost_of(kBehindNorm)), out.cost);
     V8 depth_scale{};
     if constexpr (kDepth) {
       V8 cost;
@@ -266,7 +264,10 @@ class Rows {
       for (std::int64_t at = kLanes * l_.slot_begin[b]; at < kLanes * l_.slot_begin[b + 1]; ++at) {
         const double* r = &image_[stride_ * l_.slot_image[at]];
         const int l = static_cast<int>(at % kLanes);
-        if (r[6] * x[0][l] + r[7] * x[1][l] + r[8] * x[2][l] + r[11] <= kMinDepth) layout.inverse_sigma[at] = 0.0;
+        double y[3];
+        for (int i = 0; i < 3; ++i) y[i] = r[3 * i] * x[0][l] + r[3 * i + 1] * x[1][l] + r[3 * i + 2] * x[2][l] + r[9 + i];
+        const bool fisheye = l_.lens == Lens::kMixed && r[12 + kParams] != 0.0;
+        if (is_behind(y, fisheye)) layout.inverse_sigma[at] = 0.0;
       }
     }
   }
