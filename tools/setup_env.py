@@ -212,8 +212,8 @@ class Environment:
         """Make every Python of the environment start with variables that lead into it."""
         site = self.venv / "lib" / f"python{dotted(sys.version_info[:2])}" / "site-packages"
         shutil.copyfile(self.root / "tools" / "venv_hook.py", site / "ba_node_venv.py")
-        # Such files run in alphabetical order: this one before ros_wheels_bootstrapper.pth.
-        (site / "ba_node_venv.pth").write_text("import ba_node_venv\n")
+        # Such files run in alphabetical order: this one before all others.
+        (site / "0_ba_node_venv.pth").write_text("import ba_node_venv\n")
 
     def interfaces(self) -> None:
         """Build the interface packages that are missing and install them into the environment."""

@@ -4,11 +4,16 @@
 
 tools/setup_env.py installs this file as module `ba_node_venv`, which runs before the hook of the ROS wheels. That one
 starts Python once more with LD_LIBRARY_PATH on their libraries, unless a variable says that it already has.
+
+A Python that is interrupted while it looks for such hooks ends with a traceback; where it is to run `ba`, it ends as
+ba_node/cli/interrupts.py has it. A signal that comes while Python is started once more waits until that one is here.
 """
 
+# What Python has imported by itself, or has built in: the others take their time.
+import _signal as signal  # type: ignore[import-not-found]  # typed as signal
 import os
 import sys
-from collections.abc import MutableMapping
+from _collections_abc import MutableMapping
 
 WHEELS_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
@@ -32,5 +37,21 @@ def enter(environ: MutableMapping[str, str], prefix: str) -> None:
         environ.pop(WHEELS_GUARD, None)
 
 
+def end_quietly(words: list[str]) -> None:
+    """Take the signals over where a command line, the interpreter first, is that of `ba`."""
+    if any(os.path.basename(word) == "ba" or word == "ba_node.cli.main" for word in words[1:3]):  # noqa: PTH119
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, _end)
+        # What is blocked stays so in the Python that this one turns into, and is kept.
+        how = signal.SIG_UNBLOCK if WHEELS_GUARD in os.environ else signal.SIG_BLOCK
+        signal.pthread_sigmask(how, (signal.SIGINT, signal.SIGTERM))
+
+
+def _end(number: int, _frame: object) -> None:
+    os.write(2, b"ba: interrupted\n" if number == signal.SIGINT else b"ba: terminated\n")
+    os._exit(128 + number)
+
+
 if __name__ == "ba_node_venv":
+    end_quietly(sys.orig_argv)
     enter(os.environ, sys.prefix)

@@ -12,6 +12,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ba_node.cli import interrupts
 from ba_node.cli.console import facts, table
 
 if TYPE_CHECKING:
@@ -33,8 +34,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the demo."""
     from ba_node.io.files import locked_folder  # noqa: PLC0415
     from ba_node.offline.demo import run as run_demo  # noqa: PLC0415
-    from ba_node.offline.demo import shipped_bag, write  # noqa: PLC0415
+    from ba_node.offline.demo import shipped_bag, stop_processes, write  # noqa: PLC0415
 
+    interrupts.at_interrupt(stop_processes)
     with locked_folder(args.out):
         outcome = run_demo(args.bag or shipped_bag(), args.out, lambda text: print(text, flush=True))
         errors = write(outcome, args.out)

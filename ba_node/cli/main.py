@@ -11,12 +11,26 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from ba_node import __version__
-from ba_node.cli import convert, demo, evaluate, params, play, replay, robustness, solve, steps, synth, thesis
+from ba_node.cli import (
+    convert,
+    demo,
+    evaluate,
+    interrupts,
+    params,
+    play,
+    replay,
+    robustness,
+    solve,
+    steps,
+    synth,
+    thesis,
+)
 from ba_node.cli import map as map_command
 
 COMMANDS: dict[str, ModuleType] = {
@@ -25,6 +39,7 @@ COMMANDS: dict[str, ModuleType] = {
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130
+FAULT = 1
 _ROS_PACKAGES = (
     "rclpy",
     "ba_msgs",
@@ -78,7 +93,31 @@ def build_parser(command: str | None) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; return its exit code: 0, 2 for wrong input, 3 if results need a look, 130 when interrupted."""
+    """Run a command; return its exit code: 0, 2 for wrong input, 3 if results need a look, 130 when interrupted.
+
+    In a process that is there for ``ba`` alone it does not return but ends it, as a signal may come until the very end.
+    """
+    if argv is not None or not interrupts.begun():
+        return _run(argv)
+    interrupts.at_interrupt(_discard_files)
+    try:
+        code: Any = _run(None)
+    except SystemExit as stop:
+        code = stop.code
+    except BaseException:
+        traceback.print_exc()
+        code = FAULT
+    return interrupts.leave(code if isinstance(code, int) else FAULT if code else 0)
+
+
+def _discard_files() -> None:
+    """Remove files that are half written, if any have been begun: their module is slow to import."""
+    files = sys.modules.get("ba_node.io.files")
+    if files is not None:
+        files.discard_partials()
+
+
+def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = next((word for word in arguments if not word.startswith("-")), "")
     args = build_parser(command).parse_args(arguments)

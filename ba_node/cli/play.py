@@ -11,6 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from ba_node.cli import interrupts
 from ba_node.cli.console import progress_bar
 
 SUMMARY = "publish a recording on live topics"
@@ -55,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play."""
-    from ba_node.ros.play import Listener, PlayOptions, play  # noqa: PLC0415
+    from ba_node.ros.play import Listener, PlayOptions, play, take_leave  # noqa: PLC0415
 
     remaps = [word for remap in args.remap for word in ("-r", remap)]
     options = PlayOptions(
@@ -68,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
         topics=args.topics,
         ros_args=("--ros-args", *remaps) if remaps else (),
     )
+    interrupts.at_interrupt(take_leave)
     with progress_bar("play", "messages") as progress:
         summary = play(args.bag, options, Listener(progress, lambda text: print(f"ba: {text}", file=sys.stderr)))
     for topic, count in summary.published.items():

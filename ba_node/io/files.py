@@ -53,7 +53,6 @@ def whole_file(path: Path | str, *, durable: bool = False) -> Iterator[IO[bytes]
     _require_replaceable(path)
     _sweep(path)
     partial, descriptor, lock = _create(path)
-    _partials.add(partial)
     try:
         with io.BufferedWriter(_Raw(descriptor, path)) as stream:
             yield stream
@@ -172,15 +171,21 @@ def _create(path: Path) -> tuple[Path, int, int]:
     """Return a new file beside a path: its name, its descriptor, and a second one that holds the lock."""
     for _ in range(_TRIES):
         partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
+        _partials.add(partial)  # before it is there: a signal may come between
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        with _naming(path):
-            descriptor = os.open(partial, flags, _MODE)
+        try:
+            with _naming(path):
+                descriptor = os.open(partial, flags, _MODE)
+        except BaseException:
+            _partials.discard(partial)
+            raise
         with contextlib.suppress(BlockingIOError):
             _lock(descriptor)
             # Another process may have taken it for one that was left, before it was locked.
             if os.fstat(descriptor).st_nlink:
                 return partial, descriptor, os.dup(descriptor)
         os.close(descriptor)
+        _partials.discard(partial)
     raise OSError(errno.EAGAIN, "another process removes what is written", str(path))
 
 

@@ -148,6 +148,15 @@ def _read(bag: Path) -> tuple[list[Keyframe], Poses, float]:
     return keyframes, truth, (max(stamps) - min(stamps)) * 1e-9
 
 
+def stop_processes() -> None:
+    """End the processes of a demo that is itself about to end."""
+    for process in _running.copy():
+        process.stop()
+
+
+_running: list[_Process] = []
+
+
 class _Process:
     """A process of the demo, with a log. Use it as a context manager: it is over when the block is.
 
@@ -171,18 +180,24 @@ class _Process:
                 self._command, stdout=stream, stderr=subprocess.STDOUT, start_new_session=True
             )
         self.pid = self._process.pid
+        _running.append(self)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._process.poll() is None and (self._interrupt or kind is not None):
+        self.stop(interrupt=self._interrupt or kind is not None)
+        if kind is None:
+            self.check()
+
+    def stop(self, *, interrupt: bool = True) -> None:
+        """Wait for its end, after a SIGINT or without, and not for ever."""
+        if self._process.poll() is None and interrupt:
             self._process.send_signal(signal.SIGINT)
         try:
             self._process.wait(_STOP_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        if kind is None:
-            self.check()
+        _running.remove(self)
 
     @property
     def failed(self) -> bool:

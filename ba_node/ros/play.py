@@ -45,6 +45,7 @@ _POLL_S = 0.02
 _ACK_TIMEOUT_S = 10.0
 _LATCHED_DEPTH = 10
 CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
+_playing: list[Any] = []
 _LATCHED_TYPES = (INPUT_TYPES["camera_rig"], INPUT_TYPES["camera_info"])
 
 
@@ -148,12 +149,21 @@ def _node(options: PlayOptions) -> Iterator[Any]:
             )
         except _WRONG_OPTIONS as error:
             raise PlayError(f"namespace or remapping: {error}") from error
+        _playing.append(node)
         try:
             yield node
         finally:
+            _playing.remove(node)
             node.destroy_node()
     finally:
         rclpy.try_shutdown(context=context)
+
+
+def take_leave() -> None:
+    """Let subscribers know that the play is over: the process is about to end in the middle of it."""
+    for node in _playing:
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
 
 
 class _Time:

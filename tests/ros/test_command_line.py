@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import re
 import shutil
@@ -59,9 +60,9 @@ def _shows(wanted: str, *words: str) -> str:
 
 
 @pytest.fixture
-def played(start_node: Callable[..., Any], make_peer: Callable[..., Any], scene: SyntheticData) -> Any:
+def played(start_node: Callable[..., Any], make_peer: Callable[..., Any], scene: SyntheticData, tmp_path: Path) -> Any:
     """Return a node that has refined a scene."""
-    node, peer = start_node(), make_peer()
+    node, peer = start_node("--ros-args", "-p", f"node.map_folder:={tmp_path}"), make_peer()
     peer.advertise()
     peer.play(scene)
     return node
@@ -128,6 +129,63 @@ def test_services_and_action(played: Any, tmp_path: Path) -> None:
     assert "forgot 6 keyframes" in _ros2("service", "call", f"{NODE}/reset", "std_srvs/srv/Trigger")
     assert "success=True" in _ros2("service", "call", f"{NODE}/load_map", "ba_msgs/srv/LoadMap", f"{{path: {path}}}")
     assert played.stop() == 0
+
+
+def test_answers_that_warn_and_inform_in_turn(
+    start_node: Callable[..., Any], make_peer: Callable[..., Any], scene: SyntheticData, tmp_path: Path
+) -> None:
+    """A goal while there is no data, a recording, the goal again; a save that fails, then a good one."""
+    node, peer = start_node("--ros-args", "-p", f"node.map_folder:={tmp_path}"), make_peer()
+    goal = ("action", "send_goal", f"{NODE}/optimize", "ba_msgs/action/Optimize", "{max_iterations: 5}")
+    peer.advertise()
+    peer.connect()
+    assert "Goal finished with status: ABORTED" in _ros2(*goal, code=None)
+    peer.play(scene)
+    assert "Goal finished with status: SUCCEEDED" in _ros2(*goal)
+    save = ("service", "call", f"{NODE}/save_map", "ba_msgs/srv/SaveMap")
+    for path, success in (("none/site", False), ("site", True), ("../site", False), ("site", True)):
+        assert f"success={success}" in _ros2(*save, f"{{path: {path}}}")
+    assert "forgot 6 keyframes" in _ros2("service", "call", f"{NODE}/reset", "std_srvs/srv/Trigger")
+    assert "Goal finished with status: ABORTED" in _ros2(*goal, code=None)
+    assert node.stop() == 0
+    assert "Traceback" not in node.err
+
+
+def test_pause_and_jump_of_the_clock(played: Any, make_peer: Callable[..., Any], scene: SyntheticData) -> None:
+    """After nine seconds without data, and with a clock that is set back by an hour, poses and transforms go on."""
+    time.sleep(9.0)
+    assert "level" in _ros2("topic", "echo", "--once", "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    hour_ns, peer = 3600 * 10**9, make_peer()
+    peer.advertise()
+    keyframes = tuple(
+        dataclasses.replace(k, keyframe_id=k.keyframe_id + 100, stamp_ns=k.stamp_ns - hour_ns) for k in scene.keyframes
+    )
+    tracks = tuple(
+        tuple(dataclasses.replace(image, keyframe_id=image.keyframe_id + 100) for image in images)
+        for images in scene.tracks
+    )
+    peer.play(dataclasses.replace(scene, keyframes=keyframes, tracks=tracks))
+    seconds = keyframes[-1].stamp_ns // 10**9
+    told = _shows("transforms:", "topic", "echo", "--once", "/tf", "tf2_msgs/msg/TFMessage")
+    found = re.search(r"sec: (\d+)", told)
+    assert found is not None and abs(int(found[1]) - seconds) < 300, told
+    assert played.stop() == 0
+
+
+def test_two_robots_in_two_namespaces(
+    start_node: Callable[..., Any], make_peer: Callable[..., Any], scene: SyntheticData, tmp_path: Path
+) -> None:
+    nodes = {}
+    for name, count in (("left", KEYFRAMES), ("right", 3)):
+        nodes[name] = start_node("--ros-args", "-r", f"__ns:=/{name}", "-p", f"node.map_folder:={tmp_path}")
+        peer = make_peer(namespace=name)
+        peer.advertise()
+        peer.play(dataclasses.replace(scene, keyframes=scene.keyframes[:count], tracks=scene.tracks[:count]))
+    for name, count in (("left", KEYFRAMES), ("right", 3)):
+        call = ("service", "call", f"/{name}/ba_node/save_map", "ba_msgs/srv/SaveMap", f"{{path: {name}}}")
+        assert f"keyframes={count}" in _ros2(*call)
+        assert (tmp_path / f"{name}.npz").is_file()
+    assert [node.stop() for node in nodes.values()] == [0, 0]
 
 
 def test_topics(played: Any) -> None:

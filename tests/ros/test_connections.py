@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -173,6 +175,32 @@ def test_keyframes_out_of_order_are_sorted_by_their_stamps(
     last = peer.received["report"][-1]
     assert last.keyframes + last.fixed_keyframes == KEYFRAMES
     assert node.stop() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_ns", [0, 9 * 10**9])
+def test_a_pause_of_nine_seconds_changes_nothing(
+    shift_ns: int, start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
+) -> None:
+    """The stamps go on where they stopped, or nine seconds later; map -> odom is repeated meanwhile."""
+    node, peer = start_node(), _connected(make_peer)
+    transforms = peer.received["/tf"]
+    peer.node.create_subscription(message_class("tf2_msgs/msg/TFMessage"), "/tf", transforms.append, 100)
+    _send(peer, _part(scene, slice(0, 3)))
+    end_s = time.monotonic() + 9.0
+    peer.until(lambda: time.monotonic() > end_s, "the end of the pause")
+    assert len(transforms) > 20
+    _send(peer, _part(scene, slice(3, None)), shift_ns)
+    expected = {k.stamp_ns + (shift_ns if i >= 3 else 0) for i, k in enumerate(scene.keyframes)}
+    peer.until(lambda: _stamps(peer) >= expected, "every keyframe")
+    assert {report.session_id for report in peer.received["report"]} == {0}
+    stamps = [stamp_ns_from_message(message.transforms[0].header.stamp) for message in transforms]
+    assert np.all(np.diff(stamps) > 0)
+    assert node.stop() == 0
+
+
+def _part(scene: SyntheticData, rows: slice) -> SyntheticData:
+    return dataclasses.replace(scene, keyframes=scene.keyframes[rows], tracks=scene.tracks[rows])
 
 
 def _ids(peer: Any) -> set[int]:

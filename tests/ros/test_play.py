@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -264,6 +267,21 @@ def test_a_node_goes_by_that_time(bag: Path, scene: SyntheticData, make_peer: Ma
     # By the clock of the recording the newest pose is young; by the one on the wall it is years old.
     assert 0.0 <= reports[-1].stamp_latency_p50_s < 10.0
     assert node.stop() == 0
+
+
+@pytest.mark.dds
+def test_a_loop_goes_on_until_it_is_interrupted(bag: Path, scene: SyntheticData, make_peer: MakePeer) -> None:
+    peer = make_peer()
+    received = _collect(peer)
+    words = ["play", str(bag), "--rate", "0", "--loop"]
+    command = ["env", "--default-signal=INT", sys.executable, "-m", "ba_node.cli.main", *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        wanted = 3 * len(scene.keyframes)
+        peer.until(lambda: len(received["keyframes"]) > wanted, "the fourth round")
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=30)
+    assert (process.returncode, error) == (130, "ba: interrupted\n")
+    peer.until(lambda: peer.node.count_publishers("/keyframes") == 0, "the publishers to be gone", 5.0)
 
 
 def test_a_start_after_the_end_is_refused(bag: Path) -> None:
