@@ -31,11 +31,13 @@ class Kind(enum.Enum):
     BACK = "its stamp lies far before the newest"
     FORWARD = "its stamp lies far after the newest"
     REPEAT = "it is known, and lies far before the newest"
+    REUSED = "its id is that of another keyframe"
+    LATE = "its stamp lies before the newest, by less than what begins a session"
     FRAME = "its pose is in another frame"
     HIGHER = "its session is higher"
 
 
-# Reason in REASONS where it is turned away. What only repeats what is known is turned away by the scene.
+# Reason in REASONS where it is turned away. The others go to the scene, which knows what to do with one alone.
 _REASON = {
     Kind.BACK: "bad_stamp",
     Kind.FORWARD: "bad_stamp",
@@ -84,6 +86,11 @@ class Candidate:
     text: str
     run: int = 1
     against: int = 0
+
+    @property
+    def is_error(self) -> bool:
+        """Return True if something is wrong with it, unless others confirm it."""
+        return self.kind in _REASON
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -149,6 +156,10 @@ def agree(scene: Scene, candidate: Candidate, keyframe: Keyframe) -> bool:
         return keyframe.session_id == last.session_id
     if candidate.kind is Kind.FRAME:
         return plain(keyframe.frame_id) == plain(last.frame_id)
+    if candidate.kind is Kind.REUSED:
+        return keyframe.stamp_ns > last.stamp_ns
+    if candidate.kind is Kind.LATE:
+        return keyframe.stamp_ns > last.stamp_ns and not _fill_a_gap(scene, last, keyframe)
     if candidate.kind is Kind.REPEAT:
         rows = [scene.find_keyframe(one.keyframe_id) for one in (last, keyframe)]
         places = [int(scene.places()[row]) for row in rows if row is not None]
@@ -161,11 +172,18 @@ def agree(scene: Scene, candidate: Candidate, keyframe: Keyframe) -> bool:
     return abs(step_s) <= near_s
 
 
+def _fill_a_gap(scene: Scene, first: Keyframe, second: Keyframe) -> bool:
+    """Return True if two keyframes belong between the same two that are known: what came late, not a second start."""
+    stamps = scene.keyframes.stamp_ns[scene.order]
+    place = np.searchsorted(stamps, [first.stamp_ns, second.stamp_ns])
+    return bool(place[0] == place[1] > 0)
+
+
 def begin_of(scene: Scene, candidate: Candidate) -> Begin:
     """Return how a confirmed candidate begins a session."""
     if candidate.kind in (Kind.BACK, Kind.FORWARD) and is_lone(scene, candidate, scene.config.max_reorder_s):
         return Begin(replaces=True)
-    kind = "frame_changed" if candidate.kind is Kind.FRAME else "clock_jump"
+    kind = {Kind.FRAME: "frame_changed", Kind.REUSED: "reused_id"}.get(candidate.kind, "clock_jump")
     why = {
         Kind.FRAME: "header.frame_id must not change within a session",
         Kind.REPEAT: "the recording plays again under the same session_id",
@@ -189,8 +207,8 @@ def refuse_lone(before: Scene, log: RejectionLog) -> None:
 
 
 def dropped(candidate: Candidate, then: Decision) -> Decision:
-    """Return a decision with what is held turned away before; what only repeats what is known goes to the scene."""
-    if candidate.kind is Kind.REPEAT:
+    """Return a decision with what is held turned away before, or given to the scene as if it had never been held."""
+    if candidate.kind not in _REASON:
         return then.also(admitted=tuple(Admitted(item) for item in candidate.items))
     refused = tuple(Refusal(one, _REASON[candidate.kind], _refusal_text(candidate, one)) for one in candidate.keyframes)
     tracks = tuple(
@@ -228,6 +246,14 @@ def unusual_s(scene: Scene) -> float:
     if limit_s <= 0.0 or len(stamps) < 2:
         return limit_s
     return max(limit_s, _USUAL * NS * float(np.median(np.diff(stamps))))
+
+
+def late_s(scene: Scene) -> float:
+    """Return how far back a keyframe may be without a second look, s; infinite where nothing is known yet."""
+    stamps = scene.keyframes.stamp_ns[scene.order[-_RECENT:]]
+    if scene.config.max_reorder_s <= 0.0 or len(stamps) < 2:
+        return float("inf")
+    return _USUAL * NS * float(np.median(np.diff(stamps)))
 
 
 def same_pose(scene: Scene, row: int, keyframe: Keyframe) -> bool:

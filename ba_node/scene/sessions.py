@@ -33,6 +33,7 @@ from ba_node.scene.candidates import (
     begin_of,
     dropped,
     is_lone,
+    late_s,
     never_began,
     newest_ns,
     same_pose,
@@ -44,9 +45,9 @@ if TYPE_CHECKING:
     from ba_node.measurements import Measurement
     from ba_node.scene.scene import Scene
 
-# Keyframes in a row that confirm each other. A recording that plays again repeats what is known word for word, as a
-# message that comes twice does: it takes one more.
-_NEEDED = {Kind.REPEAT: 3}
+# Keyframes in a row that confirm each other. Messages come twice, late, or under a wrong id now and then, which is no
+# jump: these take one more.
+_NEEDED = {Kind.REPEAT: 3, Kind.REUSED: 3, Kind.LATE: 3}
 _NEEDED_ELSE = 2
 # Keyframes of the current session that outvote what is held.
 _AGAINST = 3
@@ -156,12 +157,26 @@ class Sessions:
         if frame and scene.frame_id and frame != scene.frame_id:
             text = f"{name} is in frame {frame!r}, those before in {scene.frame_id!r}"
             return Kind.FRAME, keyframe, text
+        if row is None and ahead_s < 0.0 and self._goes_on(scene, keyframe):
+            assert self.state.candidate is not None
+            return self.state.candidate.kind, keyframe, back
         if is_back:
             return Kind.BACK, keyframe, back
-        if row is None and 0.0 < unusual_s(scene) < ahead_s:
+        if row is not None:
+            return Kind.REUSED, keyframe, f"{name} has the id of another keyframe"
+        if -ahead_s > late_s(scene):
+            return Kind.LATE, keyframe, back
+        if 0.0 < unusual_s(scene) < ahead_s:
             text = f"{name} is {ahead_s:.1f} s newer than the newest (scene.max_reorder_s = {limit_s:g})"
             return Kind.FORWARD, keyframe, text
         return None
+
+    def _goes_on(self, scene: Scene, keyframe: Keyframe) -> bool:
+        """Return True if a keyframe comes right after one that is held because it lies before the newest."""
+        candidate = self.state.candidate
+        if candidate is None or candidate.kind not in (Kind.BACK, Kind.LATE) or not candidate.run:
+            return False
+        return 0.0 < (keyframe.stamp_ns - candidate.last.stamp_ns) * NS <= unusual_s(scene)
 
     def _support(self, scene: Scene, kind: Kind, keyframe: Keyframe, text: str) -> Decision:
         """Hold a keyframe, and let it confirm what is held already if it agrees with that."""
@@ -232,7 +247,7 @@ class Sessions:
         doubted = dataclasses.replace(candidate, run=0, against=candidate.against + 1)
         if doubted.against < _AGAINST:
             return Decision(dataclasses.replace(state, candidate=doubted), (Admitted(keyframe),))
-        worse = _more(state.distrust) if len(doubted.keyframes) > 1 else state.distrust
+        worse = _more(state.distrust) if doubted.is_error and len(doubted.keyframes) > 1 else state.distrust
         given_up = Decision(dataclasses.replace(state, candidate=None, distrust=worse), (Admitted(keyframe),))
         return dropped(doubted, given_up)
 
@@ -265,7 +280,7 @@ def _is_theirs(scene: Scene, candidate: Candidate, tracks: FeatureTracks) -> boo
     """Return True for tracks that name a keyframe of the scene, but belong to one that is held under its id."""
     if scene.find_keyframe(tracks.keyframe_id) is None:
         return False
-    return candidate.holds(tracks) or (candidate.kind is Kind.REPEAT and candidate.run > 0)
+    return candidate.holds(tracks) or (candidate.kind in (Kind.REPEAT, Kind.REUSED) and candidate.run > 0)
 
 
 def _plays_again(scene: Scene, candidate: Candidate) -> bool:

@@ -286,6 +286,37 @@ def test_an_id_that_is_used_again_is_named_and_its_tracks_do_no_harm() -> None:
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
+@pytest.mark.parametrize("shift_ns", [0, 20 * S])
+def test_a_front_end_that_restarts_under_the_same_ids_is_not_refused_for_ever(shift_ns: int) -> None:
+    """Its poses begin at another place, so these are other keyframes, whatever their stamps."""
+    again = [
+        dataclasses.replace(m, position=m.position + 5.0) if isinstance(m, Keyframe) else m
+        for part in groups()
+        for m in stamped(part, shift_ns)
+    ]
+    played = Played([*messages(), *again])
+    assert [len(estimate.trajectory) for _, estimate in played.finished] == [N]
+    assert played.ids == all_ids()
+    assert not played.rejected
+    assert "has the id of another keyframe: a new session begins" in played.scene.log.warnings["reused_id"]
+
+
+@pytest.mark.parametrize("back_ns", [3 * S, 4 * S + 1, 9 * S, 10 * S + 3 * S // 10])
+def test_a_clock_that_is_set_back_by_less_than_the_bound_does_not_mix_two_maps(back_ns: int) -> None:
+    """Keyframes are 0.25 s apart: the whole map spans less than the bound."""
+    parts = groups()
+    played = Played(joined([*parts[:12], *(stamped(part, -back_ns) for part in parts[12:])]))
+    assert [len(estimate.trajectory) for _, estimate in played.finished] == [12]
+    assert played.ids == all_ids()[12:]
+    assert not played.rejected
+
+
+def test_a_block_of_keyframes_that_comes_late_is_sorted_in() -> None:
+    parts = groups()
+    played = Played(joined([*parts[:1], *parts[4:], *parts[1:4]]))
+    assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
+
+
 USELESS: dict[str, Callable[[], Measurement]] = {
     "tracks without rows": lambda: _tracks(uv=np.empty((0, 2)), track_id=np.empty(0, np.uint64)),
     "tracks of NaN": lambda: _tracks(uv=np.full_like(data().tracks[5][0].uv, np.nan)),
