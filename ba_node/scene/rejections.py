@@ -35,6 +35,7 @@ REASONS: dict[str, str] = {
 NOTICES: dict[str, str] = {
     "reordered": "A keyframe whose stamp lies before the newest one; it was sorted in.",
     "repeated_guess": "A second guess for a track; the first one stays.",
+    "ids_reused": "A track whose views went over to another point; the older views keep theirs under another id.",
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
     "empty_tracks": "A tracks message without rows.",
     "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
@@ -45,6 +46,7 @@ NOTICES: dict[str, str] = {
 WARNINGS: dict[str, str] = {
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
     "far_from_origin": "Keyframes so far from the origin that the float32 of ~/points loses millimetres.",
+    "ids_reused": "Track ids that were used again for other points.",
     "distortion_folds": "A camera whose distortion folds over inside its image.",
     "clock_jump": "The stamps went far back, or a recording plays again: a new session began.",
     "lower_session": "Keyframes came of a lower session only: it began anew.",

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from ba_node.core.problem import Cameras
     from ba_node.scene.candidates import Refusal
 
+# 2^64 over the golden ratio: its multiples, modulo 2^64, are all different and spread evenly.
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
 
 class Scene:
     """What is known in one session. All methods leave it consistent; none raises on bad data.
@@ -160,6 +163,35 @@ class Scene:
         mine = [tracks for tracks in other.pending if other.find_keyframe(tracks.keyframe_id) is None]
         other.pending = [tracks for tracks in other.pending if other.find_keyframe(tracks.keyframe_id) is not None]
         self.pending += mine
+
+    def split(self, landmarks: IntArray, since: IntArray) -> IntArray:
+        """Give the older views of some tracks landmarks of their own: their ids have become another point's.
+
+        What was known of a landmark stays with its older views, under an id that nobody has; the track keeps the newer
+        ones and has no position.
+
+        Args:
+            landmarks: (n,) rows, all different, each with older views.
+            since: (n,) place in the order of time of the first keyframe whose views stay.
+
+        Returns:
+            (n,) rows of the landmarks of the older views.
+        """
+        table, sightings = self.landmarks, self.sightings
+        number = np.full(len(table), -1)
+        number[landmarks] = np.arange(len(landmarks))
+        rows = np.sort(self.views_of(landmarks))
+        of = number[sightings.landmark[rows]]
+        old = self.places()[sightings.keyframe[rows]] < since[of]
+        known = {name: getattr(table, name)[landmarks] for name in ("position", "guess", "has_position", "has_guess")}
+        ids = self._unknown_ids(len(landmarks))
+        added = table.append(len(landmarks), track_id=ids, last_seen=table.last_seen[landmarks], **known)
+        self._landmark_rows.insert(ids, added)
+        table.position[landmarks] = table.guess[landmarks] = np.nan
+        table.has_position[landmarks] = table.has_guess[landmarks] = False
+        sightings.landmark[rows[old]] = added[of[old]]
+        self._link_rows(rows, np.concatenate([landmarks, added]))
+        return added
 
     def end_pending(self) -> None:
         """Give up on everything that still waits."""
@@ -393,16 +425,31 @@ class Scene:
         self._keyframe_rows = {int(k): row for row, k in enumerate(self.keyframes.keyframe_id)}
         self._order = None
 
+    def _unknown_ids(self, n: int) -> IdArray:
+        """Return n ids that no track has, spread over all there are."""
+        ids: IdArray = np.empty(0, np.uint64)
+        begin = 1
+        while len(ids) < n:
+            spread = np.arange(begin, begin + 2 * n, dtype=np.uint64) * _GOLDEN
+            ids = np.concatenate([ids, spread[self._landmark_rows.find(spread) < 0]])
+            begin += 2 * n
+        return ids[:n]
+
     def _link(self) -> None:
-        landmark = self.sightings.landmark
-        order = np.argsort(landmark, kind="stable")
-        same = landmark[order[1:]] == landmark[order[:-1]]
-        self.sightings.previous[:] = -1
+        self._link_rows(np.arange(len(self.sightings)), np.arange(len(self.landmarks)))
+
+    def _link_rows(self, rows: IntArray, landmarks: IntArray) -> None:
+        """Find anew which observations belong to some landmarks: ``rows``, ascending, are all that they have."""
+        landmark = self.sightings.landmark[rows]
+        order = rows[np.argsort(landmark, kind="stable")]
+        landmark = self.sightings.landmark[order]
+        same = landmark[1:] == landmark[:-1]
+        self.sightings.previous[rows] = -1
         self.sightings.previous[order[1:][same]] = order[:-1][same]
-        self.landmarks.last[:] = -1
+        self.landmarks.last[landmarks] = -1
         # Rows ascend within a landmark, so the last write is its newest row.
-        self.landmarks.last[landmark[order]] = order
-        self.landmarks.views[:] = np.bincount(landmark, minlength=len(self.landmarks))
+        self.landmarks.last[landmark] = order
+        self.landmarks.views[landmarks] = np.bincount(landmark, minlength=len(self.landmarks))[landmarks]
 
 
 def _same(a: Cameras, b: Cameras) -> bool:

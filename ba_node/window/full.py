@@ -271,6 +271,12 @@ def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArr
         scene, rows, keyframes, landmarks, origin, scene.landmarks.position[landmarks] - origin, config
     )
     now = dataclasses.replace(
-        selection, problem=problem, sightings=problem.observations, rows=rows, keyframes=keyframes, landmarks=landmarks
+        selection,
+        problem=problem,
+        sightings=problem.observations,
+        rows=rows,
+        believed=~scene.sightings.outlier[rows],
+        keyframes=keyframes,
+        landmarks=landmarks,
     )
     judge(scene, now, problem.start, config.tracks, config.solver.backend)

@@ -34,6 +34,8 @@ BULK = 10
 _LEAST_SUPPORT = 1.0 / 3.0
 # Two rays meet by chance more easily than three: they have to come as much nearer to each other.
 _TWO_VIEWS = 0.5
+# A track of as many views that do not agree is tried with its newest third.
+_DIVIDED_VIEWS = 9
 # Where fewer views than this share agree with another, the poses are bad.
 _LEAST_AGREEMENT = 0.2
 # Parallax below this many standard deviations of the rays' directions is noise.
@@ -52,49 +54,48 @@ class _Fit:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Found:
+class Agreed:
     """What the views of points agree on.
 
     Attributes:
         points: (n_pt, 3), m.
-        support: (n_pt,) how many views agree.
         good: (n_pt,) True where that is a place to believe in.
         measured: (n_pt,) True where a distance was measured by one that agrees.
-        gate: how far off a view may be and agree, sigmas.
     """
 
     points: FloatArray
-    support: NDArray[np.intp]
     good: BoolArray
     measured: BoolArray
-    gate: float
 
 
 def initial_points(
-    problem: Problem, guess: FloatArray, config: TracksConfig, backend: str = "auto", gate: float | None = None
+    problem: Problem, guess: FloatArray, config: TracksConfig, gate: float, backend: str = "auto"
 ) -> FloatArray:
     """Return first positions (n_pt, 3) of the points of a problem, NaN where none can be had yet.
 
     Args:
         problem: views of the points; its start points are not looked at.
         guess: (n_pt, 3) guesses in the frame of the problem, NaN for none.
-        config: the gates.
+        config: for the parallax.
+        gate: how far off a view may be and agree, sigmas.
         backend: kernels.
-        gate: how far off a view may be and agree, sigmas; None for what the views themselves tell.
     """
-    found = agreed_points(problem, config, backend, gate or _gate_of(problem, config, backend))
+    found = agreed_points(problem, config, gate, backend)
     points = np.where(found.good[:, None], found.points, np.nan)
     if np.isnan(guess).all():
         return points
     fit, guess_fit = _fit(problem, points, backend), _fit(problem, guess, backend)
     needed = np.where(found.measured, 1, 2)
     guess_usable = guess_fit.in_front >= needed
-    take_guess = guess_usable & ((guess_fit.median <= found.gate) | ~found.good | (guess_fit.robust <= fit.robust))
+    take_guess = guess_usable & ((guess_fit.median <= gate) | ~found.good | (guess_fit.robust <= fit.robust))
     return np.where(take_guess[:, None], guess, points)
 
 
-def _gate_of(problem: Problem, config: TracksConfig, backend: str) -> float:
-    """Return a gate that widens where the poses are bad: where hardly any view agrees with another."""
+def poses_gate(problem: Problem, config: TracksConfig, backend: str = "auto") -> float:
+    """Return how far off a view may be, sigmas: more where hardly any view agrees with another, so bad the poses are.
+
+    Args: as of :func:`initial_points`.
+    """
     rays, n = triangulation.rays_of(problem), problem.n_points
     gate = config.max_triangulation_px
     views = np.bincount(rays.point, minlength=n)
@@ -107,15 +108,29 @@ def _gate_of(problem: Problem, config: TracksConfig, backend: str) -> float:
     return widened(gate, fit.median[(wide | rough.measured) & (fit.in_front == views) & (views > 0)])
 
 
-def agreed_points(problem: Problem, config: TracksConfig, backend: str, gate: float) -> _Found:
-    """Return where most views of each point agree that it is.
+def agreed_points(problem: Problem, config: TracksConfig, gate: float, backend: str = "auto") -> Agreed:
+    """Return where most views of each point agree that it is; where they do not, the newest third of them.
 
     Args: as of :func:`initial_points`.
     """
-    return _consensus(triangulation.rays_of(problem), problem.n_points, gate, config, backend)
+    rays, n = triangulation.rays_of(problem), problem.n_points
+    found = _agreed(rays, n, config, gate, backend)
+    views = np.bincount(rays.point, minlength=n)
+    # An id may have become another point's.
+    divided = ~found.good & (views >= _DIVIDED_VIEWS)
+    if not divided.any():
+        return found
+    rank = np.arange(len(rays.point)) - (np.cumsum(views) - views).take(rays.point)
+    newest = divided.take(rays.point) & (3 * rank >= 2 * views.take(rays.point))
+    later = _agreed(rays.part(newest), n, config, gate, backend)
+    return Agreed(
+        np.where(later.good[:, None], later.points, found.points),
+        found.good | later.good,
+        np.where(later.good, later.measured, found.measured),
+    )
 
 
-def _consensus(rays: triangulation.Rays, n: int, gate: float, config: TracksConfig, backend: str) -> _Found:
+def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float, backend: str) -> Agreed:
     found, agrees = consensus.triangulate(rays, n, gate, backend)
     of = rays.part(agrees)
     views, support = np.bincount(rays.point, minlength=n), np.bincount(of.point, minlength=n)
@@ -126,7 +141,7 @@ def _consensus(rays: triangulation.Rays, n: int, gate: float, config: TracksConf
     wide &= found.parallax_rad * sharpness >= _LEAST_PARALLAX
     fits = worst <= gate * np.where(support > 2, 1.0, _TWO_VIEWS)
     good = ((wide & (support >= 2)) | found.measured) & fits & (support > _LEAST_SUPPORT * views)
-    return _Found(found.points, support, good, found.measured, gate)
+    return Agreed(found.points, good, found.measured)
 
 
 def widened(gate: float, errors: FloatArray, bulk: int = BULK) -> float:

@@ -13,6 +13,7 @@ from ba_node.core import geometry, native_kernels, triangulation
 from ba_node.window import gauge
 from ba_node.window.initial_points import agreed_points, widened
 from ba_node.window.problems import part_of, some_observations
+from ba_node.window.reuse import note_reuse, part_reused
 
 if TYPE_CHECKING:
     from ba_node.config import TracksConfig
@@ -119,7 +120,9 @@ def judge(scene: Scene, selection: Selection, state: State, tracks: TracksConfig
     obs, n_points, outlier_px = selection.sightings, selection.problem.n_points, tracks.outlier_px
     whole = dataclasses.replace(selection.problem, observations=obs, start=state)
     norm = native_kernels.residual_norms(whole, state, backend)
-    outlier = norm > widened(outlier_px, norm) if outlier_px > 0 else np.zeros(len(norm), bool)
+    # What was left out of the solve tells nothing about how good it is.
+    gate = widened(outlier_px, norm[selection.believed]) if outlier_px > 0 else np.inf
+    outlier = norm > gate
     if outlier_px > 0:
         _place_anew(scene, selection, whole, (norm, outlier), tracks, backend)
     scene.sightings.outlier[selection.rows] = outlier
@@ -129,6 +132,8 @@ def judge(scene: Scene, selection: Selection, state: State, tracks: TracksConfig
         _displace(scene, selection.landmarks[good < 2])
     error = norm * obs.sigma_px
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
+    if outlier_px > 0:
+        note_reuse(scene, part_reused(scene, selection, whole, norm, gate, backend))
     return norm
 
 
@@ -149,7 +154,7 @@ def _place_anew(
     if not len(rows):
         return
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
-    found = agreed_points(views, tracks, backend, widened(tracks.outlier_px, norm))
+    found = agreed_points(views, tracks, tracks.outlier_px, backend)
     start = dataclasses.replace(views.start, points=found.points)
     at = native_kernels.residual_norms(views, start, backend)
     supports = at <= tracks.outlier_px

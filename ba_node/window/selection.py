@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ba_node.core import native_kernels
 from ba_node.window import arrival, gauge, trial
-from ba_node.window.initial_points import SPREAD, initial_points, widened
+from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
 
 if TYPE_CHECKING:
@@ -229,9 +229,8 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
     if len(rows):
         of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
         guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        points[new] = initial_points(
-            of_new, guess, config.tracks, config.solver.backend, _gate(scene, part, new, config)
-        )
+        gate = _gate(scene, part, new, config) or poses_gate(of_new, config.tracks, config.solver.backend)
+        points[new] = initial_points(of_new, guess, config.tracks, gate, config.solver.backend)
     return _with_points(part.problem, points)
 
 

@@ -10,7 +10,7 @@ import pytest
 from ba_node.config import TracksConfig
 from ba_node.core import cameras, objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.window.initial_points import initial_points
+from ba_node.window.initial_points import initial_points, poses_gate
 
 GATES = TracksConfig(min_parallax_deg=1.0, max_triangulation_px=12.0)
 POINT = np.array([0.5, -0.3, 10.0])
@@ -35,7 +35,7 @@ def problem_of(baseline_m: float = 1.0, shift_px: float = 0.0, depth_m: float | 
 
 
 def first(problem: Problem, guess: object = (np.nan, np.nan, np.nan)) -> np.ndarray:
-    return np.asarray(initial_points(problem, np.array([guess], float), GATES)[0])
+    return np.asarray(initial_points(problem, np.array([guess], float), GATES, poses_gate(problem, GATES))[0])
 
 
 def test_two_views_with_parallax_are_triangulated() -> None:
