@@ -73,6 +73,7 @@ setup(
         "matplotlib",
         "mcap",
         "numpy",
+        "opencv-python-headless",
         "pyyaml",
         "rosbags",
         "scipy",

@@ -44,6 +44,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node import archive, window
+from ba_node.check.watch import SetUpWatch
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Estimate, Extras, SolveReport, Status
 from ba_node.measurements import CameraRig, Keyframe, Measurement
@@ -61,6 +62,7 @@ from ba_node.window.trust import Trust
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from ba_node.check.diagnosis import Diagnosis
     from ba_node.config import Config
     from ba_node.core.problem import Cameras, State
     from ba_node.core.result import Iteration
@@ -95,6 +97,7 @@ class Backend:
         jump_note: the last of these in words.
         refused: the last keyframes that were turned away.
         extras: what the next solve is to work out beside the estimate.
+        setup: the check of the set-up; while it gives a reason, every solve is held.
     """
 
     def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
@@ -108,6 +111,7 @@ class Backend:
         self.jump_note = ""
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
         self.extras = Extras()
+        self.setup = SetUpWatch()
         self._clock = clock
         self._sessions = Sessions()
         self._current: int | None = None
@@ -254,11 +258,14 @@ class Backend:
             return None
         due = self._due()
         end = self._end(due)
+        wrong = self.setup.look(self.scene) if self.config.guard.check_setup else ""
         taking_part = window.rows_of(self.scene, self.config, end)
         self.solve_count += 1
         newest = int(self.scene.keyframes.keyframe_id[taking_part[-1]])
         extra: dict[str, Any] = {}
-        selection, state = self._solve(newest, end, on_iteration)
+        if wrong:
+            self._hold_all()
+        selection, state = (None, None) if wrong else self._solve(newest, end, on_iteration)
         if selection is not None:
             taking_part = taking_part_of(self.scene, selection)
             if state is not None:
@@ -266,6 +273,13 @@ class Backend:
                 extra = extras.work_out(self.extras, self.scene, self.config, selection, state, taking_part)
         self.scene.keyframes.solved[self._reached(due, end)] = True
         return dataclasses.replace(self._estimate(taking_part), **extra)
+
+    def take_check(self, checked: Scene, found: Diagnosis) -> Estimate | None:
+        """Take in a check of the set-up that was made elsewhere; return what is known now if it undoes all solves."""
+        if checked is not self.scene or not self.setup.take(checked, found):
+            return None
+        self._hold_all()
+        return self.estimate()
 
     def estimate(self) -> Estimate:
         """Return all that is known, with the report of the last solve."""
@@ -279,7 +293,7 @@ class Backend:
         """
         result = solved.result
         followed = None
-        if result.status.usable and result.state.is_finite():
+        if result.status.usable and result.state.is_finite() and not self.setup.reason(self.scene):
             followed = full.put(self.scene, self.config, taken, result.state)
         if followed is None:
             return None
@@ -376,6 +390,14 @@ class Backend:
     def _young(self) -> bool:
         """Return True while no more was refined than two windows hold."""
         return int(np.count_nonzero(self.scene.keyframes.refined)) <= 2 * self.config.window.max_keyframes
+
+    def _hold_all(self) -> None:
+        """Report that the set-up is wrong; the front-end's poses stand, and its frame is the map's."""
+        newest = int(self.scene.order[-1])
+        report = self._base_report(int(self.scene.keyframes.keyframe_id[newest]))
+        self._report = dataclasses.replace(report, status=Status.HELD, reason=self.setup.reason(self.scene))
+        self._correction = MapCorrection()
+        self._correct(newest)
 
     def _correct(self, row: int) -> None:
         """Let the correction map -> odom follow what was found at a keyframe, and tell its size in the report."""

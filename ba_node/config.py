@@ -230,6 +230,11 @@ class SolverConfig:
 class GuardConfig:
     """When a solution is held back, so that the front-end's poses stand. See docs/concepts.md."""
 
+    check_setup: bool = _param(
+        True,
+        "Compare rig, poses, depths and intrinsics with the tracks of the first keyframes of a session, and hold all"
+        " solves where they contradict each other, with the likely mistake as the reason. See docs/check.md.",
+    )
     enabled: bool = _param(
         True, "Hold solutions back that are not determined, not plausible, or no better than the input."
     )

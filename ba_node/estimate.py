@@ -195,5 +195,5 @@ class Estimate:
 
     @property
     def replaces_map(self) -> bool:
-        """Return True if the map is another than before: after a usable solve, and when all was forgotten."""
-        return self.report.status.usable or len(self.trajectory) == 0
+        """Return True if the map is another than before: after a solve, a held one too, and when all was forgotten."""
+        return self.report.status.usable or self.report.status is Status.HELD or len(self.trajectory) == 0

@@ -19,7 +19,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "native": ("native",),
     "core": ("core",),
     "scene": ("measurements", "estimate", "scene"),
-    "window": ("window",),
+    "window": ("window", "check"),
     "backend": ("archive", "backend"),
     "services": ("messages", "io", "evaluation", "synthetic"),
     "tools": ("ros", "offline", "thesis", "cli"),

@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from ba_node import __version__
 from ba_node.cli import (
+    check,
     convert,
     demo,
     evaluate,
@@ -35,7 +36,21 @@ from ba_node.cli import map as map_command
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rsplit(".", 1)[1]: module
-    for module in (replay, map_command, play, solve, convert, evaluate, synth, demo, params, steps, robustness, thesis)
+    for module in (
+        replay,
+        check,
+        map_command,
+        play,
+        solve,
+        convert,
+        evaluate,
+        synth,
+        demo,
+        params,
+        steps,
+        robustness,
+        thesis,
+    )
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130

@@ -64,6 +64,9 @@ class SessionRecord:
         self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
         rows = ((key, scene.find_keyframe(key)) for key in estimate.refined.keyframe_id.tolist())
         self.refined.update(key for key, row in rows if row is not None and scene.keyframes.refined[row])
+        # What a check of the set-up has taken back.
+        table = scene.keyframes
+        self.refined.difference_update(table.keyframe_id[~table.refined].tolist())
 
     def close(self, scene: Scene, config: Config) -> None:
         """Take the figures of the whole map from a scene that is about to go."""

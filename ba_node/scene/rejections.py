@@ -34,6 +34,7 @@ REASONS: dict[str, str] = {
 # Things that are worth counting although nothing was lost by them.
 NOTICES: dict[str, str] = {
     "reordered": "A keyframe whose stamp lies before the newest one; it was sorted in.",
+    "setup_unchecked": "A session whose set-up was not checked, as OpenCV (rosdep key python3-opencv) is missing.",
     "repeated_guess": "A second guess for a track; the first one stays.",
     "ids_reused": "A track whose views went over to another point; the older views keep theirs under another id.",
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
@@ -55,6 +56,7 @@ WARNINGS: dict[str, str] = {
     "stray_session": "A keyframe of a higher session was turned away, since no second one followed.",
     "frame_name": "The fixed frame of the keyframes has no name, or one that tf2 refuses.",
     "reused_id": "An id was used for a second keyframe of the session.",
+    "setup": "A set-up that the tracks contradict: the likely mistake, and what to change. All solves are held.",
 }
 
 NOTES_KEPT = 50

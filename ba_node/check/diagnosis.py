@@ -1,0 +1,135 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Hold what a check of a set-up has found."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Row:
+    """How well a hypothesis explains the tracks.
+
+    Attributes:
+        test: what is compared.
+        hypothesis: what is assumed.
+        share: of the shared tracks that meet, in front of the cameras, 0 to 1.
+        rotation_deg: angle between its rotation and that of the tracks; NaN if there is none.
+        direction_deg: the same for the direction of the translation.
+    """
+
+    test: str
+    hypothesis: str
+    share: float
+    rotation_deg: float = float("nan")
+    direction_deg: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A likely mistake.
+
+    Attributes:
+        causes: what it is, in words, or what it may be where the tracks cannot tell these apart.
+        evidence: what the tracks say.
+        changes: the field or parameter to change, for each cause.
+        harmful: solves would make poses worse.
+        usual: it is one of the mistakes that are made often, and explains the tracks; not only a misfit.
+    """
+
+    causes: tuple[str, ...]
+    evidence: str
+    changes: tuple[str, ...]
+    harmful: bool = True
+    usual: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """Return all of it."""
+        causes, changes = (", or ".join(dict.fromkeys(part)) for part in (self.causes, self.changes))
+        return f"{causes} ({self.evidence}): change {changes}"
+
+    def narrowed(self, other: Finding) -> Finding | None:
+        """Return this with the causes alone that another finding names too; None if there are none."""
+        both = [pair for pair in zip(self.causes, self.changes, strict=True) if pair[0] in other.causes]
+        if not both:
+            return None
+        causes, changes = zip(*both, strict=True)
+        return dataclasses.replace(self, causes=causes, changes=changes, evidence=f"{self.evidence}; {other.evidence}")
+
+
+@dataclass
+class Diagnosis:
+    """What the tracks tell about a set-up.
+
+    Attributes:
+        findings: likely mistakes, the surest first.
+        sound: what was tested and fits, in words.
+        untold: what the tracks could not tell (yet), and why.
+        rows: the hypotheses.
+        told: the tests that need no more tracks.
+    """
+
+    findings: list[Finding] = field(default_factory=list)
+    sound: list[str] = field(default_factory=list)
+    untold: list[str] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    told: frozenset[str] = frozenset()
+
+    @property
+    def harmful(self) -> bool:
+        """Return True if solves would make poses worse."""
+        return any(finding.harmful for finding in self.findings)
+
+    @property
+    def settled(self) -> bool:
+        """Return True if nothing is left to be told by more tracks."""
+        return self.harmful or not self.untold
+
+    def summary(self) -> str:
+        """Return the outcome in a sentence."""
+        if self.findings:
+            return "; ".join(finding.sentence for finding in self.findings)
+        if not self.sound:
+            return f"the tracks cannot tell: {'; '.join(self.untold)}"
+        unknown = f"; not told: {'; '.join(self.untold)}" if self.untold else ""
+        return f"the set-up fits the tracks: {'; '.join(self.sound)}{unknown}"
+
+    def causes(self) -> str:
+        """Return the likely mistakes alone."""
+        return "; ".join(", or ".join(dict.fromkeys(finding.causes)) for finding in self.findings)
+
+    def add(self, other: Diagnosis) -> None:
+        """Take over what another test has found; findings with common causes become one."""
+        for finding in other.findings:
+            for i, known in enumerate(self.findings):
+                both = known.narrowed(finding)
+                if both is not None:
+                    self.findings[i] = both
+                    break
+            else:
+                self.findings.append(finding)
+        self.sound += other.sound
+        self.untold += other.untold
+        self.rows += other.rows
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a JSON file."""
+        return {
+            "summary": self.summary(),
+            "findings": [{**vars(one), "sentence": one.sentence} for one in self.findings],
+            "sound": self.sound,
+            "untold": self.untold,
+            "hypotheses": [
+                {k: (None if isinstance(v, float) and math.isnan(v) else v) for k, v in vars(row).items()}
+                for row in self.rows
+            ],
+        }
+
+
+def _or_none(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value

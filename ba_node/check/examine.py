@@ -1,0 +1,77 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Put the tests of a set-up together: first what the others build on; what they would only repeat is left out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ba_node.check import intrinsics, relations, units
+from ba_node.check.diagnosis import Diagnosis, Finding
+
+if TYPE_CHECKING:
+    from ba_node.check.relations import Relation
+    from ba_node.check.tracks import Tracks
+
+
+def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
+    """Return what the tracks tell about the set-up. Depends on nothing but the tracks.
+
+    Args:
+        tracks: what was seen.
+        told: the tests that were decided before and are left out.
+
+    Raises:
+        ImportError: OpenCV is missing, see :func:`two_view.available`.
+    """
+    outcome = Diagnosis()
+    pairs: list[Relation] | None = None
+
+    def related() -> list[Relation]:
+        nonlocal pairs
+        pairs = relations.in_motion(tracks) if pairs is None else pairs
+        return pairs
+
+    tests: dict[str, Callable[[], Diagnosis]] = {
+        "stamps": lambda: units.check_stamps(tracks),
+        "ids": lambda: units.check_ids(tracks),
+        "cameras": lambda: relations.check_cameras(tracks),
+        "poses": lambda: _poses(tracks, related()),
+        "depth": lambda: units.check_depth(tracks, related()),
+        "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
+        "lengths": lambda: units.check_lengths(tracks, related()),
+    }
+    for name, test in tests.items():
+        if name in told or (outcome.harmful and name not in ("cameras", "poses")):
+            continue
+        found = test()
+        outcome.add(found)
+        if not found.untold:
+            outcome.told |= {name}
+    if outcome.harmful:
+        outcome.sound, outcome.untold = [], []
+    return outcome
+
+
+def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:
+    motion = relations.check_motion(tracks, pairs)
+    if any(not finding.usual for finding in motion.findings):
+        size = _of_size(tracks, motion)
+        motion.findings = motion.findings if size is None else [size]
+    return motion
+
+
+def _of_size(tracks: Tracks, motion: Diagnosis) -> Finding | None:
+    """Return another size of the images as the cause, if poses that contradict the tracks fit with it."""
+    found: list[tuple[float, Finding]] = []
+    for model in intrinsics.other_sizes(tracks):
+        other = tracks.with_params(model.params)
+        pairs = relations.in_motion(other)
+        outcome = relations.check_motion(other, pairs)
+        if outcome.sound:
+            motion.rows.append(dataclasses.replace(outcome.rows[0], hypothesis=model.cause))
+            finding = Finding((model.cause,), motion.findings[0].evidence, (model.change,), usual=True)
+            found.append((intrinsics.loss_of(other, pairs), finding))
+    return min(found, key=lambda one: one[0])[1] if found else None

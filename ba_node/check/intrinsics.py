@@ -1,0 +1,304 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find out whether the cameras' intrinsics are those of the images, by small adjustments with free poses.
+
+Two images hardly tell a wrong focal length: rotation and direction follow it. A dozen keyframes do. So a few of them
+are adjusted freely, once as given and once for every other camera model in question, and the sums of residuals (Cauchy)
+are compared. Whoever is clearly lower wins.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.check.diagnosis import Diagnosis, Finding, Row
+from ba_node.check.relations import spread
+from ba_node.core import cameras, geometry, methods, native_kernels, solver, triangulation
+from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
+from ba_node.core.objective import Rules
+from ba_node.core.options import SolverOptions
+from ba_node.core.problem import Observations, Problem, State
+
+if TYPE_CHECKING:
+    from ba_node.check.relations import Relation
+    from ba_node.check.tracks import FloatArray, Tracks
+
+_KEYFRAMES = 10
+_OBSERVATIONS = 1600
+_MIN_POINTS = 30
+_MIN_VIEWS = 3
+_MAX_STRIDE = 3
+_MIN_KEYFRAMES = 8
+# A wide loss first, as the front-end's steps may be far off; the sum that counts is that of the narrow one.
+_WIDE, _NARROW = (
+    dataclasses.replace(
+        methods.options("auto"),
+        rules=Rules(loss="cauchy", loss_scale=scale),
+        max_iterations=iterations,
+        function_tolerance=1e-3,
+    )
+    for scale, iterations in ((8.0, 10), (1.0, 12))
+)
+_PATIENT = dataclasses.replace(_NARROW, max_iterations=60, function_tolerance=1e-5)
+# Distance of a point that has none, in diameters of the path.
+_FAR = 20.0
+# Residuals beyond this many sigmas, and points behind a camera, all count the same.
+_CAP = 10.0
+# Factors of the focal length that are tried first; where one is better, the others beyond it.
+_BRACKET = 1.18
+_SMALLER, _LARGER = (0.92, 0.7, 0.6, 0.5, 0.4), (1.08, 1.4, 1.65, 2.0, 2.5)
+# Factors nearer to 1 than this are not named.
+_LEAST_FACTOR = 0.12
+# Usual residual, in sigmas, from which on it is more than noise, and factors far from 1 are tried too.
+_LARGE = 1.5
+# Barrel distortion that images have where none is given.
+_BARREL = (-0.1, -0.2, -0.3, -0.4)
+# Share of the tracks' extent by which a principal point is off their middle where other sizes of the image are tried.
+_OFF_CENTRE = 0.2
+# Another model is better if its sum of residuals is lower by this share, and by so many times its mean.
+_LOWER = 0.035
+_SURE = 40.0
+_TEST = "intrinsics"
+_INFO = "camera_info in camera_rig"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A camera model in question: what it would mean, what to change, and the parameters (n_cam, 12)."""
+
+    cause: str
+    change: str
+    params: FloatArray
+
+
+def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
+    """Compare camera models by how well they explain a dozen keyframes."""
+    problem = _problem(tracks, relations)
+    if problem is None:
+        return Diagnosis(untold=["too few long tracks with parallax to judge the intrinsics"])
+    given = tracks.cameras.params
+    adjusted = {1.0: _Adjusted(problem, given)}
+    noise = adjusted[1.0].noise
+    now = adjusted[1.0].cost(noise)
+    for factor in (1.0 / _BRACKET, _BRACKET):
+        adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
+    n = len(problem.observations)
+    least = min(adjusted[1.0 / _BRACKET].cost(noise), adjusted[_BRACKET].cost(noise))
+    flat = n * (least / now - 1.0) < _SURE
+    tried = [(model, _Adjusted(problem, model.params)) for model in _others(tracks)]
+    if least < now or noise > _LARGE:
+        for factor in (*_SMALLER, *_LARGER):
+            adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
+        cost = {factor: one.cost(noise) for factor, one in adjusted.items()}
+        factor = _lowest(cost)
+        if abs(factor - 1.0) > _LEAST_FACTOR and _is_sharp(cost):
+            tried.append((_focal(given, factor), adjusted[min(cost, key=lambda one: cost[one])]))
+    rows = [
+        Row(_TEST, "as given", _explained(now)),
+        *(Row(_TEST, m.cause, _explained(one.cost(noise))) for m, one in tried),
+    ]
+    if tried:
+        model, best = min(tried, key=lambda one: one[1].cost(noise))
+        lowest = best.cost(noise)
+        # Then the given model gets every chance: many iterations, and to begin where the other one ended.
+        if _is_lower(lowest, now, n) and _is_lower(lowest, adjusted[1.0].thorough(best.state, noise), n):
+            evidence = f"a free adjustment leaves {lowest / now:.0%} of the loss that it leaves as given"
+            return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows)
+    if flat:
+        return Diagnosis(untold=["the motion so far does not tell the focal length"], rows=rows)
+    return Diagnosis(sound=["the focal length fits"], rows=rows)
+
+
+def loss_of(tracks: Tracks, relations: list[Relation]) -> float:
+    """Return the mean loss of a free adjustment of a dozen keyframes; infinite if there is none."""
+    problem = _problem(tracks, relations)
+    return np.inf if problem is None else _Adjusted(problem, tracks.cameras.params).cost(1.0)
+
+
+def _is_lower(cost: float, other: float, observations: int) -> bool:
+    """Return True if a mean loss is clearly lower than another."""
+    return other > (1.0 + _LOWER) * cost and observations * (other / cost - 1.0) > _SURE
+
+
+def _explained(cost: float) -> float:
+    """Return the mean weight of a residual with a mean loss."""
+    return float(1.0 / (1.0 + cost))
+
+
+def _scaled(params: FloatArray, factor: float) -> FloatArray:
+    scaled = params.copy()
+    scaled[:, FX : FY + 1] *= factor
+    return scaled
+
+
+def _focal(params: FloatArray, factor: float) -> Model:
+    focal = params[0, FX]
+    return Model(
+        f"focal length off by a factor of about {1.0 / factor:.2f}:"
+        f" the tracks fit {factor * focal:.0f} px, not {focal:.0f}",
+        f"k of {_INFO}",
+        _scaled(params, factor),
+    )
+
+
+def _is_sharp(cost: dict[float, float]) -> bool:
+    """Return True if the sum rises on both sides of its least."""
+    costs = [cost[factor] for factor in sorted(cost)]
+    at = int(np.argmin(costs))
+    return min(max(costs[: at + 1]), max(costs[at:])) > (1.0 + _LOWER) * costs[at]
+
+
+def _lowest(cost: dict[float, float]) -> float:
+    """Return the factor of the least cost, between the factors that were tried (parabola over their logarithms)."""
+    factors = np.array(sorted(cost))
+    costs = np.array([cost[factor] for factor in factors])
+    at = int(np.argmin(costs))
+    if at in (0, len(costs) - 1):
+        return float(factors[at])
+    three = slice(at - 1, at + 2)
+    a, b, _ = np.polyfit(np.log(factors[three]), costs[three], 2)
+    return float(np.exp(-b / (2.0 * a)))
+
+
+def _others(tracks: Tracks) -> list[Model]:
+    """Return the camera models that are usual mistakes: of the other kind of image, of another size of it."""
+    given = tracks.cameras.params
+    models = other_sizes(tracks)
+    plain = given.copy()
+    plain[:, DISTORTION] = 0.0
+    rational = (tracks.cameras.model == cameras.Model.RATIONAL).all()
+    if given[:, DISTORTION].any() and rational:
+        cause = "images rectified though a distortion is given"
+        models.append(Model(cause, f"d of {_INFO} to zeros (and k to that of the rectified image)", plain))
+    elif rational:
+        for k1 in _BARREL:
+            barrel = plain.copy()
+            barrel[:, DISTORTION.start] = k1
+            cause = "images not rectified though no distortion is given"
+            models.append(Model(cause, f"d of {_INFO}, or track in rectified images", barrel))
+    return models
+
+
+def other_sizes(tracks: Tracks) -> list[Model]:
+    """Return the camera models of a region of the image and of a binned one, if the tracks lie far off the centre."""
+    given, models = tracks.cameras.params, []
+    low, high = np.percentile(tracks.uv, [0.2, 99.8], axis=0)
+    middle, centre = 0.5 * (low + high), np.median(given[:, CX : CY + 1], axis=0)
+    if not (np.abs(centre - middle) > _OFF_CENTRE * (high - low)).any():
+        return []
+    where = (
+        f"the tracks lie about ({middle[0]:.0f}, {middle[1]:.0f}) px,"
+        f" the principal point is at ({centre[0]:.0f}, {centre[1]:.0f})"
+    )
+    region = given.copy()
+    region[:, CX : CY + 1] += middle - centre
+    cause = f"region of interest not applied: {where}"
+    models.append(Model(cause, f"roi in {_INFO}, or subtract its offset from the principal point in k", region))
+    factor = float(np.median(centre / middle))
+    for binning in (4.0, 2.0, 0.5):
+        if 0.75 < factor / binning < 1.33:
+            binned = given.copy()
+            binned[:, FX : CY + 1] /= binning
+            cause = f"binning not applied: k is that of an image {binning:g} times as large"
+            models.append(Model(cause, f"binning_x and binning_y in {_INFO}, or divide k by {binning:g}", binned))
+    return models
+
+
+def _problem(tracks: Tracks, relations: list[Relation]) -> Problem | None:
+    """Return the adjustment of a dozen keyframes that turn most, their longest tracks, the first pose fixed."""
+    usable = [one for one in relations if one.has_direction]
+    if len(usable) < 3:
+        return None
+    stride = int(np.clip(np.median([one.b[0] - one.a[0] for one in usable]) // 2, 1, _MAX_STRIDE))
+    turning = max(usable, key=lambda one: float(np.trace(np.eye(3) - one.pose.rotation)))
+    reach = stride * (_KEYFRAMES - 1)
+    first = max(0, min(turning.a[0] - reach // 2, len(tracks) - 1 - reach))
+    keyframes = np.arange(first, len(tracks))[::stride][:_KEYFRAMES]
+    if len(keyframes) < _MIN_KEYFRAMES:
+        return None
+    place = np.full(len(tracks), -1)
+    place[keyframes] = np.arange(len(keyframes))
+    rows = np.flatnonzero((place[tracks.keyframe] >= 0) & np.isfinite(tracks.ray[:, 0]))
+    image = np.unique(tracks.track[rows] * len(tracks) + tracks.keyframe[rows])
+    views = np.bincount(image // len(tracks))
+    # Tracks are numbered as they begin: so some of each keyframe.
+    longest = np.flatnonzero(views >= _MIN_VIEWS)
+    count = np.bincount(tracks.track[rows])[longest].sum()
+    longest = longest[spread(len(longest), int(len(longest) * _OBSERVATIONS / max(count, 1)))]
+    if len(longest) < _MIN_POINTS:
+        return None
+    number = np.full(len(views), -1)
+    number[longest] = np.arange(len(longest))
+    rows = rows[number[tracks.track[rows]] >= 0]
+    rows = rows[np.lexsort((tracks.camera[rows], tracks.keyframe[rows], tracks.track[rows]))]
+    empty = np.empty(0)
+    observations = Observations(
+        place[tracks.keyframe[rows]],
+        tracks.camera[rows],
+        number[tracks.track[rows]],
+        tracks.uv[rows],
+        tracks.sigma_px[rows],
+        empty,
+        empty,
+    )
+    poses = geometry.inverse(tracks.rotation[keyframes], tracks.position[keyframes] - tracks.position[first])
+    start = State(*poses, np.zeros((len(longest), 3)), np.empty((0, 3)))
+    fixed = np.arange(len(keyframes)) == 0
+    return Problem(start, fixed, tracks.cameras, observations)
+
+
+class _Adjusted:
+    """An adjustment with given intrinsics.
+
+    Attributes:
+        state: where it ended.
+        norms: sizes of the residuals there, sigmas.
+    """
+
+    def __init__(self, problem: Problem, params: FloatArray) -> None:
+        self._problem = dataclasses.replace(problem, cameras=dataclasses.replace(problem.cameras, params=params))
+        self.state = solver.solve(_placed(self._problem), _WIDE).state
+        self._finish(_NARROW)
+
+    @property
+    def noise(self) -> float:
+        """Return the usual size of a residual, sigmas: those of real images are seldom what sigma_px says."""
+        return max(float(np.median(self.norms)), 1e-3)
+
+    def cost(self, noise: float) -> float:
+        """Return the mean Cauchy loss of a residual; beyond a limit, and behind a camera, all count the same."""
+        norms = np.minimum(self.norms, _CAP) / noise
+        return float(np.log1p(norms * norms).mean())
+
+    def thorough(self, state: State, noise: float) -> float:
+        """Return the mean loss after as many iterations as it takes, from here or from other poses: the lower one."""
+        self._finish(_PATIENT)
+        costs = [self.cost(noise)]
+        for wide in (False, True):
+            self.state = state
+            if wide:
+                self.state = solver.solve(_placed(dataclasses.replace(self._problem, start=state)), _WIDE).state
+            self._finish(_PATIENT)
+            costs.append(self.cost(noise))
+        return min(costs)
+
+    def _finish(self, options: SolverOptions) -> None:
+        self.state = solver.solve(_placed(dataclasses.replace(self._problem, start=self.state)), options).state
+        self.norms = native_kernels.residual_norms(self._problem, self.state)
+
+
+def _placed(problem: Problem) -> Problem:
+    """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
+    rays, n = triangulation.rays_of(problem), problem.n_points
+    points = triangulation.triangulate(rays, n).points
+    ahead = ((points[rays.point] - rays.centre) * rays.direction).sum(axis=1)
+    behind = np.bincount(rays.point, ~(ahead > 0.0), n) > 0
+    reach = _FAR * float(np.linalg.norm(np.ptp(rays.centre, axis=0)))
+    # The last row of a point wins; any of its rays will do.
+    points[rays.point[behind[rays.point]]] = (rays.centre + reach * rays.direction)[behind[rays.point]]
+    points[~np.isfinite(points).all(axis=1)] = 0.0
+    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))

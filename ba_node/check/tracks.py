@@ -1,0 +1,160 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Look at the tracks of a scene as rays, image by image, and match images by them.
+
+Rays are in normalised coordinates (X/Z, Y/Z), so that nothing behind this module knows a camera model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.core import cameras as camera_models
+from ba_node.core import geometry
+
+if TYPE_CHECKING:
+    from ba_node.core.problem import Cameras
+    from ba_node.scene.scene import Scene
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+Image = tuple[int, int]
+
+# Beyond 80 degrees from the axis a small error in the pixel is a large one in X/Z.
+_MAX_RAY = 5.67
+# A camera with this share of the tracks of the busiest one may stand for the keyframe.
+_MAIN_SHARE = 0.7
+_NOTHING = np.empty(0, np.intp)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """What the front-end has delivered; keyframes oldest first.
+
+    Attributes:
+        stamp_ns: (n_kf,).
+        rotation: (n_kf, 3, 3) fixed frame from body, as given.
+        position: (n_kf, 3) as given, m.
+        cameras: the rig, as given.
+        keyframe: (n_obs,) index of the keyframe.
+        camera: (n_obs,) index of the camera.
+        track: (n_obs,) number of the track.
+        uv: (n_obs, 2) px.
+        sigma_px: (n_obs,).
+        depth_m: (n_obs,) NaN for none.
+        ray: (n_obs, 2) X/Z and Y/Z; NaN where there is none.
+        images: rows of each image (keyframe, camera), by track.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    rotation: FloatArray
+    position: FloatArray
+    cameras: Cameras
+    keyframe: IntArray
+    camera: IntArray
+    track: IntArray
+    uv: FloatArray
+    sigma_px: FloatArray
+    depth_m: FloatArray
+    ray: FloatArray
+    images: dict[Image, IntArray]
+
+    def __len__(self) -> int:
+        """Return the number of keyframes."""
+        return len(self.position)
+
+    def match(self, a: Image, b: Image) -> tuple[IntArray, IntArray]:
+        """Return the rows of the tracks that two images share, in the same order: two (n,)."""
+        rows_a, rows_b = self.images.get(a, _NOTHING), self.images.get(b, _NOTHING)
+        if not len(rows_a) or not len(rows_b):
+            return _NOTHING, _NOTHING
+        track = self.track[rows_b]
+        at = np.minimum(np.searchsorted(track, self.track[rows_a]), len(track) - 1)
+        same = track[at] == self.track[rows_a]
+        return rows_a[same], rows_b[at[same]]
+
+    def main_camera(self, keyframe: int) -> int | None:
+        """Return the camera that stands for a keyframe: the first with about as many tracks as the busiest."""
+        counts = [len(self.images.get((keyframe, camera), _NOTHING)) for camera in range(len(self.cameras.model))]
+        if not max(counts):
+            return None
+        return next(camera for camera, count in enumerate(counts) if count >= _MAIN_SHARE * max(counts))
+
+    def sigma(self, rows: IntArray) -> float:
+        """Return the usual standard deviation of some rays."""
+        return float(np.median(self.sigma_px[rows] / _focal(self.cameras)[self.camera[rows]])) if len(rows) else 0.0
+
+    def px(self, rows: IntArray) -> float:
+        """Return the length of a pixel in the rays of some rows."""
+        return float(np.median(1.0 / _focal(self.cameras)[self.camera[rows]])) if len(rows) else 0.0
+
+    def with_params(self, params: FloatArray) -> Tracks:
+        """Return the same pixels seen through cameras with other intrinsics, (n_cam, 12)."""
+        cameras = dataclasses.replace(self.cameras, params=params)
+        ray = _rays(cameras, self.camera, self.uv)
+        images = _images(self.keyframe, self.camera, self.track, ray)
+        return dataclasses.replace(self, cameras=cameras, ray=ray, images=images)
+
+
+def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:
+    """Return a copy of what a scene has been given; None before the first tracks or without a rig.
+
+    Args:
+        scene: what is known.
+        newest: keyframes to look at; None for all.
+    """
+    table, cameras = scene.sightings, scene.cameras
+    order = scene.order if newest is None else scene.order[-newest:]
+    place = np.full(len(scene.keyframes), -1)
+    place[order] = np.arange(len(order))
+    rows = np.flatnonzero(place[table.keyframe] >= 0)
+    if cameras is None or not len(rows):
+        return None
+    keyframe, camera = place[table.keyframe[rows]], table.camera[rows].astype(np.intp)
+    track, uv = table.landmark[rows].astype(np.intp), table.uv[rows].astype(float)
+    ray = _rays(cameras, camera, uv)
+    return Tracks(
+        scene.keyframes.stamp_ns[order],
+        scene.keyframes.input_rotation[order],
+        scene.keyframes.input_position[order],
+        cameras,
+        keyframe,
+        camera,
+        track,
+        uv,
+        table.sigma_px[rows].astype(float),
+        table.depth_m[rows].astype(float),
+        ray,
+        _images(keyframe, camera, track, ray),
+    )
+
+
+def _images(keyframe: IntArray, camera: IntArray, track: IntArray, ray: FloatArray) -> dict[Image, IntArray]:
+    """Return the rows of each image that have a ray, by track."""
+    rows = np.flatnonzero(np.isfinite(ray[:, 0]))
+    rows = rows[np.lexsort((track[rows], camera[rows], keyframe[rows]))]
+    ends = np.flatnonzero((np.diff(keyframe[rows]) != 0) | (np.diff(camera[rows]) != 0)) + 1
+    return {(int(keyframe[part[0]]), int(camera[part[0]])): part for part in np.split(rows, ends) if len(part)}
+
+
+def _rays(cameras: Cameras, camera: IntArray, uv: FloatArray) -> FloatArray:
+    ray = camera_models.normalise(uv, cameras.model[camera], cameras.params[camera])
+    with np.errstate(invalid="ignore"):
+        usable = np.asarray((ray * ray).sum(axis=1) <= _MAX_RAY**2)
+    return np.where(usable[:, None], ray, np.nan)
+
+
+def _focal(cameras: Cameras) -> FloatArray:
+    return np.asarray(np.sqrt(cameras.params[:, camera_models.FX] * cameras.params[:, camera_models.FY]))
+
+
+def relative(
+    rotation_a: FloatArray, position_a: FloatArray, rotation_b: FloatArray, position_b: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``x_b = R x_a + t`` between two poses that are given in a common frame."""
+    return geometry.compose(*geometry.inverse(rotation_b, position_b), rotation_a, position_a)

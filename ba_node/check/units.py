@@ -1,0 +1,200 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Check what needs no geometry of its own once images are related: units of depths, lengths and stamps, and ids."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.check import two_view
+from ba_node.check.diagnosis import Diagnosis, Finding, Row
+from ba_node.check.placement import as_given
+from ba_node.check.relations import Relation, rays, relate, spread
+from ba_node.check.two_view import Pose
+
+if TYPE_CHECKING:
+    from ba_node.check.tracks import FloatArray, Tracks
+
+# Parallax, in gates, from which on a triangulated depth is worth something; points and pairs that are needed.
+_PARALLAX = 4.0
+_POINTS = 8
+_PAIRS = 4
+# Factors of a depth and of a length beyond which they are wrong: the front-end's steps are no better.
+_DEPTH_FACTOR = 1.5
+_LENGTH_FACTOR = 1.3
+# A factor is named if depths agree on it to this share (median deviation of its logarithm).
+_AGREE = 0.35
+_UNITS = (
+    (1000.0, "in millimetres"),
+    (100.0, "in centimetres"),
+    (10.0, "in decimetres"),
+    (5000.0, "in units of 0.2 mm"),
+    (256.0, "in units of 1/256 m"),
+    (0.001, "in kilometres"),
+    (3.2808, "in feet"),
+)
+# Sensible distances between keyframes, s; and units that stamps may have been taken for.
+_SPACING_S = (5e-4, 600.0)
+_STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
+# Images that far apart, in keyframes, share tracks; where ids are used again, fewer of them are the same point.
+_FAR = 4
+_STARTS = 8
+_LOST = 0.7
+
+
+def check_stamps(tracks: Tracks) -> Diagnosis:
+    """Look whether keyframes follow each other at a sensible pace."""
+    steps = np.diff(tracks.stamp_ns)
+    steps = steps[steps > 0]
+    if len(steps) < 3:
+        return Diagnosis()
+    usual = float(np.median(steps)) * 1e-9
+    if _SPACING_S[0] <= usual <= _SPACING_S[1]:
+        return Diagnosis(sound=[f"keyframes are {usual:.3g} s apart"])
+    likely = [name for factor, name in _STAMP_UNITS if 0.01 <= usual * factor <= 10.0]
+    likely += [f"{name} taken for seconds" for factor, name in _STAMP_UNITS if 0.01 <= usual / factor <= 10.0]
+    cause = f"stamps in another unit: keyframes are {usual:.3g} s apart" + (f", perhaps {likely[0]}" if likely else "")
+    return Diagnosis([Finding((cause,), "median of their stamps", ("header.stamp of the keyframes",), harmful=False)])
+
+
+def check_ids(tracks: Tracks) -> Diagnosis:
+    """Look whether a track goes on being the same point: by consensus of neighbouring images, and of distant ones."""
+    near, far = [], []
+    for k in spread(len(tracks) - _FAR, _STARTS):
+        camera = tracks.main_camera(k)
+        if camera is None:
+            continue
+        pairs = [
+            relate(tracks, (int(k), camera), (int(k + gap), camera), tracks.match((k, camera), (k + gap, camera)))
+            for gap in (1, _FAR)
+        ]
+        if pairs[0] is not None and len(tracks.match((k, camera), (k + _FAR, camera))[0]) >= two_view.MIN_PAIRS:
+            near.append(pairs[0].share)
+            far.append(0.0 if pairs[1] is None else pairs[1].share)
+    if len(near) < 3:
+        return Diagnosis(untold=["too few long tracks to judge ids"])
+    rows = [Row("ids", "images next to each other", float(np.median(near)))]
+    rows += [Row("ids", f"images {_FAR} keyframes apart", float(np.median(far)))]
+    if rows[1].share >= _LOST * rows[0].share:
+        return Diagnosis(sound=["tracks keep their ids"], rows=rows)
+    evidence = f"{rows[0].share:.0%} of the tracks agree from one keyframe to the next, {rows[1].share:.0%} over {_FAR}"
+    finding = Finding(
+        ("ids reused: the same track_id stands for several points",),
+        evidence,
+        ("track_id in the feature_tracks: a new id for each point, never one of an ended track",),
+    )
+    return Diagnosis([finding], rows=rows)
+
+
+def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
+    """Compare measured depths with those of the front-end's steps, or of two cameras."""
+    measured = np.isfinite(tracks.depth_m)
+    if not measured.any():
+        return Diagnosis()
+    by = "the front-end's steps"
+    pairs = _depth_pairs(tracks, relations, tracks.depth_m)
+    if len(pairs) < _PAIRS:
+        return Diagnosis(untold=["too little parallax to compare depths with steps"])
+    ratio = [float(np.median(np.log(given / found))) for given, found in pairs]
+    factor, spread_of = float(np.exp(np.median(ratio))), _deviation(ratio)
+    rows = [Row("depth", f"measured over triangulated: {factor:.4g}", 1.0)]
+    given, found = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    if _deviation(np.log(given * found)) < 0.5 * _deviation(np.log(given / found)):
+        inverse = float(np.exp(np.median(np.log(given * found))))
+        cause = f"depth_m holds inverse depths: it falls as depth grows (their product is {inverse:.3g})"
+        return Diagnosis([_depth_finding(cause, f"against {by}")], rows=rows)
+    if spread_of > _AGREE:
+        return Diagnosis(untold=[f"depths contradict {by}"], rows=rows)
+    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+        return Diagnosis(sound=[f"depths fit {by} (to {abs(factor - 1.0):.0%})"], rows=rows)
+    cause = f"depth_m {_unit(factor) or 'in another unit'}: it is {_times(factor)} what {by} tell"
+    return Diagnosis([_depth_finding(cause, f"over {len(pairs)} pairs of keyframes")], rows=rows)
+
+
+def _times(factor: float) -> str:
+    return f"{factor:.0f} times" if factor >= 10.0 else f"{factor:.2g} times"
+
+
+def _unit(factor: float) -> str:
+    """Return the unit that a factor stands for; empty if none is near."""
+    return next((name for value, name in _UNITS if 0.75 < factor / value < 1.33), "")
+
+
+def _depth_finding(cause: str, evidence: str) -> Finding:
+    return Finding((cause,), evidence, ("depth_m in the feature_tracks, expected metres along the optical axis",))
+
+
+def check_lengths(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
+    """Compare depths of two cameras, which are in units of their baseline, with those of the front-end's steps."""
+    outcome, given = Diagnosis(), as_given(tracks)
+    for camera in range(1, min(len(given.cameras.rotation), 3)):
+        depth = np.full(len(tracks.keyframe), np.nan)
+        baseline, shared = given.between_cameras(0, camera), False
+        for k in sorted({one.b[0] for one in relations if one.b[1] == 0}):
+            rows = tracks.match((k, 0), (k, camera))
+            shared = shared or len(rows[0]) > 0
+            if not len(rows[0]):
+                continue
+            pair = rays(tracks, rows)
+            in_a, _, parallax = two_view.depths(pair, baseline)
+            good = two_view.explained(pair, baseline) & (parallax > _PARALLAX * pair.gate) & (in_a > 0.0)
+            depth[rows[0][good]] = in_a[good]
+        pairs = _depth_pairs(tracks, relations, depth)
+        if not shared:
+            continue
+        if len(pairs) < _PAIRS:
+            outcome.untold.append(f"too little parallax to compare the baseline of camera {camera} with steps")
+            continue
+        outcome.add(_lengths(tracks, camera, float(np.linalg.norm(baseline.translation)), pairs))
+    return outcome
+
+
+def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[FloatArray, FloatArray]]) -> Diagnosis:
+    stereo, steps = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    ratio = [float(np.median(np.log(one / other))) for one, other in pairs]
+    factor = float(np.exp(np.median(ratio)))
+    rows = [Row("lengths", f"baseline of camera {camera} over the front-end's steps: {factor:.3g}", 1.0)]
+    if 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
+        return Diagnosis(
+            sound=[f"the baseline of camera {camera} fits the steps (to {abs(factor - 1.0):.0%})"], rows=rows
+        )
+    evidence = f"depths of two cameras against those of the front-end's steps, over {len(pairs)} pairs of keyframes"
+    # A shift of all disparities: 1 / z = 1 / z_steps + shift.
+    shift = float(np.median(1.0 / stereo - 1.0 / steps))
+    left = _deviation(np.log(np.maximum(1.0 / stereo - shift, 1e-9) * steps))
+    if left < 0.6 * _deviation(np.log(stereo / steps)):
+        px = abs(shift) * baseline * float(tracks.cameras.params[camera, 0])
+        cause = f"principal point of camera {camera} off by about {px:.0f} px along the baseline"
+        return Diagnosis([Finding((cause,), evidence, (f"k in the camera_info of camera {camera}",))], rows=rows)
+    if _deviation(ratio) > _AGREE:
+        return Diagnosis(untold=[f"depths of cameras 0 and {camera} contradict the front-end's steps"], rows=rows)
+    causes = (
+        f"baseline of camera {camera} {_unit(factor) or f'{_times(factor)} too long'} for the front-end's steps",
+        f"poses {_unit(1.0 / factor) or 'in another unit'}",
+    )
+    changes = (
+        f"body_from_camera of camera {camera} in camera_rig ({baseline:.3g} m; tracks fit {baseline / factor:.3g} m)",
+        "the position in the keyframes, expected metres",
+    )
+    return Diagnosis([Finding(causes, evidence, changes)], rows=rows)
+
+
+def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Return given depths and those of the front-end's steps, m, for each pair of images with enough of them."""
+    given, found = as_given(tracks), []
+    for one in relations:
+        length = float(np.linalg.norm(given.between_images(one.a, one.b).translation))
+        if not one.has_direction or length <= 0.0:
+            continue
+        _, in_b, parallax = two_view.depths(one.pair, Pose(one.pose.rotation, one.pose.translation * length))
+        good = two_view.explained(one.pair, one.pose) & (parallax > _PARALLAX * one.pair.gate)
+        good &= (depth[one.rows_b] > 0.0) & (in_b > 0.0)
+        if np.count_nonzero(good) >= _POINTS:
+            found.append((depth[one.rows_b][good], in_b[good]))
+    return found
+
+
+def _deviation(values: list[float] | FloatArray) -> float:
+    return float(np.median(np.abs(np.asarray(values) - np.median(values))))

@@ -1,0 +1,93 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Check the set-up of each session as its first keyframes come, and say whether its solves are to be held.
+
+What the tracks can tell depends on how the robot moves: two cameras can be compared at once, poses need parallax, a
+focal length needs turns. So the check runs at numbers of keyframes that double, each time only with the tests that are
+still open, until all have told or the last of these numbers is reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ba_node.check import two_view
+from ba_node.check.diagnosis import Diagnosis
+from ba_node.check.examine import examine
+from ba_node.check.tracks import tracks_of
+
+if TYPE_CHECKING:
+    from ba_node.scene.scene import Scene
+
+# Keyframes at which a session is checked. A robot may stand for long before there is anything to tell.
+_AT = (3, 6, 10, 15, 25, 40, 60, 90, 130, 200, 300, 450, 700, 1000)
+# The newest of them are looked at.
+_NEWEST = 60
+
+Work = Callable[[], Diagnosis]
+
+
+class SetUpWatch:
+    """The check of one session after the other.
+
+    Attributes:
+        elsewhere: hands work to another thread and sees to it that :meth:`take` gets its result; None to do it at once.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing checked."""
+        self.elsewhere: Callable[[Scene, Work], None] | None = None
+        self._reason = ""
+        self._scene: Scene | None = None
+        self._told: frozenset[str] = frozenset()
+        self._next = 0
+        self._busy = False
+
+    def look(self, scene: Scene) -> str:
+        """Check a scene if it has come to a number of keyframes at which that is due; return why to hold its solves."""
+        if scene is not self._scene:
+            self._scene, self._told, self._next, self._busy, self._reason = scene, frozenset(), 0, False, ""
+        count = len(scene.keyframes)
+        if not (self._reason or self._busy or self._next >= len(_AT) or count < _AT[self._next]):
+            self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
+            self._check(scene)
+        return self._reason
+
+    def reason(self, scene: Scene) -> str:
+        """Return why the solves of a scene are held, empty if they are not."""
+        return self._reason if scene is self._scene else ""
+
+    def _check(self, scene: Scene) -> None:
+        if not two_view.available():
+            scene.log.notice("setup_unchecked")
+            self._next = len(_AT)
+            return
+        tracks, told = tracks_of(scene, _NEWEST), self._told
+        if tracks is None:
+            return
+        if self.elsewhere is None:
+            self.take(scene, examine(tracks, told))
+        else:
+            self._busy = True
+            self.elsewhere(scene, lambda: examine(tracks, told))
+
+    def take(self, scene: Scene, found: Diagnosis) -> bool:
+        """Take in a result; return True if it is of the current session and says that solves do harm.
+
+        Then the scene is as the front-end gave it.
+        """
+        if scene is not self._scene:
+            return False
+        self._busy = False
+        self._told |= found.told
+        if found.findings:
+            scene.log.warn(kind="setup", text=found.summary())
+        if not found.harmful:
+            if found.settled:
+                self._next = len(_AT)
+            return False
+        self._reason = f"the set-up contradicts the tracks: {found.causes()}"
+        scene.forget_solutions()
+        scene.log.warnings.pop("held", None)
+        return True

@@ -1,0 +1,206 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Give synthetic recordings wrongly, in every way that the check names."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.check.tracks import Tracks, tracks_of
+from ba_node.config import Config
+from ba_node.core import geometry
+from ba_node.measurements import FeatureTracks
+from ba_node.scene.scene import Scene
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+
+FloatArray = NDArray[np.float64]
+Wrong = Callable[[SyntheticData], SyntheticData]
+
+_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_LENS = np.array([-0.28, 0.07, 0.0002, 0.00002, 0.0])
+
+
+def recording(seed: int = 3, wrong: str = "", mode: str = "stereo", **options: Any) -> SyntheticData:
+    """Return a recording of a mode (stereo, mono, rgbd) along a loop of 52 m, or a line of 40 m, given wrongly."""
+    length = 40.0 if options.get("path") == "line" else 52.0
+    depth = {"depth_share": 0.8} if mode == "rgbd" else {}
+    if wrong == "not rectified":
+        options["distortion"] = "plumb_bob"
+    chosen = {"baseline_m": 0.12 if mode == "stereo" else 0.0, "length_m": length, **depth, **options}
+    data = generate(SyntheticOptions(seed=seed, **chosen))
+    return WRONG[wrong](data) if wrong else data
+
+
+def seen(data: SyntheticData, keyframes: int | None = None) -> Tracks:
+    """Return the tracks of the first keyframes of a recording."""
+    tracks = tracks_of(scene_of(data, keyframes))
+    assert tracks is not None
+    return tracks
+
+
+def scene_of(data: SyntheticData, keyframes: int | None = None) -> Scene:
+    """Return a scene that has been given the first keyframes of a recording."""
+    scene = Scene(Config().scene)
+    scene.add(data.rig)
+    for keyframe, images in list(zip(data.keyframes, data.tracks, strict=True))[:keyframes]:
+        scene.add(keyframe)
+        for image in images:
+            scene.add(image)
+    return scene
+
+
+def rig(change: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]) -> Wrong:
+    """Return what gives rotation (n, 3, 3) and position (n, 3) of the cameras otherwise."""
+
+    def go(data: SyntheticData) -> SyntheticData:
+        rotation, position = change(geometry.matrix_from_quaternion(data.rig.orientation), data.rig.position.copy())
+        other = dataclasses.replace(
+            data.rig, orientation=geometry.quaternion_from_matrix(rotation), position=np.ascontiguousarray(position)
+        )
+        return dataclasses.replace(data, rig=other)
+
+    return go
+
+
+def poses(change: Callable[[FloatArray, FloatArray, SyntheticData], tuple[FloatArray, FloatArray]]) -> Wrong:
+    """Return what gives rotation (n, 3, 3) and position (n, 3) of the keyframes otherwise."""
+
+    def go(data: SyntheticData) -> SyntheticData:
+        given = geometry.matrix_from_quaternion(np.array([one.orientation for one in data.keyframes]))
+        rotation, position = change(given, np.array([one.position for one in data.keyframes]), data)
+        rows = zip(data.keyframes, geometry.quaternion_from_matrix(rotation), position, strict=True)
+        keyframes = tuple(dataclasses.replace(one, orientation=q, position=p) for one, q, p in rows)
+        return dataclasses.replace(data, keyframes=keyframes)
+
+    return go
+
+
+def intrinsics(change: Callable[[FloatArray], FloatArray]) -> Wrong:
+    """Return what gives fx fy cx cy (n, 4) otherwise."""
+    return lambda data: dataclasses.replace(
+        data, rig=dataclasses.replace(data.rig, intrinsics=change(data.rig.intrinsics.copy()))
+    )
+
+
+def distortion(coefficients: FloatArray) -> Wrong:
+    """Return what gives the distortion of all cameras otherwise."""
+    return lambda data: dataclasses.replace(
+        data, rig=dataclasses.replace(data.rig, distortion=(coefficients,) * len(data.rig))
+    )
+
+
+def images(change: Callable[[FeatureTracks], FeatureTracks]) -> Wrong:
+    """Return what gives each tracks message otherwise."""
+    return lambda data: dataclasses.replace(data, tracks=tuple(tuple(map(change, both)) for both in data.tracks))
+
+
+def _reversed(rotation: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    position[1] = 2.0 * position[0] - position[1]
+    return rotation, position
+
+
+def turned(degrees: float, axis: tuple[float, float, float]) -> Wrong:
+    """Return what turns the second camera about an axis of its own."""
+
+    def change(rotation: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        turn = geometry.so3_exp(np.radians(degrees) * np.array(axis))
+        return np.stack([rotation[0], rotation[1] @ turn]), position
+
+    return rig(change)
+
+
+def _second(factor: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)) -> Wrong:
+    def change(k: FloatArray) -> FloatArray:
+        k[1] = k[1] * [factor, factor, 1.0, 1.0] + [0.0, 0.0, *shift]
+        return k
+
+    return intrinsics(change)
+
+
+def _camera_0(data: SyntheticData) -> tuple[FloatArray, FloatArray]:
+    return geometry.matrix_from_quaternion(data.rig.orientation[0]), data.rig.position[0]
+
+
+def _exchanged(data: SyntheticData) -> SyntheticData:
+    tracks = tuple(
+        (dataclasses.replace(right, camera_index=0), dataclasses.replace(left, camera_index=1))
+        for left, right in data.tracks
+    )
+    return dataclasses.replace(data, tracks=tracks)
+
+
+def _slots(data: SyntheticData) -> SyntheticData:
+    """Number tracks by the first slot that is free, as some trackers do."""
+    held: dict[int, int] = {}
+    tracks = []
+    for both in data.tracks:
+        here = set(both[0].track_id.tolist())
+        held = {track: slot for track, slot in held.items() if track in here}
+        free = iter(sorted(set(range(2 * len(here) + 1)) - set(held.values())))
+        held |= {track: next(free) for track in sorted(here - held.keys())}
+        tracks.append(
+            tuple(
+                dataclasses.replace(one, track_id=np.array([held[t] for t in one.track_id.tolist()], np.uint64))
+                for one in both
+            )
+        )
+    return dataclasses.replace(data, tracks=tuple(tracks))
+
+
+def _stamps(factor: float) -> Wrong:
+    def go(data: SyntheticData) -> SyntheticData:
+        first = data.keyframes[0].stamp_ns
+        keyframes = tuple(
+            dataclasses.replace(one, stamp_ns=round((one.stamp_ns - first) * factor)) for one in data.keyframes
+        )
+        return dataclasses.replace(data, keyframes=keyframes)
+
+    return go
+
+
+WRONG: dict[str, Wrong] = {
+    "baseline reversed": rig(_reversed),
+    "rig swapped": rig(lambda r, p: (r[::-1], p[::-1])),
+    "tracks swapped": _exchanged,
+    "extrinsics inverted": rig(geometry.inverse),
+    "axes missing": rig(lambda r, p: (r @ _OPTICAL.T, p)),
+    "axes twice": rig(lambda r, p: (r @ _OPTICAL, p)),
+    "extrinsics in mm": rig(lambda r, p: (r, 1000.0 * p)),
+    "poses inverted": poses(lambda r, p, _: geometry.inverse(r, p)),
+    "poses of camera": poses(lambda r, p, data: geometry.compose(r, p, *_camera_0(data))),
+    "camera from world": poses(lambda r, p, data: geometry.inverse(*geometry.compose(r, p, *_camera_0(data)))),
+    "poses of optical body": poses(lambda r, p, _: (r @ _OPTICAL, p)),
+    "poses in mm": poses(lambda r, p, _: (r, 1000.0 * p)),
+    "poses with w first": poses(
+        lambda r, p, _: (
+            geometry.matrix_from_quaternion(geometry.quaternion_from_matrix(r)[:, [3, 0, 1, 2]]),
+            p,
+        )
+    ),
+    "turned 1 about y": turned(1.0, (0.0, 1.0, 0.0)),
+    "turned 1 about x": turned(1.0, (1.0, 0.0, 0.0)),
+    "turned 2 about z": turned(2.0, (0.0, 0.0, 1.0)),
+    "turned 0.5 about x": turned(0.5, (1.0, 0.0, 0.0)),
+    "focal 1.2": intrinsics(lambda k: k * [1.2, 1.2, 1.0, 1.0]),
+    "focal 0.8": intrinsics(lambda k: k * [0.8, 0.8, 1.0, 1.0]),
+    "focal 0.5": intrinsics(lambda k: k * [0.5, 0.5, 1.0, 1.0]),
+    "focal of camera 1": _second(factor=1.2),
+    "principal point of camera 1, v": _second(shift=(0.0, 20.0)),
+    "principal point of camera 1, u": _second(shift=(30.0, 0.0)),
+    "region": intrinsics(lambda k: k + np.array([0.0, 0.0, 320.0, 200.0])),
+    "binning": intrinsics(lambda k: 2.0 * k),
+    "not rectified": distortion(np.zeros(5)),
+    "rectified": distortion(_LENS),
+    "depth in mm": images(lambda one: dataclasses.replace(one, depth_m=1000.0 * one.depth_m)),
+    "depth in cm": images(lambda one: dataclasses.replace(one, depth_m=100.0 * one.depth_m)),
+    "depth in km": images(lambda one: dataclasses.replace(one, depth_m=0.001 * one.depth_m)),
+    "inverse depth": images(lambda one: dataclasses.replace(one, depth_m=1.0 / one.depth_m)),
+    "slots": _slots,
+    "stamps in us": _stamps(1e-3),
+    "stamps in ms": _stamps(1e-6),
+}

@@ -1,0 +1,143 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Each mistake is named when it is made, and none when the set-up is sound."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from ba_node.check.examine import examine
+from ba_node.check.tracks import Tracks
+from tests.check.set_ups import recording, seen
+
+# Mistake -> modes in which it shows, and what the likely mistake says.
+NAMED: dict[str, tuple[tuple[str, ...], str]] = {
+    "baseline reversed": (("stereo",), "baseline of camera 1 reversed"),
+    "rig swapped": (("stereo",), "cameras 0 and 1 swapped"),
+    "tracks swapped": (("stereo",), "cameras 0 and 1 swapped"),
+    "extrinsics inverted": (("stereo", "mono"), "extrinsics inverted: body_from_camera holds camera-from-body"),
+    "axes missing": (("stereo", "mono"), "axes confused: body_from_camera is that of a frame that looks along x"),
+    "axes twice": (("stereo", "mono"), "axes confused: body_from_camera turns into the optical frame twice"),
+    "extrinsics in mm": (("stereo",), "body_from_camera in millimetres"),
+    "poses inverted": (("stereo", "mono"), "^poses inverted: they hold body-from-world"),
+    "poses of camera": (("stereo", "mono"), "^poses are of the camera, given as of the body"),
+    "camera from world": (("stereo", "mono"), "^poses inverted and of the camera"),
+    "poses of optical body": (("stereo", "mono"), "the poses are of a body whose z looks forward"),
+    "poses in mm": (("stereo",), "poses in millimetres"),
+    "poses with w first": (("stereo", "mono"), "quaternions of the poses with w first"),
+    "turned 1 about y": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
+    "turned 1 about x": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
+    "turned 2 about z": (("stereo",), "camera 1 does not fit its place on the body by about 2 degrees"),
+    "turned 0.5 about x": (("stereo",), "camera 1 does not fit its place on the body by about 0.5 degrees"),
+    "focal 1.2": (("stereo", "mono"), r"focal length off by a factor of about 1\.(1[6-9]|2[0-4])"),
+    "focal 0.8": (("stereo", "mono"), r"focal length off by a factor of about 0\.(7[7-9]|8[0-3])"),
+    "focal 0.5": (("stereo", "mono"), r"focal length off by a factor of about 0\.(4[7-9]|5[0-3])"),
+    "focal of camera 1": (("stereo",), "focal length of camera 1 off by a factor of about 1.2"),
+    "principal point of camera 1, v": (("stereo",), "principal point of camera 1"),
+    "principal point of camera 1, u": (("stereo",), "principal point of camera 1 off by about (29|30|31) px"),
+    "region": (("stereo", "mono"), "region of interest not applied"),
+    "binning": (("stereo", "mono"), "binning not applied: k is that of an image 2 times as large"),
+    "not rectified": (("stereo", "mono"), "images not rectified though no distortion is given"),
+    "rectified": (("stereo", "mono"), "images rectified though a distortion is given"),
+    "depth in mm": (("rgbd",), "depth_m in millimetres"),
+    "depth in cm": (("rgbd",), "depth_m in centimetres"),
+    "depth in km": (("rgbd",), "depth_m in kilometres"),
+    "inverse depth": (("rgbd",), "depth_m holds inverse depths"),
+    "slots": (("stereo", "mono"), "ids reused"),
+    "stamps in us": (("mono",), "stamps in another unit.*microseconds"),
+    "stamps in ms": (("mono",), "stamps in another unit.*milliseconds"),
+}
+CASES = [(wrong, mode) for wrong, (modes, _) in NAMED.items() for mode in modes]
+
+
+@pytest.mark.parametrize(("wrong", "mode"), CASES)
+def test_mistake_is_named(wrong: str, mode: str) -> None:
+    found = examine(seen(recording(wrong=wrong, mode=mode)))
+    assert re.search(NAMED[wrong][1], found.causes()), found.summary()
+    assert found.harmful == (not wrong.startswith("stamps"))
+    assert all(finding.changes for finding in found.findings)
+
+
+@pytest.mark.parametrize("wrong", ["baseline reversed", "extrinsics inverted", "axes missing"])
+def test_two_cameras_tell_after_three_keyframes(wrong: str) -> None:
+    found = examine(seen(recording(wrong=wrong), keyframes=3))
+    assert re.search(NAMED[wrong][1], found.causes()), found.summary()
+
+
+@pytest.mark.parametrize("wrong", ["poses inverted", "camera from world", "poses of camera"])
+def test_one_camera_tells_after_ten_keyframes(wrong: str) -> None:
+    found = examine(seen(recording(wrong=wrong, mode="mono"), keyframes=10))
+    assert re.search(NAMED[wrong][1], found.causes()), found.summary()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"path": "line"},
+        {"mode": "mono"},
+        {"mode": "mono", "path": "line"},
+        {"mode": "rgbd"},
+        {"outlier_share": 0.3},
+        {"mode": "mono", "outlier_share": 0.3},
+        {"drift_rotation_deg": 3.0, "drift_translation": 0.1},
+        {"path": "line", "look_deg": 90.0},
+        {"mode": "mono", "distortion": "plumb_bob"},
+        {"distortion": "equidistant", "fov_deg": 130.0},
+        {"noise_px": 0.0, "outlier_share": 0.0},
+        {"mode": "mono", "send_sigma": False, "noise_px": 1.5},
+        {"tracks": 30},
+        {"ids": "random64"},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("keyframes", [6, 15, 60])
+def test_silent_when_sound(options: dict[str, object], keyframes: int) -> None:
+    found = examine(seen(recording(**options), keyframes))  # type: ignore[arg-type]
+    assert not found.findings, found.summary()
+    assert found.sound, found.untold
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["stereo", "mono", "rgbd"])
+@pytest.mark.parametrize("seed", range(20))
+def test_silent_on_every_seed(seed: int, mode: str) -> None:
+    for path in ("loop", "line"):
+        data = recording(seed, mode=mode, path=path)
+        for keyframes in (10, 25, 60):
+            found = examine(seen(data, keyframes))
+            assert not found.findings, f"{path}, {keyframes} keyframes: {found.summary()}"
+
+
+def test_same_tracks_give_the_same_numbers() -> None:
+    tracks = seen(recording(wrong="turned 1 about y"))
+    first, second = (json.dumps(examine(tracks).as_dict()) for _ in range(2))
+    assert first == second
+
+
+def test_nothing_to_tell() -> None:
+    data = recording(mode="mono", keyframes=3)
+    found = examine(seen(data, keyframes=1))
+    assert not found.findings
+    assert not found.sound
+    assert found.summary().startswith("the tracks cannot tell")
+
+
+def test_json_holds_no_nan() -> None:
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    text = json.dumps(examine(seen(recording(mode="mono"), keyframes=10)).as_dict())
+    json.loads(text, parse_constant=refuse)
+
+
+def test_tracks_without_rays_are_left_out() -> None:
+    tracks = seen(recording(distortion="equidistant", fov_deg=150.0), keyframes=5)
+    assert isinstance(tracks, Tracks)
+    for rows in tracks.images.values():
+        assert np.isfinite(tracks.ray[rows]).all()
+        assert (np.diff(tracks.track[rows]) > 0).all()

@@ -1,0 +1,63 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ba_node.check import two_view
+from ba_node.cli.main import main
+from ba_node.offline.recording import record
+from tests.check.set_ups import recording
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+
+
+@pytest.mark.parametrize("name", ["stereo_loop", "mono_loop"])
+def test_sound(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(BAGS / f"{name}.mcap")]) == 0
+    assert "the set-up fits the tracks" in capsys.readouterr().out
+
+
+def test_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "wrong.mcap"
+    data = recording(wrong="baseline reversed", keyframes=12, length_m=12.0)
+    record(bag, data.timeline(), data.truth)
+    assert main(["check", str(bag), "--json", str(tmp_path / "found.json")]) == 3
+    out = capsys.readouterr().out
+    assert "likely mistake: baseline of camera 1 reversed" in out
+    assert "change: the position in body_from_camera of camera 1 in camera_rig" in out
+    session = json.loads((tmp_path / "found.json").read_text())["sessions"][0]
+    assert session["findings"][0]["causes"][0].startswith("baseline of camera 1 reversed")
+    assert {row["hypothesis"] for row in session["hypotheses"]} >= {"as given", "free", "cameras 0 and 1 swapped"}
+
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 3
+    assert "baseline of camera 1 reversed" in capsys.readouterr().err
+    written = [line.split()[1:4] for line in (tmp_path / "out" / "trajectory.tum").read_text().splitlines()]
+    given = [line.split()[1:4] for line in (tmp_path / "out" / "trajectory_input.tum").read_text().splitlines()]
+    assert written == given
+
+
+def test_poses_of_camera_is_a_parameter(tmp_path: Path) -> None:
+    bag = tmp_path / "camera.mcap"
+    data = recording(wrong="poses of camera", keyframes=20, length_m=18.0)
+    record(bag, data.timeline())
+    assert main(["check", str(bag)]) == 3
+    assert main(["check", str(bag), "--set", "frames.poses_of=camera"]) == 0
+
+
+def test_too_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "short.mcap"
+    data = recording(mode="mono", keyframes=2, length_m=10.0)
+    record(bag, data.timeline())
+    assert main(["check", str(bag)]) == 2
+    assert "the tracks cannot tell" in capsys.readouterr().out
+
+
+def test_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(tmp_path / "none.mcap")]) == 2
+    monkeypatch.setattr(two_view, "available", lambda: False)
+    assert main(["check", str(BAGS / "mono_loop.mcap")]) == 2
+    assert "python3-opencv" in capsys.readouterr().err
