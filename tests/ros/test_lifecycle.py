@@ -200,7 +200,7 @@ def test_a_transition_that_fails_is_logged_and_can_be_tried_again(
     assert not {f"/ba_node/{topic}" for topic in OUTPUT_TYPES} & _node_topics(peer), "what was made is destroyed"
     assert _change(peer, "configure")
     assert not _change(peer, "activate")
-    assert "activate failed: RuntimeError: no activate today" in node.err
+    peer.until(lambda: "activate failed: RuntimeError: no activate today" in node.err, "that reason")
     assert _state(peer) == UNCONFIGURED
     assert not {f"/{topic}" for topic in INPUT_TYPES} & _topics(peer)
     assert _change(peer, "configure")
