@@ -79,5 +79,6 @@ def test_outputs_survive_the_wire(estimate: Estimate) -> None:
     np.testing.assert_allclose(points[:, :3], estimate.cloud.position, rtol=1e-6)
     report = received["report"]
     assert dict(zip(report.rejected_reason, report.rejected_count, strict=True)) == dict(estimate.report.rejected)
-    for name in set(vars(estimate.report)) - {"rejected"}:
+    assert tuple(report.warnings) == estimate.report.warnings
+    for name in set(vars(estimate.report)) - {"rejected", "warnings"}:
         assert getattr(report, name) == getattr(estimate.report, name), name

@@ -82,10 +82,10 @@ def test_silence_is_stale_and_names_who_is_missing(
 
 FAILING_SOLVE = """
 import sys
-from ba_node import backend
+from ba_node.core import solver
 from ba_node.core.result import Result, Status
 
-solve = backend.solver.solve
+solve = solver.solve
 calls = []
 
 def fail_from_the_third(problem, *arguments, **options):
@@ -94,7 +94,7 @@ def fail_from_the_third(problem, *arguments, **options):
         return solve(problem, *arguments, **options)
     return Result(problem.start, Status.FAILED, "made to fail", "test", ())
 
-backend.solver.solve = fail_from_the_third
+solver.solve = fail_from_the_third
 from ba_node.ros.main import main
 sys.exit(main())
 """

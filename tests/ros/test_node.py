@@ -175,6 +175,7 @@ def test_bad_input_is_counted_and_nothing_is_lost(
     _play(peer, scene)
     expected = {
         "bad_pose": 1,
+        "bad_rig": 1,
         "duplicate_keyframe": 2,
         # From the storm, and from the scene that is played as a whole after its first keyframe was sent.
         "duplicate_observation": len(good.track_id) + sum(len(image.track_id) for image in scene.tracks[0]),
@@ -182,7 +183,6 @@ def test_bad_input_is_counted_and_nothing_is_lost(
         "non_finite": len(good.track_id),
         "unknown_camera": 1,
         "unknown_keyframe": 3,
-        "unreadable": 1,
     }
     peer.until(lambda: _newest(peer) == KEYFRAMES - 1, "the last report")
     assert _rejected(peer) == expected
