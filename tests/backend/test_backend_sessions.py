@@ -344,7 +344,7 @@ def test_several_that_are_turned_away_for_one_reason_are_counted_in_the_warning(
 
 
 def test_stamps_that_are_all_the_same_are_said() -> None:
-    played = Played(m for part in [[data().rig], *groups()] for m in stamped(part, at_ns=0))
+    played = Played(joined(stamped(part, at_ns=0) for part in groups()))
     assert played.ids == all_ids(), "in order of arrival"
     words = f"keyframe {all_ids()[1]} has the stamp of keyframe {all_ids()[0]}, 0.000 s"
     assert played.scene.log.warnings["equal_stamps"].startswith(words)
