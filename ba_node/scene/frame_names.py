@@ -29,6 +29,8 @@ def check_name(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) ->
     if name == keyframe.frame_id and name:
         return
     log.notice("frame_name")
+    if "frame_name" in log.warnings:
+        return
     where = f"keyframe {keyframe.keyframe_id}: header.frame_id = {keyframe.frame_id!r}"
     if name:
         log.warn("frame_name", f"{where} is no name for tf2, taken as {name!r}: leave out the slash")

@@ -55,6 +55,7 @@ WARNINGS: dict[str, str] = {
     "bad_stamp": "A keyframe was turned away for its stamp.",
     "stray_session": "A keyframe of a higher session was turned away, since no second one followed.",
     "frame_name": "The fixed frame of the keyframes has no name, or one that tf2 refuses.",
+    "equal_stamps": "Two keyframes have one stamp.",
     "reused_id": "An id was used for a second keyframe of the session.",
     "setup": "A set-up that the tracks contradict: the likely mistake, and what to change. All solves are held.",
 }
@@ -96,3 +97,9 @@ class RejectionLog:
         """Keep a warning: what is wrong, which value, and what to do; it replaces an earlier one of its kind."""
         assert kind in WARNINGS, kind
         self.warnings[kind] = text
+
+    def warn_again(self, kind: str, text: str, name: str) -> None:
+        """Keep the first warning of a kind that is a reason too, with how many followed and the name of the last."""
+        first, _, _ = self.warnings.get(kind, text).partition("; likewise ")
+        more = self.rejected[kind] - 1
+        self.warn(kind, first + (f"; likewise {more} more, the last of them {name}" if more > 0 else ""))

@@ -147,9 +147,9 @@ class Scene:
     def refuse(self, refusal: Refusal) -> None:
         """Turn away what was held, and the tracks that wait for it."""
         self.log.reject(refusal.reason, refusal.text)
-        if refusal.reason in WARNINGS:
-            self.log.warn(refusal.reason, f"{refusal.text}: turned away")
         refused = refusal.measurement
+        if refusal.reason in WARNINGS and isinstance(refused, Keyframe):
+            self.log.warn_again(refusal.reason, f"{refusal.text}: turned away", f"keyframe {refused.keyframe_id}")
         key = refused.keyframe_id if isinstance(refused, Keyframe) and refused.session_id == self.session_id else None
         if key is None or key in self._keyframe_rows:
             return
@@ -263,6 +263,7 @@ class Scene:
             return
         if len(self.keyframes) and keyframe.stamp_ns < self.keyframes.stamp_ns.max():
             self.log.notice("reordered")
+        ingest.check_stamp(keyframe, self.keyframes, self.log)
         self.frame_id = self.frame_id or plain(keyframe.frame_id)
         row = self.keyframes.append(
             1,

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from ba_node.scene.scene import Scene
 
 # Keyframes in a row that confirm each other. Messages come twice, late, or under a wrong id now and then, which is no
-# jump: these take one more.
-_NEEDED = {Kind.REPEAT: 3, Kind.REUSED: 3, Kind.LATE: 3}
+# jump: these take more.
+_NEEDED = {Kind.REPEAT: 5, Kind.REUSED: 3, Kind.LATE: 3}
 _NEEDED_ELSE = 2
 # Keyframes of the current session that outvote what is held.
 _AGAINST = 3
@@ -153,7 +153,7 @@ class Sessions:
         row = scene.find_keyframe(keyframe.keyframe_id)
         if row is not None and same_pose(scene, row, keyframe):
             is_new = keyframe.keyframe_id not in self._loaded
-            return (Kind.REPEAT, keyframe, back) if is_back and is_new else None
+            return (Kind.REPEAT, keyframe, back) if is_new and (is_back or -ahead_s > late_s(scene)) else None
         if frame and scene.frame_id and frame != scene.frame_id:
             text = f"{name} is in frame {frame!r}, those before in {scene.frame_id!r}"
             return Kind.FRAME, keyframe, text

@@ -317,6 +317,39 @@ def test_a_block_of_keyframes_that_comes_late_is_sorted_in() -> None:
     assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
 
 
+def test_a_short_recording_that_plays_again_is_no_duplicate() -> None:
+    """It spans less than scene.max_reorder_s."""
+    played = Played([*messages(), *messages()])
+    assert [len(estimate.trajectory) for _, estimate in played.finished] == [N]
+    assert played.ids == all_ids()
+    assert not played.rejected
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_keyframes_that_come_again_long_after_change_nothing(count: int) -> None:
+    again = [m for part in groups()[:count] for m in part]
+    played = Played([*messages(), *again])
+    assert (played.ids, played.finished) == (all_ids(), [])
+    assert played.rejected["duplicate_keyframe"] == count
+    assert not played.scene.log.warnings
+
+
+def test_several_that_are_turned_away_for_one_reason_are_counted_in_the_warning() -> None:
+    parts = groups()
+    parts[4], parts[9] = stamped(parts[4], at_ns=0), stamped(parts[9], at_ns=0)
+    warning = Played(joined(parts)).scene.log.warnings["bad_stamp"]
+    first, last = all_ids()[4], all_ids()[9]
+    assert warning.startswith(f"keyframe {first} is")
+    assert warning.endswith(f"turned away; likewise 1 more, the last of them keyframe {last}")
+
+
+def test_stamps_that_are_all_the_same_are_said() -> None:
+    played = Played(joined(stamped(part, at_ns=0) for part in groups()))
+    assert played.ids == all_ids(), "in order of arrival"
+    words = f"keyframe {all_ids()[1]} has the stamp of keyframe {all_ids()[0]}, 0.000 s"
+    assert played.scene.log.warnings["equal_stamps"].startswith(words)
+
+
 USELESS: dict[str, Callable[[], Measurement]] = {
     "tracks without rows": lambda: _tracks(uv=np.empty((0, 2)), track_id=np.empty(0, np.uint64)),
     "tracks of NaN": lambda: _tracks(uv=np.full_like(data().tracks[5][0].uv, np.nan)),
