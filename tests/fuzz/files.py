@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import bz2
+import functools
 import gzip
 import io
 import struct
@@ -17,6 +18,8 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2
 
 from ba_node.backend import Backend
 from ba_node.config import Config
@@ -41,6 +44,15 @@ def read_recording(path: Path) -> None:
         for _ in reader.measurements():
             pass
         read_truth(reader)
+
+
+def read_folder(path: Path) -> None:
+    """Read a folder of rosbag2 whose metadata.yaml is the input."""
+    folder = path.with_suffix(".folder")
+    folder.mkdir()
+    (folder / "a.mcap").write_bytes(seeds()["mcap_packed"][0])
+    path.rename(folder / "metadata.yaml")
+    read_recording(folder)
 
 
 def read_plain_map(path: Path) -> None:
@@ -76,6 +88,8 @@ def _packed(suffix: str, pack: Callable[[bytes], bytes]) -> Reader:
 READERS: dict[str, Reader] = {
     "mcap": read_recording,
     "mcap_packed": read_recording,
+    "sqlite": read_recording,
+    "folder": read_folder,
     "tum": read_tum,
     "bal": read_bal,
     "bal_bz2": _packed(".bz2", bz2.compress),
@@ -88,6 +102,7 @@ READERS: dict[str, Reader] = {
 }
 
 
+@functools.cache
 def seeds() -> dict[str, list[bytes]]:
     """Return whole files for every reader."""
     with TemporaryDirectory() as name:
@@ -106,13 +121,17 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
     write_tum(folder / "a.tum", estimate.trajectory)
     write_ply(folder / "a.ply", estimate.cloud, "map")
     write_map(folder / "a.npz", backend.snapshot())
+    _write_sqlite(folder / "a.mcap", folder / "b")
     rng = np.random.default_rng(0)
     write_bal(folder / "a.txt", _bal(rng))
     read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "ply", "npz", "txt")}
     yaml = parameters_yaml(Config()).encode()
+    metadata = (folder / "b" / "metadata.yaml").read_bytes()
     return {
         "mcap": [_unpacked(folder / "a.mcap", chunked) for chunked in (True, False)],
         "mcap_packed": [read["mcap"]],
+        "sqlite": [(folder / "b" / "b.db3").read_bytes()],
+        "folder": [metadata.replace(b"b.db3", b"a.mcap").replace(b"sqlite3", b"mcap")],
         "tum": [read["tum"]],
         "bal": [read["txt"]],
         "bal_bz2": [read["txt"]],
@@ -145,6 +164,15 @@ def _unpacked(path: Path, chunked: bool) -> bytes:
             writer.add_message(channels[topic], time_ns, data, time_ns)
     writer.finish()  # type: ignore[no-untyped-call]
     return stream.getvalue()
+
+
+def _write_sqlite(bag: Path, folder: Path) -> None:
+    with BagReader(bag) as reader, Rosbag2(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections: dict[str, Any] = {}
+        for topic, kind, time_ns, data in reader.messages():
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ros_types.typestore())
+            writer.write(connections[topic], time_ns, data)
 
 
 def _members(path: Path) -> bytes:

@@ -15,6 +15,7 @@ import importlib.util
 import os
 import resource
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,15 +38,22 @@ def main() -> int:
     return 0
 
 
-def _until(run: Callable[[str, bytes], int], name: str, count: int) -> Callable[[bytes], None]:
-    """Return what runs a target and ends the process when it has taken enough."""
+def _until(run: Callable[[str, bytes], int], args: argparse.Namespace) -> Callable[[bytes], None]:
+    """Return what runs a target and ends the process when it has taken enough, or with the first fault."""
     taken = runs = 0
 
     def one(data: bytes) -> None:
         nonlocal taken, runs
-        taken += run(name, data)
+        try:
+            taken += run(args.name, data)
+        except BaseException:
+            kept = args.out / f"crash-{hashlib.sha1(data).hexdigest()}"
+            kept.write_bytes(data)
+            traceback.print_exc()
+            print(f"\n\nkept as {kept}", file=sys.stderr, flush=True)
+            os._exit(1)
         runs += 1
-        if taken >= count:
+        if taken >= args.count:
             peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
             print(f"{taken} {runs} {peak_mb}", flush=True)
             os._exit(0)
@@ -72,7 +80,7 @@ def _guided(args: argparse.Namespace) -> None:
         "artifact_prefix": f"{args.out}/",
     }
     given = [f"-{key}={value}" for key, value in options.items()]
-    atheris.Setup([sys.argv[0], *given, str(corpus)], _until(targets.run, args.name, args.count))
+    atheris.Setup([sys.argv[0], *given, str(corpus)], _until(targets.run, args))
     atheris.Fuzz()
 
 
@@ -82,7 +90,7 @@ def _drawn(args: argparse.Namespace) -> None:
     from tests.fuzz import targets  # noqa: PLC0415
     from tests.fuzz.mutation import mutated  # noqa: PLC0415
 
-    one = _until(targets.run, args.name, args.count)
+    one = _until(targets.run, args)
     options: dict[str, Any] = {
         "max_examples": _ROUND,
         "deadline": None,
