@@ -134,9 +134,11 @@ def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
     if rig.malformed:
         log.reject("bad_rig", f"camera rig {rig.frame_id!r}: {rig.malformed}")
         return None
-    shapes = (np.shape(rig.intrinsics), np.shape(rig.position), np.shape(rig.orientation), len(rig.distortion))
-    if n == 0 or shapes != ((n, 4), (n, 3), (n, 4), n):
-        log.reject("bad_rig", f"camera rig of {n} cameras: shapes {shapes}, expected ({n}, 4), ({n}, 3), ({n}, 4), {n}")
+    arrays = (rig.intrinsics, rig.position, rig.orientation, rig.image_size)
+    shapes = (*map(np.shape, arrays), len(rig.distortion), len(rig.names))
+    expected = ((n, 4), (n, 3), (n, 4), (n, 2), n, n)
+    if n == 0 or shapes != expected:
+        log.reject("bad_rig", f"camera rig of {n} cameras: shapes {shapes}, expected {expected}")
         return None
     model, params = np.zeros(n, np.uint8), np.zeros((n, cameras.N_PARAMS))
     for i in range(n):
