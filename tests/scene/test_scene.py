@@ -159,6 +159,9 @@ BAD_MESSAGES = [
     ("unknown_model", rig(models=("plumb_bob", "fisheye62"))),
     ("unknown_model", rig(intrinsics=np.zeros((2, 4)))),
     ("bad_rig", rig(0)),
+    ("bad_rig", rig(names=())),
+    ("bad_rig", rig(image_size=np.zeros((1, 2), np.int64))),
+    ("bad_rig", rig(malformed="camera 1 ('b'): k is all zero")),
     ("bad_rig", rig(orientation=np.zeros((2, 4)))),
     ("rig_changed", rig(1)),
 ]
