@@ -365,12 +365,12 @@ class Backend:
             self._report = dataclasses.replace(self._base_report(newest), reason=tried)
             return None, None
         elapsed = self._clock() - began
-        selection, (norms, state) = tried.selection, tried.found
+        selection, (norms, state, _) = tried.selection, tried.found
         if tried.held:
             self._hold(tried.held)
             state = None
         elif state is not None:
-            norms = window.put(self.scene, selection, state, self.config.tracks, self.config.solver.backend)
+            norms = window.put(self.scene, selection, state, norms, self.config.tracks, self.config.solver.backend)
             self.scene.keyframes.refined[list(tried.without)] = False
         figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:

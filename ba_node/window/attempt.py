@@ -64,7 +64,7 @@ def attempt(
         found = outcome(scene, selection, result, config.solver.backend)
         if found.state is None:
             return Attempt(selection, result, found, guard.Health(), "", without)
-        verdict = guard.judge(scene, config, selection, found.state, found.norms, trust)
+        verdict = guard.judge(scene, config, selection, found, trust)
         if without or not verdict.keyframes:
             held = trust.hear(verdict.reason, verdict.odd, without, config)
             return Attempt(selection, result, found, verdict.health, held, without)

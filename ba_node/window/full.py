@@ -279,4 +279,5 @@ def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArr
         keyframes=keyframes,
         landmarks=landmarks,
     )
-    judge(scene, now, problem.start, config.tracks, config.solver.backend)
+    norms = native_kernels.residual_norms(problem, problem.start, config.solver.backend)
+    judge(scene, now, problem.start, norms, config.tracks, config.solver.backend)

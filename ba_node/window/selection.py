@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,10 +78,14 @@ class Selection:
     tried: IntArray
     held_out: BoolArray
 
-    @property
+    @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
         return dataclasses.replace(self.problem, observations=self.sightings)
+
+    def trial(self, backend: str) -> trial.Trial:
+        """Return the tracks that poses are tried on."""
+        return trial.Trial(self.whole, self.tried, int(np.count_nonzero(self.held_out)), backend)
 
 
 @dataclass(frozen=True)
@@ -118,11 +123,13 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     if reason:
         return reason
     scene.settle_poses()
-    lost_keyframes = arrival.place(scene, config, window) if config.guard.enabled else window[:0]
-    part = _reach(scene, window, config, np.concatenate([lost_keyframes, np.array(without, np.intp)]))
-    part = dataclasses.replace(part, problem=_placed(scene, part, config))
-    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
-    norms = native_kernels.residual_norms(part.problem, start, config.solver.backend)
+    left_out = np.array(without, np.intp)
+    part, norms = _begun(scene, window, config, left_out)
+    if config.guard.enabled:
+        strays = arrival.strays(scene, config, part.problem, part.keyframes, part.landmarks, norms)
+        if len(strays):
+            left_out = np.concatenate([left_out, arrival.place(scene, config, strays)])
+            part, norms = _begun(scene, window, config, left_out)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     least = config.guard.min_points if config.guard.enabled else 2
@@ -156,6 +163,14 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         tried,
         held_out,
     )
+
+
+def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
+    """Return what may take part, and its residuals at the start, sigmas."""
+    part = _reach(scene, window, config, without)
+    part = dataclasses.replace(part, problem=_placed(scene, part, config))
+    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
+    return part, native_kernels.residual_norms(part.problem, start, config.solver.backend)
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:
