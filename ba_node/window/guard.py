@@ -12,7 +12,7 @@
 - **Better**: it explains some tracks, most of which took no part, no worse than the front-end's poses do, for all
   cameras together and for each alone (``trial.py``).
 
-Nothing here changes the scene. What is held leaves it as it was but for the count of solves; keyframes that were never
+Nothing here sees the scene. What is held leaves it as it was but for the count of solves; keyframes that were never
 taken follow the front-end by the correction of the last one that was (``Scene.settle_poses``).
 """
 
@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node.core import geometry
 from ba_node.window import steps
 from ba_node.window.trial import MIN_PARALLAX, median
 from ba_node.window.trust import Odd, Trust, agree
@@ -32,8 +31,7 @@ from ba_node.window.trust import Odd, Trust, agree
 if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.core.problem import Problem, State
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
     from ba_node.window.merging import Merged
     from ba_node.window.selection import Selection
     from ba_node.window.trial import Explained
@@ -84,11 +82,10 @@ class Verdict:
     systematic: bool = False
 
 
-def judge(scene: Scene, config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
+def judge(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
     """Return whether a solution may be taken.
 
     Args:
-        scene: into which it would go; not changed.
         config: all parameters.
         selection: what was solved.
         found: what came of it, with a state.
@@ -109,7 +106,7 @@ def judge(scene: Scene, config: Config, selection: Selection, found: Merged, tru
     )
     if not config.guard.enabled:
         return Verdict(health=health)
-    compared = _Compared.of(scene, config, selection, found.state, found.norms)
+    compared = _Compared.of(config, selection, found.state, found.norms)
     reason = _misfit(selection, found.state, agrees, config) or compared.systematic()
     reason = reason or _unexplained(selection.whole, found.explained, sigma, config)
     if reason:
@@ -185,7 +182,6 @@ class _Compared:
     selection: Selection
     norms: FloatArray
     config: Config
-    keyframe_id: IdArray
     first: IntArray
     second: IntArray
     solved: steps.Steps
@@ -193,20 +189,16 @@ class _Compared:
     off: steps.Comparison
 
     @classmethod
-    def of(cls, scene: Scene, config: Config, selection: Selection, state: State, norms: FloatArray) -> _Compared:
-        table, rows = scene.keyframes, selection.keyframes
-        measured = geometry.inverse(table.input_rotation[rows], table.input_position[rows] - selection.origin)
-        place = scene.places()[selection.keyframes]
+    def of(cls, config: Config, selection: Selection, state: State, norms: FloatArray) -> _Compared:
         fixed = selection.problem.fixed
         # Keyframes of the problem are oldest first; those between which others are left out make one step too.
-        adjacent = np.diff(place) <= 1 + len(selection.window)
+        adjacent = np.diff(selection.place) <= 1 + len(selection.window)
         first = np.flatnonzero(adjacent & ~(fixed[1:] & fixed[:-1]))
         second = first + 1
         solved = steps.between(state.rotation, state.translation, first, second)
-        front_end = steps.between(*measured, first, second)
+        front_end = steps.between(*selection.measured, first, second)
         off = steps.compare(solved, front_end, config.guard)
-        ids = scene.keyframes.keyframe_id[selection.keyframes]
-        return cls(selection, norms, config, ids, first, second, solved, front_end, off)
+        return cls(selection, norms, config, first, second, solved, front_end, off)
 
     def systematic(self) -> str:
         """Return what is wrong with the steps as a whole, in words."""
@@ -251,8 +243,9 @@ class _Compared:
             return Verdict(health=health)
         worst = int(np.argmax(np.where(odd, self.off.sigmas, 0.0)))
         text = (
-            f"its step to keyframe {self.keyframe_id[self.second[worst]]} is {self.off.move_m[worst]:.3g} m and"
-            f" {np.degrees(self.off.turn_rad[worst]):.3g} deg ({self.off.sigmas[worst]:.0f} sigmas) off the front-end's"
+            f"its step to keyframe {self.selection.keyframe_id[self.second[worst]]} is {self.off.move_m[worst]:.3g} m"
+            f" and {np.degrees(self.off.turn_rad[worst]):.3g} deg ({self.off.sigmas[worst]:.0f} sigmas) off the"
+            " front-end's"
         )
         if spanned[odd].all():
             return Verdict(f"{text}; it waits for more solves that agree", health, odd=self._odd(odd))

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from ba_node.window.trial import Explained
 
 
+# A point so many times as far away as the whole window's parallax can tell is anywhere.
+_NOTICED = 10.0
+
+
 class Merged(NamedTuple):
     """What came of a result.
 
@@ -41,27 +45,73 @@ class Merged(NamedTuple):
 
 def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
     """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
-    found = outcome(scene, selection, result, backend)
+    found = outcome(scene, selection, result, tracks, backend)
     if found.state is None:
         return found
     return found._replace(norms=put(scene, selection, found.state, found.norms, tracks, backend))
 
 
-def outcome(scene: Scene, selection: Selection, result: Result, backend: str = "auto") -> Merged:
+def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
     """Return what came of a result, in the scale of the map; the scene stays as it is."""
-    state = result.state
-    if not result.status.usable or not state.is_finite():
+    if not result.status.usable or not result.state.is_finite():
         return Merged(selection.norms, None)
-    table, rows = scene.keyframes, selection.keyframes
-    state = scaled(selection, table.input_position[rows], state)
-    measured = geometry.inverse(table.input_rotation[rows], table.input_position[rows] - selection.origin)
-    explained = selection.trial(backend).explained(measured, (state.rotation, state.translation))
-    if len(explained.points):
-        # Points that took no part are placed by their rays.
-        points, found = state.points.copy(), explained.points
-        points[selection.tried[: len(found)]] = np.where(np.isnan(found), points[selection.tried[: len(found)]], found)
+    state = scaled(selection, scene.keyframes.input_position[selection.keyframes], result.state)
+    return settled(selection, state, tracks, backend)
+
+
+def settled(selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> Merged:
+    """Return a solution with its points where they may be published, see ``Merged``.
+
+    Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
+    far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
+
+    Args:
+        selection: what was solved.
+        state: the solution, in the scale of the map.
+        tracks: the outlier gate.
+        backend: kernels.
+    """
+    explained = selection.trial(backend).explained(selection.measured, (state.rotation, state.translation))
+    found = explained.points
+    if len(found):
+        points, aside = state.points.copy(), selection.tried[: len(found)]
+        points[aside] = np.where(np.isnan(found), points[aside], found)
         state = dataclasses.replace(state, points=points)
-    return Merged(native_kernels.residual_norms(selection.whole, state, backend), state, explained)
+    norms = native_kernels.residual_norms(selection.whole, state, backend)
+    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, backend)
+    return Merged(norms, state, explained)
+
+
+def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, backend: str) -> State:
+    """Return a state whose points that ran away are back where they began; their norms are written over."""
+    whole, point, n = selection.whole, selection.sightings.point, selection.problem.n_points
+    limit = _noticed_m(selection, state)
+    centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
+    away, began = (np.abs(points - centre).max(axis=1) > limit for points in (state.points, whole.start.points))
+    agreeing = np.bincount(point[norms <= gate], minlength=n)
+    doubted = away | (2 * agreeing < np.bincount(point, minlength=n))
+    rows = np.flatnonzero(doubted.take(point))
+    if not len(rows):
+        return state
+    views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
+    start = dataclasses.replace(state, points=whole.start.points[doubted])
+    before = native_kernels.residual_norms(views, start, backend)
+    better = np.bincount(views.observations.point[before <= gate], minlength=views.n_points) > agreeing[doubted]
+    back, lost = ~began[doubted] & (better | away[doubted]), (away & began)[doubted]
+    moved = back.take(views.observations.point)
+    norms[rows[moved]] = before[moved]
+    norms[rows[lost.take(views.observations.point)]] = np.inf
+    points = state.points.copy()
+    points[np.flatnonzero(doubted)[back]] = whole.start.points[doubted][back]
+    return dataclasses.replace(state, points=points)
+
+
+def _noticed_m(selection: Selection, state: State) -> float:
+    """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise."""
+    cams, obs = selection.problem.cameras, selection.sightings
+    spread = np.ptp(-(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0], axis=0).max()
+    spread = max(float(spread), float(np.ptp(cams.translation, axis=0).max()))
+    return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
 
 
 def put(

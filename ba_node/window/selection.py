@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core import native_kernels
+from ba_node.core import geometry, native_kernels
 from ba_node.window import arrival, gauge, trial
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.core.problem import Observations, Problem
     from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
@@ -62,6 +62,9 @@ class Selection:
         unscaled: see ``gauge.Gauge``.
         tried: points whose tracks a solution is tried on, see ``trial.py``.
         held_out: (n_pt,) those of them that are not in the problem, but for their start.
+        keyframe_id: (n_kf,) uint64.
+        place: (n_kf,) of each keyframe in the order of time.
+        measured: the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m.
     """
 
     problem: Problem
@@ -77,6 +80,9 @@ class Selection:
     unscaled: IntArray
     tried: IntArray
     held_out: BoolArray
+    keyframe_id: IdArray
+    place: IntArray
+    measured: tuple[FloatArray, FloatArray]
 
     @cached_property
     def whole(self) -> Problem:
@@ -162,7 +168,15 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         held.unscaled,
         tried,
         held_out,
+        scene.keyframes.keyframe_id[part.keyframes],
+        scene.places()[part.keyframes],
+        _measured(scene, part),
     )
+
+
+def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:
+    table, rows = scene.keyframes, part.keyframes
+    return geometry.inverse(table.input_rotation[rows], table.input_position[rows] - part.origin)
 
 
 def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
