@@ -53,7 +53,7 @@ from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
 from ba_node.scene.frame_names import check_name
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
-from ba_node.window import extras, full, quality
+from ba_node.window import extras, full, guard, quality
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection, Transform
 from ba_node.window.known import cloud_of, poses_of, taking_part_of
@@ -98,6 +98,7 @@ class Backend:
         refused: the last keyframes that were turned away.
         extras: what the next solve is to work out beside the estimate.
         setup: the check of the set-up; while it gives a reason, every solve is held.
+        refusal: why the last solve of everything was held, in words; empty if it was not.
     """
 
     def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
@@ -112,6 +113,7 @@ class Backend:
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
         self.extras = Extras()
         self.setup = SetUpWatch()
+        self.refusal = ""
         self._clock = clock
         self._sessions = Sessions()
         self._current: int | None = None
@@ -291,15 +293,22 @@ class Backend:
         Returns:
             What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
         """
-        result = solved.result
-        followed = None
-        if result.status.usable and result.state.is_finite() and not self.setup.reason(self.scene):
-            followed = full.put(self.scene, self.config, taken, result.state)
+        result, self.refusal = solved.result, ""
+        if not result.status.usable or not result.state.is_finite():
+            return None
+        found = taken.outcome(result.state, self.config)
+        verdict = guard.judge(self.config, taken.selection, found)
+        self.refusal = self.setup.reason(self.scene) or ("" if verdict.odd else verdict.reason)
+        if self.refusal:
+            self._hold(f"a solve of everything: {self.refusal}")
+            return None
+        assert found.state is not None
+        followed = full.put(self.scene, self.config, taken, found.state)
         if followed is None:
             return None
         self.solve_count += 1
         newest = int(self.scene.order[-1])
-        figures = quality.figures(taken.selection, result, solved.norms)
+        figures = quality.figures(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
         report = self._base_report(int(self.scene.keyframes.keyframe_id[newest]))
         self._report = dataclasses.replace(report, **figures)
         self._correct(newest)
@@ -365,12 +374,12 @@ class Backend:
             self._report = dataclasses.replace(self._base_report(newest), reason=tried)
             return None, None
         elapsed = self._clock() - began
-        selection, (norms, state) = tried.selection, tried.found
+        selection, (norms, state, _) = tried.selection, tried.found
         if tried.held:
             self._hold(tried.held)
             state = None
         elif state is not None:
-            norms = window.put(self.scene, selection, state, self.config.tracks, self.config.solver.backend)
+            norms = window.put(self.scene, selection, state, norms, self.config.tracks, self.config.solver.backend)
             self.scene.keyframes.refined[list(tried.without)] = False
         figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:

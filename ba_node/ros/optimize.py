@@ -178,8 +178,9 @@ class Optimize(Component):
             result = solved.result
             if merged is None:
                 lost = result.status.usable
-                reason = (goal.stop or _GONE) if lost else result.reason
-                goal.end(Status.SKIPPED if lost else result.status, reason)
+                reason = (goal.stop or backend.refusal or _GONE) if lost else result.reason
+                held = lost and not goal.stop and backend.refusal
+                goal.end(Status.HELD if held else Status.SKIPPED if lost else result.status, reason)
                 return None
             estimate, goal.result["followed_keyframes"] = merged
             goal.end(result.status, result.reason)

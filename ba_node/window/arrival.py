@@ -42,20 +42,42 @@ _TRIED = 3
 _SOUGHT = 2
 
 
-def place(scene: Scene, config: Config, window: IntArray) -> IntArray:
+def strays(
+    scene: Scene, config: Config, problem: Problem, keyframes: IntArray, landmarks: IntArray, norms: FloatArray
+) -> IntArray:
+    """Return the rows of keyframes that were not refined yet and begin where they do not see what is known.
+
+    Args:
+        scene: what is known.
+        config: the outlier gate.
+        problem: of these keyframes and landmarks.
+        keyframes: (n_kf,) rows in the scene.
+        landmarks: (n_pt,) rows in the scene.
+        norms: (n_obs,) residuals at the start, sigmas.
+    """
+    new = np.flatnonzero(~scene.keyframes.refined[keyframes])
+    if config.tracks.outlier_px <= 0 or len(new) == len(keyframes):
+        return new[:0]
+    known = scene.landmarks.has_position[landmarks]
+    obs, found = problem.observations, []
+    for k in new:
+        own = np.flatnonzero(obs.keyframe == k)
+        own = own[known[obs.point[own]]]
+        if len(own) >= _MIN_POINTS and np.count_nonzero(norms[own] <= _limit(problem)) < _AGREEING * len(own):
+            found.append(keyframes[k])
+    return np.array(found, np.intp)
+
+
+def place(scene: Scene, config: Config, rows: IntArray) -> IntArray:
     """Move keyframes that begin in the wrong place; return the rows of those whose place is not found.
 
     Args:
         scene: poses of keyframes that were not refined are changed, until they are settled anew.
         config: the outlier gate.
-        window: rows of keyframes, oldest first.
+        rows: of keyframes, oldest first.
     """
-    new = window[~scene.keyframes.refined[window]]
-    if config.tracks.outlier_px <= 0 or len(new) == len(scene.keyframes):
-        return new[:0]
-    newest = window[-_SOUGHT:]
-    lost = [row for row in new if not _found(scene, config, int(row), bool((newest == row).any()))]
-    return np.array(lost, np.intp)
+    newest = set(scene.order[-_SOUGHT:].tolist())
+    return np.array([row for row in rows if not _found(scene, config, int(row), int(row) in newest)], np.intp)
 
 
 def _found(scene: Scene, config: Config, row: int, sought: bool) -> bool:
@@ -98,9 +120,12 @@ def _views(scene: Scene, config: Config, row: int) -> Problem | None:
 def _near(problem: Problem, state: State, config: Config) -> int:
     """Return how many points are near enough to their views for the solve to mend the pose."""
     norms = native_kernels.residual_norms(problem, state, config.solver.backend)
-    focal = float(np.median(problem.cameras.params[:, :2]))
-    limit = _FAR_RAD * focal / float(np.median(problem.observations.sigma_px))
-    return int(np.count_nonzero(norms <= limit))
+    return int(np.count_nonzero(norms <= _limit(problem)))
+
+
+def _limit(problem: Problem) -> float:
+    """Return the residual, sigmas, of a turn that is not left to the solve to mend."""
+    return _FAR_RAD * float(problem.cameras.params[0, 0]) / float(problem.observations.sigma_px[0])
 
 
 def _starts(scene: Scene, row: int) -> list[tuple[FloatArray, FloatArray]]:

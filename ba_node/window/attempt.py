@@ -61,10 +61,10 @@ def attempt(
         result = solver.solve(
             selection.problem, methods.from_config(config.solver), clock=clock, on_iteration=on_iteration
         )
-        found = outcome(scene, selection, result, config.solver.backend)
+        found = outcome(scene, selection, result, config.tracks, config.solver.backend)
         if found.state is None:
             return Attempt(selection, result, found, guard.Health(), "", without)
-        verdict = guard.judge(scene, config, selection, found.state, found.norms, trust)
+        verdict = guard.judge(config, selection, found, trust)
         if without or not verdict.keyframes:
             held = trust.hear(verdict.reason, verdict.odd, without, config)
             return Attempt(selection, result, found, verdict.health, held, without)

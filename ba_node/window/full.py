@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ba_node.core import geometry, methods, native_kernels, solver
-from ba_node.window.merging import judge, merge, scaled
+from ba_node.window.merging import Merged, judge, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
 
@@ -102,6 +102,11 @@ class Copy:
         whole = dataclasses.replace(self.selection.problem, observations=self.selection.sightings)
         return Solved(result, native_kernels.residual_norms(whole, result.state, chosen.backend))
 
+    def outcome(self, state: State, config: Config) -> Merged:
+        """Return a solution in the scale of the map, with its points where they may be published."""
+        state = scaled(self.selection, self.position, state)
+        return settled(self.selection, state, config.tracks, config.solver.backend)
+
 
 @dataclass(frozen=True)
 class _Similarity:
@@ -152,12 +157,11 @@ def _held(fixed: BoolArray, unscaled: IntArray, position: FloatArray) -> BoolArr
 
 
 def put(scene: Scene, config: Config, taken: Copy, state: State) -> int | None:
-    """Put the result for a copy into the map.
+    """Put the result for a copy, in the scale of the map (``Copy.outcome``), into the map.
 
     Returns:
         How many refined keyframes that are not of the copy followed; None if nothing of the copy is left.
     """
-    state = scaled(taken.selection, taken.position, state)
     keyframes = scene.find_keyframes(taken.keyframe_id)
     here = keyframes >= 0
     if scene is not taken.scene or not here.any():
@@ -279,4 +283,5 @@ def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArr
         keyframes=keyframes,
         landmarks=landmarks,
     )
-    judge(scene, now, problem.start, config.tracks, config.solver.backend)
+    norms = native_kernels.residual_norms(problem, problem.start, config.solver.backend)
+    judge(scene, now, problem.start, norms, config.tracks, config.solver.backend)

@@ -12,34 +12,36 @@
 - **Better**: it explains some tracks, most of which took no part, no worse than the front-end's poses do, for all
   cameras together and for each alone (``trial.py``).
 
-Nothing here changes the scene. What is held leaves it as it was but for the count of solves; keyframes that were never
+Nothing here sees the scene. What is held leaves it as it was but for the count of solves; keyframes that were never
 taken follow the front-end by the correction of the last one that was (``Scene.settle_poses``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node.core import geometry
 from ba_node.window import steps
-from ba_node.window.trial import MIN_PARALLAX, Trial
+from ba_node.window.trial import MIN_PARALLAX, median
 from ba_node.window.trust import Odd, Trust, agree
 
 if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.core.problem import Problem, State
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+    from ba_node.window.merging import Merged
     from ba_node.window.selection import Selection
+    from ba_node.window.trial import Explained
 
 # A common factor, or half the steps being off, is not judged from fewer steps.
 _MIN_STEPS = 4
-# Measured depths that are looked at.
-_DEPTHS = 256
+# Measured depths, and sigmas, that are looked at.
+_LOOKED_AT = 256
+# Cameras of a rig up to which each has to agree.
+_FEW_CAMERAS = 6
 # A step is borne out by so many points that are seen on both sides of it, and this share of them at least.
 _MIN_SPANNING = 10
 _SPANNING_SHARE = 0.5
@@ -80,44 +82,57 @@ class Verdict:
     systematic: bool = False
 
 
-def judge(
-    scene: Scene, config: Config, selection: Selection, state: State, norms: FloatArray, trust: Trust | None = None
-) -> Verdict:
+def judge(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
     """Return whether a solution may be taken.
 
     Args:
-        scene: into which it would go; not changed.
         config: all parameters.
         selection: what was solved.
-        state: the solution, in the scale of the map.
-        norms: (n_all,) sizes of the residuals after it, as ``Selection.norms``.
+        found: what came of it, with a state.
         trust: what the solves before are worth.
     """
+    assert found.state is not None and found.explained is not None
     trust = trust or Trust()
-    config = replace(config, guard=trust.bounds(config.guard))
+    config = trust.bounds(config)
     gate = config.tracks.outlier_px or np.inf
-    share = float(np.count_nonzero(norms <= gate)) / max(len(norms), 1)
-    table, rows = scene.keyframes, selection.keyframes
-    measured = geometry.inverse(table.input_rotation[rows], table.input_position[rows] - selection.origin)
-    health, unexplained = _tried(config, selection, state, measured)
-    health = replace(health, inlier_share=share)
+    agrees = found.norms <= gate
+    share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
+    sigma = median(selection.sightings.sigma_px[:: 1 + len(found.norms) // _LOOKED_AT])
+    health = Health(
+        inlier_share=share,
+        parallax_deg=float(np.degrees(found.explained.parallax_rad)),
+        held_out_px_before=found.explained.held_out[0] * sigma,
+        held_out_px_after=found.explained.held_out[1] * sigma,
+    )
     if not config.guard.enabled:
         return Verdict(health=health)
-    found = _Found.of(scene, config, selection, state, measured, norms)
-    reason = _misfit(selection, state, share, config) or found.systematic()
-    if reason or unexplained:
-        return Verdict(reason or unexplained, health, systematic=True)
-    return found.verdict(health, trust.confirmed(config.frames.gate_confirmations))
+    compared = _Compared.of(config, selection, found.state, found.norms)
+    reason = _misfit(selection, found.state, agrees, config) or compared.systematic()
+    reason = reason or _unexplained(selection.whole, found.explained, sigma, config)
+    if reason:
+        return Verdict(reason, health, systematic=True)
+    return compared.verdict(health, trust.confirmed(config.frames.gate_confirmations))
 
 
-def _misfit(selection: Selection, state: State, share: float, config: Config) -> str:
+def _misfit(selection: Selection, state: State, agrees: BoolArray, config: Config) -> str:
     """Return in words whether fewer observations agree with a solution, or fewer measured depths, than have to."""
     least, gate = config.guard.min_inlier_share, config.tracks.outlier_px or np.inf
+    share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
     if share < least:
         return (
             f"only {100 * share:.0f} % of the observations agree with it within {gate:g} sigmas: cameras, their places"
             " on the body, or track ids are not what they are said to be"
         )
+    n_cam = len(selection.problem.cameras.model)
+    for camera in range(n_cam if 1 < n_cam <= _FEW_CAMERAS else 0):
+        own = selection.sightings.camera == camera
+        count = int(np.count_nonzero(own))
+        share = float(np.count_nonzero(agrees & own)) / max(count, 1)
+        if share < least and count > len(agrees) // (2 * n_cam):
+            return (
+                f"only {100 * share:.0f} % of the observations of camera {camera} agree with it within {gate:g} sigmas:"
+                " it does not sit on the body as the rig says, or its calibration is wrong"
+            )
     off = _depth_errors(selection.whole, state)
     share = float(np.count_nonzero(off <= gate)) / max(len(off), 1)
     if len(off) and share < least:
@@ -134,81 +149,56 @@ def _depth_errors(problem: Problem, state: State) -> FloatArray:
     if not len(obs.depth_m):
         return np.empty(0)
     rows = np.flatnonzero(np.isfinite(obs.depth_m))
-    rows = rows[:: 1 + len(rows) // _DEPTHS]
+    rows = rows[:: 1 + len(rows) // _LOOKED_AT]
     camera, keyframe = obs.camera[rows], obs.keyframe[rows]
     body = (state.rotation[keyframe] @ state.points[obs.point[rows]][:, :, None])[..., 0] + state.translation[keyframe]
     depth = np.sum(cams.rotation[camera, 2] * body, axis=1) + cams.translation[camera, 2]
     return np.asarray(np.abs(depth - obs.depth_m[rows]) / obs.depth_sigma_m[rows])
 
 
-def _tried(
-    config: Config, selection: Selection, state: State, measured: tuple[FloatArray, FloatArray]
-) -> tuple[Health, str]:
-    """Return the health, and in words whether the tried tracks are explained worse than by the front-end's poses."""
-    whole = selection.whole
-    trial = Trial(whole, selection.tried, int(np.count_nonzero(selection.held_out)), config.solver.backend)
-    found = trial.explained(measured, (state.rotation, state.translation))
-    sigma = float(np.median(selection.sightings.sigma_px)) if len(selection.sightings) else 1.0
-    health = Health(
-        parallax_deg=float(np.degrees(found.parallax_rad)),
-        held_out_px_before=found.held_out[0] * sigma,
-        held_out_px_after=found.held_out[1] * sigma,
-    )
-    noise = sigma / float(np.median(whole.cameras.params[:, :2]))
-    if not len(whole.observations.depth_m) and found.parallax_rad < MIN_PARALLAX * noise:
-        return health, (
-            f"the rays to its points meet at {health.parallax_deg:.3f} deg, with a noise of {np.degrees(noise):.3f}"
-            " deg: that does not tell how far away they are, nor how far the keyframes are apart"
+def _unexplained(problem: Problem, found: Explained, sigma_px: float, config: Config) -> str:
+    """Return in words whether tracks tell no distances, or are explained worse than by the front-end's poses."""
+    noise = sigma_px / float(np.mean(problem.cameras.params[0, :2]))
+    if not len(problem.observations.depth_m) and found.parallax_rad < MIN_PARALLAX * noise:
+        return (
+            f"the rays to its points meet at {np.degrees(found.parallax_rad):.3f} deg, with a noise of"
+            f" {np.degrees(noise):.3f} deg: that does not tell how far away they are, nor how far keyframes are apart"
         )
     bad = found.worse(config.guard.max_worse_share)
     if not len(bad):
-        return health, ""
+        return ""
     k = int(bad[0])
     figures = f"mean residual {found.mean[0, k]:.2f} -> {found.mean[1, k]:.2f} sigmas"
     if k == 0:
-        return health, f"it explains the tracks that it was tried on worse than the poses that came in ({figures})"
+        return f"it explains the tracks that it was tried on worse than the poses that came in ({figures})"
     text = f"camera {k - 1} alone is explained worse than by the poses that came in ({figures}): the cameras do not sit"
-    return health, f"{text} on the body as the rig says, or their calibration is wrong"
+    return f"{text} on the body as the rig says, or their calibration is wrong"
 
 
 @dataclass(frozen=True)
-class _Found:
-    """The steps of a solution, those of the front-end, and those that the solve began with."""
+class _Compared:
+    """The steps of a solution and those of the front-end."""
 
     selection: Selection
     norms: FloatArray
     config: Config
-    keyframe_id: IdArray
     first: IntArray
     second: IntArray
     solved: steps.Steps
     measured: steps.Steps
-    began: steps.Steps
     off: steps.Comparison
 
     @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        config: Config,
-        selection: Selection,
-        state: State,
-        measured: tuple[FloatArray, FloatArray],
-        norms: FloatArray,
-    ) -> _Found:
-        place = scene.places()[selection.keyframes]
+    def of(cls, config: Config, selection: Selection, state: State, norms: FloatArray) -> _Compared:
         fixed = selection.problem.fixed
         # Keyframes of the problem are oldest first; those between which others are left out make one step too.
-        adjacent = np.diff(place) <= 1 + len(selection.window)
+        adjacent = np.diff(selection.place) <= 1 + len(selection.window)
         first = np.flatnonzero(adjacent & ~(fixed[1:] & fixed[:-1]))
         second = first + 1
         solved = steps.between(state.rotation, state.translation, first, second)
-        front_end = steps.between(*measured, first, second)
-        start = selection.problem.start
-        began = steps.between(start.rotation, start.translation, first, second)
+        front_end = steps.between(*selection.measured, first, second)
         off = steps.compare(solved, front_end, config.guard)
-        ids = scene.keyframes.keyframe_id[selection.keyframes]
-        return cls(selection, norms, config, ids, first, second, solved, front_end, began, off)
+        return cls(selection, norms, config, first, second, solved, front_end, off)
 
     def systematic(self) -> str:
         """Return what is wrong with the steps as a whole, in words."""
@@ -241,7 +231,9 @@ class _Found:
         odd = self.off.sigmas > limit
         if not odd.any():
             return Verdict(health=health)
-        known = steps.compare(self.solved, self.began, self.config.guard).sigmas <= limit
+        start = self.selection.problem.start
+        began = steps.between(start.rotation, start.translation, self.first, self.second)
+        known = steps.compare(self.solved, began, self.config.guard).sigmas <= limit
         if confirmed is not None:
             known |= agree(self._odd(odd), confirmed, self.config, self._keys(np.arange(len(odd))))
         spanned = np.zeros(len(odd), bool)
@@ -251,8 +243,9 @@ class _Found:
             return Verdict(health=health)
         worst = int(np.argmax(np.where(odd, self.off.sigmas, 0.0)))
         text = (
-            f"its step to keyframe {self.keyframe_id[self.second[worst]]} is {self.off.move_m[worst]:.3g} m and"
-            f" {np.degrees(self.off.turn_rad[worst]):.3g} deg ({self.off.sigmas[worst]:.0f} sigmas) off the front-end's"
+            f"its step to keyframe {self.selection.keyframe_id[self.second[worst]]} is {self.off.move_m[worst]:.3g} m"
+            f" and {np.degrees(self.off.turn_rad[worst]):.3g} deg ({self.off.sigmas[worst]:.0f} sigmas) off the"
+            " front-end's"
         )
         if spanned[odd].all():
             return Verdict(f"{text}; it waits for more solves that agree", health, odd=self._odd(odd))

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ba_node.core import geometry, native_kernels, triangulation
+from ba_node.core import geometry, native_kernels
 from ba_node.window import gauge
 from ba_node.window.initial_points import agreed_points, widened
-from ba_node.window.problems import part_of, some_observations
+from ba_node.window.problems import part_of
 from ba_node.window.reuse import note_reuse, part_reused
 
 if TYPE_CHECKING:
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from ba_node.scene.scene import Scene
     from ba_node.scene.tables import BoolArray, FloatArray, IntArray
     from ba_node.window.selection import Selection
+    from ba_node.window.trial import Explained
+
+
+# A point so many times as far away as the whole window's parallax can tell is anywhere.
+_NOTICED = 10.0
 
 
 class Merged(NamedTuple):
@@ -30,42 +35,97 @@ class Merged(NamedTuple):
     Attributes:
         norms: (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these.
         state: the solution in the scale that it has in the map; None without a usable result.
+        explained: how well its poses explain the tracks that they are tried on; None likewise.
     """
 
     norms: FloatArray
     state: State | None
+    explained: Explained | None = None
 
 
 def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
     """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
-    found = outcome(scene, selection, result, backend)
+    found = outcome(scene, selection, result, tracks, backend)
     if found.state is None:
         return found
-    return Merged(put(scene, selection, found.state, tracks, backend), found.state)
+    return found._replace(norms=put(scene, selection, found.state, found.norms, tracks, backend))
 
 
-def outcome(scene: Scene, selection: Selection, result: Result, backend: str = "auto") -> Merged:
+def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
     """Return what came of a result, in the scale of the map; the scene stays as it is."""
-    state = result.state
-    if not result.status.usable or not state.is_finite():
+    if not result.status.usable or not result.state.is_finite():
         return Merged(selection.norms, None)
-    state = scaled(selection, scene.keyframes.input_position[selection.keyframes], state)
-    if selection.held_out.any():
-        state = _with_held_out(selection, state, backend)
-    return Merged(native_kernels.residual_norms(selection.whole, state, backend), state)
+    state = scaled(selection, scene.keyframes.input_position[selection.keyframes], result.state)
+    return settled(selection, state, tracks, backend)
 
 
-def _with_held_out(selection: Selection, state: State, backend: str) -> State:
-    """Place the points that took no part by their rays, where these give a place."""
-    rows = np.flatnonzero(selection.held_out.take(selection.sightings.point))
-    problem = dataclasses.replace(some_observations(selection.whole, rows), start=state)
-    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points, backend)
-    placed = selection.held_out & ~np.isnan(found.points[:, 0])
-    return dataclasses.replace(state, points=np.where(placed[:, None], found.points, state.points))
+def settled(selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> Merged:
+    """Return a solution with its points where they may be published, see ``Merged``.
+
+    Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
+    far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
+
+    Args:
+        selection: what was solved.
+        state: the solution, in the scale of the map.
+        tracks: the outlier gate.
+        backend: kernels.
+    """
+    explained = selection.trial(backend).explained(selection.measured, (state.rotation, state.translation))
+    found = explained.points
+    if len(found):
+        points, aside = state.points.copy(), selection.tried[: len(found)]
+        points[aside] = np.where(np.isnan(found), points[aside], found)
+        state = dataclasses.replace(state, points=points)
+    norms = native_kernels.residual_norms(selection.whole, state, backend)
+    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, backend)
+    return Merged(norms, state, explained)
 
 
-def put(scene: Scene, selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> FloatArray:
+def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, backend: str) -> State:
+    """Return a state whose points that ran away are back where they began; their norms are written over."""
+    whole, point, n = selection.whole, selection.sightings.point, selection.problem.n_points
+    limit = _noticed_m(selection, state)
+    centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
+    away, began = (np.abs(points - centre).max(axis=1) > limit for points in (state.points, whole.start.points))
+    agreeing = np.bincount(point[norms <= gate], minlength=n)
+    doubted = away | (2 * agreeing < np.bincount(point, minlength=n))
+    rows = np.flatnonzero(doubted.take(point))
+    if not len(rows):
+        return state
+    views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
+    start = dataclasses.replace(state, points=whole.start.points[doubted])
+    before = native_kernels.residual_norms(views, start, backend)
+    better = np.bincount(views.observations.point[before <= gate], minlength=views.n_points) > agreeing[doubted]
+    back, lost = ~began[doubted] & (better | away[doubted]), (away & began)[doubted]
+    moved = back.take(views.observations.point)
+    norms[rows[moved]] = before[moved]
+    norms[rows[lost.take(views.observations.point)]] = np.inf
+    points = state.points.copy()
+    points[np.flatnonzero(doubted)[back]] = whole.start.points[doubted][back]
+    return dataclasses.replace(state, points=points)
+
+
+def _noticed_m(selection: Selection, state: State) -> float:
+    """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise."""
+    cams, obs = selection.problem.cameras, selection.sightings
+    spread = np.ptp(-(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0], axis=0).max()
+    spread = max(float(spread), float(np.ptp(cams.translation, axis=0).max()))
+    return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
+
+
+def put(
+    scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, backend: str = "auto"
+) -> FloatArray:
     """Put a solution, in the scale of the map, into the scene and judge its observations anew.
+
+    Args:
+        scene: to put it into.
+        selection: what was solved.
+        state: the solution.
+        norms: (n_all,) sizes of its residuals, as ``Selection.norms``; written over.
+        tracks: the gates.
+        backend: kernels.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
@@ -78,7 +138,7 @@ def put(scene: Scene, selection: Selection, state: State, tracks: TracksConfig, 
     scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
-    norms = judge(scene, selection, state, tracks, backend)
+    judge(scene, selection, state, norms, tracks, backend)
     _displace(scene, selection.lost)
     return norms
 
@@ -106,20 +166,19 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
     return dataclasses.replace(state, translation=translation, points=points)
 
 
-def judge(scene: Scene, selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> FloatArray:
+def judge(
+    scene: Scene, selection: Selection, state: State, norm: FloatArray, tracks: TracksConfig, backend: str = "auto"
+) -> None:
     """Mark the observations to leave out next time, and note the error of each point.
 
     The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point that
     less than half of its views believe in is placed anew where more of them agree. One with fewer than two good views
     (or one with a measured depth) is in the wrong place, or its track is: it loses its position, and all its views are
-    heard again when it is next placed.
-
-    Returns:
-        (n_all,) sizes of the residuals, as ``Selection.norms``.
+    heard again when it is next placed. ``norm`` are the sizes of the residuals; those of what is placed anew are
+    written over.
     """
     obs, n_points, outlier_px = selection.sightings, selection.problem.n_points, tracks.outlier_px
     whole = dataclasses.replace(selection.problem, observations=obs, start=state)
-    norm = native_kernels.residual_norms(whole, state, backend)
     # What was left out of the solve tells nothing about how good it is.
     gate = widened(outlier_px, norm[selection.believed]) if outlier_px > 0 else np.inf
     outlier = norm > gate
@@ -134,7 +193,6 @@ def judge(scene: Scene, selection: Selection, state: State, tracks: TracksConfig
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
     if outlier_px > 0:
         note_reuse(scene, part_reused(scene, selection, whole, norm, gate, backend))
-    return norm
 
 
 def _place_anew(

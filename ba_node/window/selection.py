@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core import native_kernels
+from ba_node.core import geometry, native_kernels
 from ba_node.window import arrival, gauge, trial
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.core.problem import Observations, Problem
     from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
@@ -61,6 +62,9 @@ class Selection:
         unscaled: see ``gauge.Gauge``.
         tried: points whose tracks a solution is tried on, see ``trial.py``.
         held_out: (n_pt,) those of them that are not in the problem, but for their start.
+        keyframe_id: (n_kf,) uint64.
+        place: (n_kf,) of each keyframe in the order of time.
+        measured: the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m.
     """
 
     problem: Problem
@@ -76,11 +80,18 @@ class Selection:
     unscaled: IntArray
     tried: IntArray
     held_out: BoolArray
+    keyframe_id: IdArray
+    place: IntArray
+    measured: tuple[FloatArray, FloatArray]
 
-    @property
+    @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
         return dataclasses.replace(self.problem, observations=self.sightings)
+
+    def trial(self, backend: str) -> trial.Trial:
+        """Return the tracks that poses are tried on."""
+        return trial.Trial(self.whole, self.tried, int(np.count_nonzero(self.held_out)), backend)
 
 
 @dataclass(frozen=True)
@@ -118,11 +129,13 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     if reason:
         return reason
     scene.settle_poses()
-    lost_keyframes = arrival.place(scene, config, window) if config.guard.enabled else window[:0]
-    part = _reach(scene, window, config, np.concatenate([lost_keyframes, np.array(without, np.intp)]))
-    part = dataclasses.replace(part, problem=_placed(scene, part, config))
-    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
-    norms = native_kernels.residual_norms(part.problem, start, config.solver.backend)
+    left_out = np.array(without, np.intp)
+    part, norms = _begun(scene, window, config, left_out)
+    if config.guard.enabled:
+        strays = arrival.strays(scene, config, part.problem, part.keyframes, part.landmarks, norms)
+        if len(strays):
+            left_out = np.concatenate([left_out, arrival.place(scene, config, strays)])
+            part, norms = _begun(scene, window, config, left_out)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     least = config.guard.min_points if config.guard.enabled else 2
@@ -155,7 +168,23 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         held.unscaled,
         tried,
         held_out,
+        scene.keyframes.keyframe_id[part.keyframes],
+        scene.places()[part.keyframes],
+        _measured(scene, part),
     )
+
+
+def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:
+    table, rows = scene.keyframes, part.keyframes
+    return geometry.inverse(table.input_rotation[rows], table.input_position[rows] - part.origin)
+
+
+def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
+    """Return what may take part, and its residuals at the start, sigmas."""
+    part = _reach(scene, window, config, without)
+    part = dataclasses.replace(part, problem=_placed(scene, part, config))
+    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
+    return part, native_kernels.residual_norms(part.problem, start, config.solver.backend)
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_node.core import geometry
+from ba_node.window.trial import median
 
 if TYPE_CHECKING:
     from ba_node.config import GuardConfig
@@ -99,8 +99,14 @@ def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     telling = angle_of(measured.turn) > found.sigma_rad
     if np.count_nonzero(telling) < _FEW:
         return 1.0
-    turns, wanted = (geometry.so3_log(one.turn[telling]) for one in (steps, measured))
+    turns, wanted = (_axes(one.turn[telling]) for one in (steps, measured))
     return _common(turns, wanted, found.sigma_rad[telling])
+
+
+def _axes(turn: FloatArray) -> FloatArray:
+    """Return the axes of rotations times the sines of their angles, (n, 3)."""
+    skew = 0.5 * (turn - np.swapaxes(turn, 1, 2))
+    return np.asarray(skew[:, [2, 0, 1], [1, 2, 0]])
 
 
 def _common(found: FloatArray, measured: FloatArray, sigma: FloatArray) -> float:
@@ -122,7 +128,7 @@ def _common(found: FloatArray, measured: FloatArray, sigma: FloatArray) -> float
     if n < _FEW:
         return 1.0
     logs = np.log(ours[telling] / theirs[telling])
-    middle = float(np.median(logs))
-    scatter = _MEDIAN * _SPREAD * float(np.median(np.abs(logs - middle))) / np.sqrt(n)
-    expected = _MEDIAN * float(np.median(2.0 * sigma[telling] / length[telling])) / np.sqrt(n)
+    middle = median(logs)
+    scatter = _MEDIAN * _SPREAD * median(np.abs(logs - middle)) / np.sqrt(n)
+    expected = _MEDIAN * median(2.0 * sigma[telling] / length[telling]) / np.sqrt(n)
     return float(np.exp(middle)) if abs(middle) > max(3.0 * scatter, 2.0 * expected) else 1.0

@@ -38,6 +38,7 @@ _BEHIND = 1e6
 # Sigmas that the mean may grow in any case.
 _SLACK = 0.05
 _HASH = np.uint64(0x9E3779B97F4A7C15)
+_NONE = np.empty(0, np.intp)
 
 
 def choose(track_id: IdArray, point: IntArray, wanted: int) -> tuple[IntArray, IntArray]:
@@ -56,7 +57,10 @@ def choose(track_id: IdArray, point: IntArray, wanted: int) -> tuple[IntArray, I
         return candidates[:0], candidates[:0]
     with np.errstate(over="ignore"):
         key = track_id[candidates] * _HASH
-    tried = candidates[np.argsort(key, kind="stable")[:wanted]]
+    if wanted < len(key):
+        few = np.argpartition(key, wanted)[:wanted]
+        candidates, key = candidates[few], key[few]
+    tried = candidates[np.argsort(key, kind="stable")]
     return tried, tried[: len(track_id) // _SHARE]
 
 
@@ -68,11 +72,13 @@ class Explained:
         held_out: (2,) median of the residuals of the tracks that took no part, sigmas; 0 without any.
         mean: (2, 1 + n_cam) of the residuals of all, each bounded, sigmas; NaN where there are too few.
         parallax_rad: median over the tracks of the largest angle between two rays, by the second set of poses.
+        points: (n_out, 3) those that took no part, by the second set of poses, m.
     """
 
     held_out: FloatArray
     mean: FloatArray
     parallax_rad: float
+    points: FloatArray
 
     def worse(self, share: float) -> IntArray:
         """Return which residuals the second set raises by more than a share: 0 for all cameras, 1 + camera."""
@@ -81,94 +87,114 @@ class Explained:
 
 
 class Trial:
-    """Some tracks of a problem."""
+    """Some tracks of a problem, to be tried with two sets of poses at once: each view stands in all arrays twice."""
 
     def __init__(self, problem: Problem, tried: IntArray, n_out: int, backend: str = "auto") -> None:
         """Take the views of the tracks ``tried`` out of a problem; the first ``n_out`` of them took no part."""
-        self._problem, self._backend, self._n_out = problem, backend, n_out
-        self._n_cam = len(problem.cameras.model)
-        obs, n = problem.observations, len(tried)
-        number = np.full(problem.n_points, -1)
-        number[tried] = np.arange(n)
-        rows = np.flatnonzero(number.take(obs.point) >= 0)
-        group = number.take(obs.point.take(rows))
-        rows = rows.take(np.argsort(group, kind="stable"))
-        if self._n_cam > 1:
-            alone = number.take(obs.point.take(rows)) * self._n_cam + obs.camera.take(rows) + n
-            order = np.argsort(alone, kind="stable")
-            group = np.concatenate([number.take(obs.point.take(rows)), alone.take(order)])
-            rows = np.concatenate([rows, rows.take(order)])
-            self.n_groups = n * (1 + self._n_cam)
-        else:
-            group = number.take(obs.point.take(rows))
-            self.n_groups = n
-        self._n_tried = n
-        self._prepare(obs, rows, group)
+        self._problem, self._backend = problem, backend
+        self._n_cam, self._n_tried, self._n_out = len(problem.cameras.model), len(tried), n_out
+        obs = problem.observations
+        # Observations are sorted by point.
+        begin, end = (np.searchsorted(obs.point, tried, side) for side in ("left", "right"))
+        rows = np.concatenate([np.arange(b, e) for b, e in zip(begin.tolist(), end.tolist(), strict=True)] or [_NONE])
+        self._rays(obs, rows, np.repeat(np.arange(len(tried)), end - begin))
 
-    def _prepare(self, obs: Observations, rows: IntArray, group: IntArray) -> None:
-        cams = self._problem.cameras
+    def _rays(self, obs: Observations, rows: IntArray, group: IntArray) -> None:
+        """Keep the rays of some observations, in the body, and to which track each belongs."""
+        cams, n_kf = self._problem.cameras, self._problem.n_keyframes
         camera = obs.camera.take(rows)
-        self._obs = Observations(
-            obs.keyframe.take(rows),
-            camera,
-            group,
-            obs.uv.take(rows, axis=0),
-            obs.sigma_px.take(rows),
-            np.empty(0),
-            np.empty(0),
-        )
         ray = np.ones((len(rows), 3))
-        ray[:, :2] = normalise(self._obs.uv, cams.model[camera], cams.params[camera])
-        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        ray[:, :2] = normalise(obs.uv.take(rows, axis=0), cams.model[camera], cams.params[camera])
+        good = np.isfinite(ray[:, 0])
+        if not good.all():
+            rows, group, camera, ray = rows[good], group[good], camera[good], ray[good]
+        ray /= np.sqrt(np.einsum("ij,ij->i", ray, ray))[:, None]
         turn = np.swapaxes(cams.rotation, 1, 2)
-        self._direction = (turn[camera] @ ray[:, :, None])[..., 0]
-        self._centre = (-(turn @ cams.translation[:, :, None])[..., 0])[camera]
-        focal = np.sqrt(cams.params[:, FX] * cams.params[:, FY])
-        self._px_per_rad = focal[camera] / self._obs.sigma_px
-        self._noise_rad = 1.0 / float(np.median(self._px_per_rad)) if len(rows) else 0.0
-        self._good = np.isfinite(ray[:, 0])
+        self._direction = np.tile(np.einsum("nij,nj->ni", turn.take(camera, axis=0), ray), (2, 1))
+        self._centres = -(turn @ cams.translation[:, :, None])[..., 0]
+        self._keyframe = _twice(obs.keyframe.take(rows), n_kf)
+        order, n_groups = np.arange(len(rows)), self._n_tried
+        if self._n_cam > 1:
+            # All views of each track, and then those of each camera.
+            alone = group * self._n_cam + camera
+            by_camera = np.argsort(alone, kind="stable")
+            group = np.concatenate([group, alone.take(by_camera) + self._n_tried])
+            order = np.concatenate([order, by_camera])
+            n_groups *= 1 + self._n_cam
+        self._order = _twice(order, len(rows))
+        self._views(obs, rows[order], group, n_groups)
+
+    def _views(self, obs: Observations, rows: IntArray, group: IntArray, n_groups: int) -> None:
+        """Keep the views by group, and which groups count."""
+        cams, n_kf = self._problem.cameras, self._problem.n_keyframes
+        keyframe, camera, sigma_px = obs.keyframe.take(rows), obs.camera.take(rows), obs.sigma_px.take(rows)
         # Views by different keyframes; a track of fewer is explained by any poses.
-        key = group * self._problem.n_keyframes + self._obs.keyframe
+        key = group * n_kf + keyframe
         distinct = np.ones(len(key), bool)
         distinct[1:] = key[1:] != key[:-1]
-        views = np.bincount(group[self._good & distinct], minlength=self.n_groups)
-        self._counts = self._good & (views >= _MIN_VIEWS).take(group)
+        self._group, self._n_groups = group, n_groups
+        self._counts = np.bincount(group[distinct], minlength=n_groups) >= _MIN_VIEWS
         # 0 for all cameras together, then each alone; one camera is both.
         self._of = np.where(group < self._n_tried, 0, 1 + camera)
+        uv, none = np.tile(obs.uv.take(rows, axis=0), (2, 1)), np.empty(0)
+        self._obs = Observations(
+            _twice(keyframe, n_kf), np.tile(camera, 2), _twice(group, n_groups), uv, np.tile(sigma_px, 2), none, none
+        )
+        px_per_rad = np.sqrt(cams.params[:, FX] * cams.params[:, FY]).take(camera) / sigma_px
+        self._noise_rad = 1.0 / median(px_per_rad) if len(rows) else 0.0
+        self._px_per_rad = np.tile(px_per_rad, 2)
+        self._image = _twice(keyframe * self._n_cam + camera, n_kf * self._n_cam)
 
-    def explained(self, *poses: tuple[FloatArray, FloatArray]) -> Explained:
+    def explained(self, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]) -> Explained:
         """Return how well two sets of poses explain the tracks.
 
         Args:
-            poses: (n_kf, 3, 3) and (n_kf, 3) body from world, m, of each.
+            before: (n_kf, 3, 3) and (n_kf, 3) body from world, m.
+            after: the other poses.
         """
-        norms, parallax = zip(*(self._norms(*one) for one in poses), strict=True)
+        points, parallax, norms = self._tried(*(np.concatenate(pair) for pair in zip(before, after, strict=True)))
         # Rays that are parallel by either set meet anywhere.
-        counts = self._counts & (np.minimum(*parallax) > MIN_PARALLAX * self._noise_rad).take(self._obs.point)
-        mean, held_out = np.full((2, 1 + self._n_cam), np.nan), np.zeros(2)
-        for i, found in enumerate(norms):
-            for k in range(1 + self._n_cam if self._n_cam > 1 else 1):
-                own = found[counts & (self._of == k)]
-                if len(own) >= _MIN_RESIDUALS:
-                    mean[i, k] = np.mean(np.minimum(own, _BOUND))
-            out = found[self._counts & (self._obs.point < self._n_out)]
-            held_out[i] = min(float(np.median(out)), _BEHIND) if len(out) else 0.0
-        joint = parallax[1][: self._n_tried]
-        return Explained(held_out, mean, float(np.median(joint)) if len(joint) else 0.0)
+        wide = (parallax > MIN_PARALLAX * self._noise_rad).all(axis=0)
+        rows = np.flatnonzero((self._counts & wide).take(self._group))
+        n = 1 + self._n_cam
+        count = np.bincount(self._of[rows], minlength=n)
+        sums = [np.bincount(self._of[rows], np.minimum(norm[rows], _BOUND), n) for norm in norms]
+        mean = np.where(count >= _MIN_RESIDUALS, np.array(sums) / np.maximum(count, 1), np.nan)
+        out = np.flatnonzero(self._counts.take(self._group) & (self._group < self._n_out))
+        return Explained(
+            np.array([min(median(norm[out]), _BEHIND) if len(out) else 0.0 for norm in norms]),
+            mean,
+            median(parallax[1, : self._n_tried]) if self._n_tried else 0.0,
+            points[1, : self._n_out],
+        )
 
-    def _norms(self, rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        turn = np.swapaxes(rotation, 1, 2).take(self._obs.keyframe, axis=0)
-        from_body = self._centre - translation.take(self._obs.keyframe, axis=0)
-        good, nan = self._good, np.full(int(np.count_nonzero(self._good)), np.nan)
+    def _tried(self, rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return points (2, n_groups, 3) m, their parallax (2, n_groups) rad, and residuals (2, n_obs) sigmas."""
+        back = np.swapaxes(rotation, 1, 2)
+        centres = (back[:, None] @ (self._centres - translation[:, None, :])[..., None]).reshape(-1, 3)
+        directions = np.einsum("nij,nj->ni", back.take(self._keyframe, axis=0), self._direction)
+        nan = np.full(len(self._order), np.nan)
         rays = triangulation.Rays(
-            self._obs.point[good],
-            (turn @ from_body[:, :, None])[good, :, 0],
-            (turn @ self._direction[:, :, None])[good, :, 0],
-            self._px_per_rad[good],
+            self._obs.point,
+            centres.take(self._image, axis=0),
+            directions.take(self._order, axis=0),
+            self._px_per_rad,
             nan,
             nan,
         )
-        found = triangulation.triangulate(rays, self.n_groups, self._backend)
+        found = triangulation.triangulate(rays, 2 * self._n_groups, self._backend)
         state = State(rotation, translation, np.nan_to_num(found.points), np.empty((0, 3)))
-        problem = Problem(state, self._problem.fixed, self._problem.cameras, self._obs)
-        return native_kernels.residual_norms(problem, state, self._backend), found.parallax_rad
+        problem = Problem(state, np.zeros(len(rotation), bool), self._problem.cameras, self._obs)
+        norms = native_kernels.residual_norms(problem, state, self._backend)
+        return found.points.reshape(2, -1, 3), found.parallax_rad.reshape(2, -1), norms.reshape(2, -1)
+
+
+def _twice(index: IntArray, n: int) -> IntArray:
+    """Return indices into a list of n, and once more into another list after it."""
+    return np.concatenate([index, index + n])
+
+
+def median(values: FloatArray) -> float:
+    """Return the (upper) median of some values: numpy's takes ten times as long for as few."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])

@@ -12,7 +12,7 @@ import numpy as np
 from ba_node.window import steps
 
 if TYPE_CHECKING:
-    from ba_node.config import Config, GuardConfig
+    from ba_node.config import Config
     from ba_node.scene.tables import BoolArray
 
 # Doubt that a held solve adds; the most there may be; up to which one that passes is taken; from which on what was
@@ -75,17 +75,18 @@ class Trust:
         """Return True if what was taken of a young map is to be given up."""
         return self.doubt >= _LOST
 
-    def bounds(self, guard: GuardConfig) -> GuardConfig:
-        """Return the bounds, narrower as long as there is doubt: who was just out of them does not slip back in."""
+    def bounds(self, config: Config) -> Config:
+        """Return parameters with narrower bounds as long as there is doubt: who was just out does not slip back in."""
         if self.doubt <= _ENOUGH:
-            return guard
-        return replace(
-            guard,
-            max_typical_sigmas=_NARROW * guard.max_typical_sigmas,
-            max_scale_error=_NARROW * guard.max_scale_error,
-            max_worse_share=_NARROW * guard.max_worse_share,
-            min_inlier_share=min(guard.min_inlier_share / _NARROW, 1.0),
+            return config
+        guard = replace(
+            config.guard,
+            max_typical_sigmas=_NARROW * config.guard.max_typical_sigmas,
+            max_scale_error=_NARROW * config.guard.max_scale_error,
+            max_worse_share=_NARROW * config.guard.max_worse_share,
+            min_inlier_share=min(config.guard.min_inlier_share / _NARROW, 1.0),
         )
+        return replace(config, guard=guard)
 
     def confirmed(self, needed: int) -> Odd | None:
         """Return odd steps that as many solves agreed on as are needed."""

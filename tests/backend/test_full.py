@@ -22,6 +22,7 @@ from ba_node.evaluation.alignment import align
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from ba_node.window import full
+from ba_node.window.merging import scaled
 from ba_node.window.problems import some_observations
 
 if TYPE_CHECKING:
@@ -178,6 +179,7 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     state = dataclasses.replace(state, rotation=inverse[0], translation=inverse[1])
     # The scale is given to the map by its steps, so they are stretched with it.
     taken = dataclasses.replace(taken, position=moved(position))
+    state = scaled(taken.selection, taken.position, state)
     assert full.put(scene, backend.config, taken, state) == 8
     after = backend.estimate()
     np.testing.assert_allclose(after.trajectory.position, moved(before.trajectory.position), atol=1e-9)
