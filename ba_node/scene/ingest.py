@@ -20,6 +20,7 @@ from ba_node.scene.rejections import RejectionLog
 
 if TYPE_CHECKING:
     from ba_node.measurements import CameraRig, FeatureTracks, IdArray, Keyframe, LandmarkGuesses
+    from ba_node.scene.records import Keyframes
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -71,6 +72,16 @@ def _check_distance(name: str, frame_id: str, position: FloatArray, log: Rejecti
             " and points.ply keep all digits)"
         )
         log.warn("far_from_origin", text=text)
+
+
+def check_stamp(keyframe: Keyframe, known: Keyframes, log: RejectionLog) -> None:
+    """Say so, once, if a keyframe has the stamp of one that is known."""
+    same = np.flatnonzero(known.stamp_ns == keyframe.stamp_ns)
+    if not len(same) or "equal_stamps" in log.warnings:
+        return
+    other = f"keyframe {int(known.keyframe_id[same[-1]])}, {keyframe.stamp_ns * 1e-9:.3f} s"
+    text = f"keyframe {keyframe.keyframe_id} has the stamp of {other}: they are put in order of arrival"
+    log.warn("equal_stamps", f"{text}; set header.stamp to the time of the image")
 
 
 def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | None:
@@ -135,7 +146,7 @@ def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
         log.reject("bad_rig", f"camera rig {rig.frame_id!r}: {rig.malformed}")
         return None
     arrays = (rig.intrinsics, rig.position, rig.orientation, rig.image_size)
-    shapes = (*map(np.shape, arrays), len(rig.distortion), len(rig.names))
+    shapes = (*(np.shape(array) for array in arrays), len(rig.distortion), len(rig.names))
     expected = ((n, 4), (n, 3), (n, 4), (n, 2), n, n)
     if n == 0 or shapes != expected:
         log.reject("bad_rig", f"camera rig of {n} cameras: shapes {shapes}, expected {expected}")
