@@ -219,6 +219,30 @@ def test_started_python_keeps_its_own_libraries_and_drops_those_of_others() -> N
     assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in other
 
 
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (["python", "/v/bin/ba", "replay"], 130, "ba: interrupted\n"),
+        (["python", "-m", "ba_node.cli.main"], 130, "ba: interrupted\n"),
+        (["python", "bar"], 0, "mine\n"),
+    ],
+)
+def test_a_python_that_starts_is_interrupted_quietly_where_it_is_to_run_ba(
+    words: list[str], code: int, told: str
+) -> None:
+    script = (
+        "import signal, sys; from tools import venv_hook\n"
+        "signal.signal(signal.SIGINT, lambda *_: print('mine', file=sys.stderr))\n"
+        f"venv_hook.end_quietly({words!r})\n"
+        "signal.raise_signal(signal.SIGINT)"
+    )
+    environ = {**os.environ, venv_hook.WHEELS_GUARD: "1"}
+    run = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, env=environ, capture_output=True, text=True, check=False
+    )
+    assert (run.returncode, run.stderr) == (code, told)
+
+
 def test_shell_and_python_agree_on_the_versions() -> None:
     script = (ROOT / "tools" / "setup.sh").read_text()
     accepted = re.search(r"^ *((?:3\.\d+ ?\|? ?)+)\)", script, re.MULTILINE)
