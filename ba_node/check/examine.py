@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from ba_node.check.relations import Relation
     from ba_node.check.tracks import Tracks
 
+_RELATIONS = frozenset({"cameras", "poses"})
+_BUILD_ON_THESE = ("intrinsics", "lengths")
+
 
 def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
     """Return what the tracks tell about the set-up. Depends on nothing but the tracks.
@@ -44,15 +47,26 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "lengths": lambda: units.check_lengths(tracks, related()),
     }
     for name, test in tests.items():
-        if name in told or (outcome.harmful and name not in ("cameras", "poses")):
+        if name in told or (outcome.harmful and name not in _RELATIONS):
             continue
-        found = test()
+        if name in _BUILD_ON_THESE and not told | outcome.told >= _RELATIONS:
+            outcome.untold.append(f"{name}: not before cameras and poses are known to fit")
+            continue
+        found = _run(test, name)
         outcome.add(found)
         if not found.untold:
             outcome.told |= {name}
     if outcome.harmful:
         outcome.sound, outcome.untold = [], []
     return outcome
+
+
+def _run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
+    """Run a test; a fault in it must not keep anybody from solving, and is told as what it is."""
+    try:
+        return test()
+    except Exception as error:
+        return Diagnosis(untold=[f"{name}: internal error, {type(error).__name__}: {error}"])
 
 
 def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:

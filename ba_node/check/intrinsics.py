@@ -46,6 +46,8 @@ _WIDE, _NARROW = (
 _PATIENT = dataclasses.replace(_NARROW, max_iterations=60, function_tolerance=1e-5)
 # Distance of a point that has none, in diameters of the path.
 _FAR = 20.0
+# Residuals beyond this many of the usual ones with the given model are mismatches.
+_MISMATCH = 5.0
 # Residuals beyond this many sigmas, and points behind a camera, all count the same.
 _CAP = 10.0
 # Factors of the focal length that are tried first; where one is better, the others beyond it.
@@ -82,30 +84,30 @@ def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         return Diagnosis(untold=["too few long tracks with parallax to judge the intrinsics"])
     given = tracks.cameras.params
     adjusted = {1.0: _Adjusted(problem, given)}
-    noise = adjusted[1.0].noise
-    now = adjusted[1.0].cost(noise)
+    measure = _Measure(adjusted[1.0].norms)
+    now = measure(adjusted[1.0])
     for factor in (1.0 / _BRACKET, _BRACKET):
         adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
-    n = len(problem.observations)
-    least = min(adjusted[1.0 / _BRACKET].cost(noise), adjusted[_BRACKET].cost(noise))
+    n = len(measure)
+    least = min(measure(adjusted[1.0 / _BRACKET]), measure(adjusted[_BRACKET]))
     flat = n * (least / now - 1.0) < _SURE
     tried = [(model, _Adjusted(problem, model.params)) for model in _others(tracks)]
-    if least < now or noise > _LARGE:
+    if least < now or measure.noise > _LARGE:
         for factor in (*_SMALLER, *_LARGER):
             adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
-        cost = {factor: one.cost(noise) for factor, one in adjusted.items()}
+        cost = {factor: measure(one) for factor, one in adjusted.items()}
         factor = _lowest(cost)
         if abs(factor - 1.0) > _LEAST_FACTOR and _is_sharp(cost):
             tried.append((_focal(given, factor), adjusted[min(cost, key=lambda one: cost[one])]))
     rows = [
         Row(_TEST, "as given", _explained(now)),
-        *(Row(_TEST, m.cause, _explained(one.cost(noise))) for m, one in tried),
+        *(Row(_TEST, m.cause, _explained(measure(one))) for m, one in tried),
     ]
     if tried:
-        model, best = min(tried, key=lambda one: one[1].cost(noise))
-        lowest = best.cost(noise)
+        model, best = min(tried, key=lambda one: measure(one[1]))
+        lowest = measure(best)
         # Then the given model gets every chance: many iterations, and to begin where the other one ended.
-        if _is_lower(lowest, now, n) and _is_lower(lowest, adjusted[1.0].thorough(best.state, noise), n):
+        if _is_lower(lowest, now, n) and _is_lower(lowest, adjusted[1.0].thorough(best.state, measure), n):
             evidence = f"a free adjustment leaves {lowest / now:.0%} of the loss that it leaves as given"
             return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows)
     if flat:
@@ -116,7 +118,10 @@ def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
 def loss_of(tracks: Tracks, relations: list[Relation]) -> float:
     """Return the mean loss of a free adjustment of a dozen keyframes; infinite if there is none."""
     problem = _problem(tracks, relations)
-    return np.inf if problem is None else _Adjusted(problem, tracks.cameras.params).cost(1.0)
+    if problem is None:
+        return np.inf
+    norms = np.minimum(_Adjusted(problem, tracks.cameras.params).norms, _CAP)
+    return float(np.log1p(norms * norms).mean())
 
 
 def _is_lower(cost: float, other: float, observations: int) -> bool:
@@ -251,6 +256,31 @@ def _problem(tracks: Tracks, relations: list[Relation]) -> Problem | None:
     return Problem(start, fixed, tracks.cameras, observations)
 
 
+class _Measure:
+    """How well an adjustment explains the observations that are no mismatches, as the given model has them.
+
+    The loss is in units of the usual residual: that of real images is seldom what sigma_px says.
+
+    Attributes:
+        noise: usual residual with the given model, sigmas.
+    """
+
+    def __init__(self, norms: FloatArray) -> None:
+        usual = float(np.median(norms))
+        # Where most residuals are large, the given model is in doubt, and they are not for it to judge.
+        self._rows = (norms < _MISMATCH * max(usual, 1.0)) | (usual > _LARGE)
+        self.noise = max(float(np.median(norms[self._rows])), 1e-3)
+
+    def __len__(self) -> int:
+        """Return the number of these observations."""
+        return int(np.count_nonzero(self._rows))
+
+    def __call__(self, adjusted: _Adjusted) -> float:
+        """Return the mean Cauchy loss of a residual; beyond a limit, and behind a camera, all count the same."""
+        norms = np.minimum(adjusted.norms[self._rows], _CAP) / self.noise
+        return float(np.log1p(norms * norms).mean())
+
+
 class _Adjusted:
     """An adjustment with given intrinsics.
 
@@ -264,26 +294,16 @@ class _Adjusted:
         self.state = solver.solve(_placed(self._problem), _WIDE).state
         self._finish(_NARROW)
 
-    @property
-    def noise(self) -> float:
-        """Return the usual size of a residual, sigmas: those of real images are seldom what sigma_px says."""
-        return max(float(np.median(self.norms)), 1e-3)
-
-    def cost(self, noise: float) -> float:
-        """Return the mean Cauchy loss of a residual; beyond a limit, and behind a camera, all count the same."""
-        norms = np.minimum(self.norms, _CAP) / noise
-        return float(np.log1p(norms * norms).mean())
-
-    def thorough(self, state: State, noise: float) -> float:
+    def thorough(self, state: State, measure: _Measure) -> float:
         """Return the mean loss after as many iterations as it takes, from here or from other poses: the lower one."""
         self._finish(_PATIENT)
-        costs = [self.cost(noise)]
+        costs = [measure(self)]
         for wide in (False, True):
             self.state = state
             if wide:
                 self.state = solver.solve(_placed(dataclasses.replace(self._problem, start=state)), _WIDE).state
             self._finish(_PATIENT)
-            costs.append(self.cost(noise))
+            costs.append(measure(self))
         return min(costs)
 
     def _finish(self, options: SolverOptions) -> None:
@@ -294,6 +314,8 @@ class _Adjusted:
 def _placed(problem: Problem) -> Problem:
     """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
     rays, n = triangulation.rays_of(problem), problem.n_points
+    if not len(rays.point):
+        return problem
     points = triangulation.triangulate(rays, n).points
     ahead = ((points[rays.point] - rays.centre) * rays.direction).sum(axis=1)
     behind = np.bincount(rays.point, ~(ahead > 0.0), n) > 0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.check import two_view
-from ba_node.check.diagnosis import Diagnosis, Finding, Row
+from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import BETWEEN_CAMERAS, IN_MOTION, Mistake, SetUp, as_given
 from ba_node.check.two_view import MIN_PAIRS, Pair, Pose
 from ba_node.core import geometry
@@ -219,8 +219,7 @@ def _misfit(camera: int, relation: Relation, given: Pose, rows: list[Row]) -> Di
     turned = two_view.refined(relation.pair, given, free=3)
     relation = relation if two_view.share(relation.pair, turned) < _NAMED * relation.share else relation.at(turned)
     row = dataclasses.replace(row, rotation_deg=given.turned_from(relation.pose))
-    degrees = f"{row.rotation_deg:.1f}" if row.rotation_deg < 0.75 else f"{row.rotation_deg:.0f}"
-    what = f"by about {degrees} degree{'' if degrees == '1' else 's'}"
+    what = f"by about {angle(row.rotation_deg)}"
     if row.rotation_deg < _MISFIT_DEG:
         what = f"in the direction from camera 0, by about {row.direction_deg:.0f} degrees"
     causes, changes = [f"camera {camera} does not fit its place on the body {what}"], [change]

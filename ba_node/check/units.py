@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.check import two_view
-from ba_node.check.diagnosis import Diagnosis, Finding, Row
+from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import as_given
 from ba_node.check.relations import Relation, rays, relate, spread
 from ba_node.check.two_view import Pose
@@ -35,21 +35,28 @@ _UNITS = (
     (0.001, "in kilometres"),
     (3.2808, "in feet"),
 )
+# A shift of all disparities is named unless a factor of all depths leaves so many times less spread, and goes first.
+_CLEARLY = 3.0
+# A factor is named unless a shift leaves so much less.
+_SURELY = 0.7
 # Sensible distances between keyframes, s; and units that stamps may have been taken for.
 _SPACING_S = (5e-4, 600.0)
 _STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
 # Images that far apart, in keyframes, share tracks; where ids are used again, fewer of them are the same point.
 _FAR = 4
 _STARTS = 8
-_LOST = 0.7
+_LOST = 0.9
+# Keyframes that are needed to judge ids and lengths; share of the ids of the last quarter that the first one had.
+_KEYFRAMES = 10
+_PERSIST = 0.85
 
 
 def check_stamps(tracks: Tracks) -> Diagnosis:
     """Look whether keyframes follow each other at a sensible pace."""
     steps = np.diff(tracks.stamp_ns)
     steps = steps[steps > 0]
-    if len(steps) < 3:
-        return Diagnosis()
+    if len(steps) < 2:
+        return Diagnosis(untold=["too few keyframes to judge stamps"])
     usual = float(np.median(steps)) * 1e-9
     if _SPACING_S[0] <= usual <= _SPACING_S[1]:
         return Diagnosis(sound=[f"keyframes are {usual:.3g} s apart"])
@@ -60,8 +67,13 @@ def check_stamps(tracks: Tracks) -> Diagnosis:
 
 
 def check_ids(tracks: Tracks) -> Diagnosis:
-    """Look whether a track goes on being the same point: by consensus of neighbouring images, and of distant ones."""
+    """Look whether a track goes on being the same point: by consensus of neighbouring images, and of distant ones.
+
+    Where ids are used again, few new ones come, although tracks end.
+    """
     near, far = [], []
+    if len(tracks) < _KEYFRAMES:
+        return Diagnosis(untold=["too few keyframes to judge ids"])
     for k in spread(len(tracks) - _FAR, _STARTS):
         camera = tracks.main_camera(k)
         if camera is None:
@@ -77,9 +89,16 @@ def check_ids(tracks: Tracks) -> Diagnosis:
         return Diagnosis(untold=["too few long tracks to judge ids"])
     rows = [Row("ids", "images next to each other", float(np.median(near)))]
     rows += [Row("ids", f"images {_FAR} keyframes apart", float(np.median(far)))]
-    if rows[1].share >= _LOST * rows[0].share:
+    quarter = max(1, len(tracks) // 4)
+    early = np.unique(tracks.track[tracks.keyframe < quarter])
+    persist = float(np.isin(tracks.track[tracks.keyframe >= len(tracks) - quarter], early).mean())
+    rows += [Row("ids", "of the last keyframes that the first had too", persist)]
+    if rows[1].share >= _LOST * rows[0].share or persist < _PERSIST:
         return Diagnosis(sound=["tracks keep their ids"], rows=rows)
-    evidence = f"{rows[0].share:.0%} of the tracks agree from one keyframe to the next, {rows[1].share:.0%} over {_FAR}"
+    evidence = (
+        f"{rows[0].share:.0%} of the tracks agree from one keyframe to the next, {rows[1].share:.0%} over {_FAR},"
+        f" and {persist:.0%} of the ids of the first keyframes are in the last"
+    )
     finding = Finding(
         ("ids reused: the same track_id stands for several points",),
         evidence,
@@ -129,6 +148,8 @@ def _depth_finding(cause: str, evidence: str) -> Finding:
 def check_lengths(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     """Compare depths of two cameras, which are in units of their baseline, with those of the front-end's steps."""
     outcome, given = Diagnosis(), as_given(tracks)
+    if len(given.cameras.rotation) > 1 and len(tracks) < _KEYFRAMES:
+        return Diagnosis(untold=["too few keyframes to compare a baseline with steps"])
     for camera in range(1, min(len(given.cameras.rotation), 3)):
         depth = np.full(len(tracks.keyframe), np.nan)
         baseline, shared = given.between_cameras(0, camera), False
@@ -157,28 +178,45 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
     factor = float(np.exp(np.median(ratio)))
     rows = [Row("lengths", f"baseline of camera {camera} over the front-end's steps: {factor:.3g}", 1.0)]
     if 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
-        return Diagnosis(
-            sound=[f"the baseline of camera {camera} fits the steps (to {abs(factor - 1.0):.0%})"], rows=rows
-        )
+        tell = f"the baseline of camera {camera} fits the steps (to {abs(factor - 1.0):.0%})"
+        return Diagnosis(sound=[tell], rows=rows)
     evidence = f"depths of two cameras against those of the front-end's steps, over {len(pairs)} pairs of keyframes"
-    # A shift of all disparities: 1 / z = 1 / z_steps + shift.
+    # A shift of all disparities, 1 / z = 1 / z_steps + shift, against a factor: whichever leaves less of the spread.
     shift = float(np.median(1.0 / stereo - 1.0 / steps))
-    left = _deviation(np.log(np.maximum(1.0 / stereo - shift, 1e-9) * steps))
-    if left < 0.6 * _deviation(np.log(stereo / steps)):
-        px = abs(shift) * baseline * float(tracks.cameras.params[camera, 0])
-        cause = f"principal point of camera {camera} off by about {px:.0f} px along the baseline"
-        return Diagnosis([Finding((cause,), evidence, (f"k in the camera_info of camera {camera}",))], rows=rows)
-    if _deviation(ratio) > _AGREE:
+    shifted = _deviation(np.log(np.maximum(1.0 / stereo - shift, 1e-9) * steps))
+    scaled = _deviation(np.log(stereo / steps))
+    if min(shifted, scaled) > _AGREE:
         return Diagnosis(untold=[f"depths of cameras 0 and {camera} contradict the front-end's steps"], rows=rows)
-    causes = (
-        f"baseline of camera {camera} {_unit(factor) or f'{_times(factor)} too long'} for the front-end's steps",
-        f"poses {_unit(1.0 / factor) or 'in another unit'}",
-    )
-    changes = (
-        f"body_from_camera of camera {camera} in camera_rig ({baseline:.3g} m; tracks fit {baseline / factor:.3g} m)",
-        "the position in the keyframes, expected metres",
-    )
-    return Diagnosis([Finding(causes, evidence, changes)], rows=rows)
+    causes: dict[str, str] = {}
+    if shifted < _CLEARLY * scaled:
+        causes |= _of_shift(tracks, camera, abs(shift) * baseline)
+    if scaled < shifted / _SURELY:
+        causes |= _of_factor(camera, baseline, factor)
+    return Diagnosis([Finding(tuple(causes), evidence, tuple(causes.values()))], rows=rows)
+
+
+def _of_shift(tracks: Tracks, camera: int, turn: float) -> dict[str, str]:
+    """Return what shifts all disparities by an angle (its tangent), and what to change."""
+    px, degrees = turn * float(tracks.cameras.params[camera, 0]), float(np.degrees(np.arctan(turn)))
+    return {
+        f"camera {camera} does not fit its place on the body by about {angle(degrees)}, towards camera 0 or away": (
+            f"body_from_camera of camera {camera} in camera_rig (or tf_static)"
+        ),
+        f"principal point of camera {camera} off by about {px:.0f} px along the baseline": (
+            f"k in the camera_info of camera {camera}"
+        ),
+    }
+
+
+def _of_factor(camera: int, baseline: float, factor: float) -> dict[str, str]:
+    """Return what stretches all depths by a factor, and what to change."""
+    fitting = f"({baseline:.3g} m; tracks fit {baseline / factor:.3g} m)"
+    return {
+        f"baseline of camera {camera} {_unit(factor) or f'{_times(factor)} too long'} for the front-end's steps": (
+            f"body_from_camera of camera {camera} in camera_rig {fitting}"
+        ),
+        f"poses {_unit(1.0 / factor) or 'in another unit'}": "the position in the keyframes, expected metres",
+    }
 
 
 def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
