@@ -173,10 +173,11 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
         if rows[1].share < 0.2:
             return Diagnosis(untold=[f"the tracks of cameras 0 and {camera} contradict each other"], rows=rows)
         return Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
-    tried = {
-        one: row(one.name.format(camera=camera), one.undo(given, camera).between_cameras(0, camera))
-        for one in BETWEEN_CAMERAS
-    }
+    others = {one: one.undo(given, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS}
+    # Where points are far, consensus finds one of many relations; a usual mistake may be the way to a better one.
+    relation = max((relation, *(relation.at(two_view.refined(pair, pose)) for pose in others.values())), key=_share)
+    rows = [row("as given", now), row("free", relation.pose)]
+    tried = {one: row(one.name.format(camera=camera), pose) for one, pose in others.items()}
     rows += tried.values()
     best = max(one.share for one in tried.values())
     named = [
@@ -185,12 +186,16 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
         if one.share >= max(0.97 * best, _NAMED * rows[1].share)
         and one.rotation_deg < _TURNED_DEG
         and not one.direction_deg > rows[0].direction_deg
-        and _differ(now, mistake.undo(given, camera).between_cameras(0, camera))
+        and _differ(now, others[mistake])
     ]
     if not named:
         return _misfit(camera, relation, now, rows)
     evidence = f"of the tracks of cameras 0 and {camera}, {rows[0].share:.0%} meet in front as given, so {best:.0%}"
     return Diagnosis([_finding(named, evidence, camera)], rows=rows)
+
+
+def _share(relation: Relation) -> float:
+    return relation.share
 
 
 def _differ(one: Pose, other: Pose) -> bool:

@@ -36,6 +36,7 @@ from ba_node.ros.parameters import Parameters
 from ba_node.ros.publishing import Publishing
 from ba_node.ros.relay import Relay
 from ba_node.ros.services import Services
+from ba_node.ros.setup_check import on_a_thread
 from ba_node.ros.side_outputs import SideOutputs
 from ba_node.ros.silence import Silence
 from ba_node.ros.simulated_time import SimulatedTime
@@ -115,6 +116,7 @@ class BaNode(ManagedNode):
         config = self._settings.config
         inbox = Inbox(config.node.inbox_size)
         backend = Backend(config, clock=time.perf_counter)
+        backend.setup.elsewhere = on_a_thread(inbox)
         worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
         relay = Relay(self, lambda: worker.alive)
         self._host = host = Host(self, config, inbox, worker, relay, self._log)
