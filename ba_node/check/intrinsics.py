@@ -294,6 +294,8 @@ class _Adjusted:
 def _placed(problem: Problem) -> Problem:
     """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
     rays, n = triangulation.rays_of(problem), problem.n_points
+    if not len(rays.point):
+        return problem  # a model that gives no pixel a ray
     points = triangulation.triangulate(rays, n).points
     ahead = ((points[rays.point] - rays.centre) * rays.direction).sum(axis=1)
     behind = np.bincount(rays.point, ~(ahead > 0.0), n) > 0
