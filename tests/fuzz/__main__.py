@@ -20,7 +20,7 @@ from tests.fuzz import files, targets
 from tests.fuzz.worker import GUIDED
 
 # Quarters of the messages that each target takes.
-_SHARE = {"stream": 3, "cdr": 1}
+_SHARE = {"stream": 2, "drive": 1, "cdr": 1}
 # A process ends after so many and the next goes on from its corpus: the fuzzer itself grows by some kB a run.
 _ROUND = 20_000
 

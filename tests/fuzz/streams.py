@@ -29,7 +29,6 @@ from ba_node.synthetic.faults import RIGS, SOUND, spoiled
 
 _SETTINGS = {"solver.max_iterations": 3, "window.max_keyframes": 3, "scene.max_pending": 5, "scene.max_landmarks": 100}
 _TINY: dict[str, Any] = {
-    "keyframes": 6,
     "length_m": 10.0,
     "landmarks": 300,
     "tracks": 25,
@@ -69,26 +68,31 @@ class Bytes:
 
 
 @functools.cache
-def good_stream(rig: str) -> tuple[Measurement, ...]:
-    """Return a stream of 6 keyframes."""
-    return spoiled(SOUND, rig, **_TINY).measurements
+def good_stream(rig: str, keyframes: int = 6) -> tuple[Measurement, ...]:
+    """Return a stream of some keyframes."""
+    return spoiled(SOUND, rig, **_TINY, keyframes=keyframes).measurements
 
 
-def stream(data: bytes) -> int:
+def stream(data: bytes, keyframes: int = 6) -> int:
     """Give a back-end the stream that bytes describe; return the number of messages."""
     source = Bytes(data)
-    good = good_stream(list(RIGS)[source.below(len(RIGS))])
+    good = good_stream(list(RIGS)[source.below(len(RIGS))], keyframes)
     messages: list[Measurement] = []
     for measurement in good:
         choice = source.below(8)
         if choice == 1:
             continue
         messages += [measurement] * (2 if choice == 2 else 1)
-        while source and choice >= 4 and len(messages) < 60:
+        while source and choice >= 4 and len(messages) < 10 * keyframes:
             messages.append(spoil(source, messages[-1 - source.below(min(4, len(messages)))]))
             choice = source.below(8)
-    feed(messages)
+    feed(messages, check_setup=keyframes > 6)
     return len(messages)
+
+
+def drive(data: bytes) -> int:
+    """Do as :func:`stream` with as many keyframes as the check of the set-up asks for."""
+    return stream(data, keyframes=16)
 
 
 def cdr(data: bytes) -> int:
@@ -105,9 +109,9 @@ def cdr(data: bytes) -> int:
     return 2
 
 
-def feed(messages: list[Measurement]) -> None:
+def feed(messages: list[Measurement], check_setup: bool = False) -> None:
     """Run a back-end over messages as a replay does, and look at all that it gives."""
-    backend = Backend(Config().with_values(_SETTINGS))
+    backend = Backend(Config().with_values({**_SETTINGS, "guard.check_setup": check_setup}))
     for measurement in messages:
         if backend.completes(measurement):
             check(backend.solve())
@@ -166,7 +170,7 @@ def seeds() -> dict[str, list[bytes]]:
     """Return bytes that lead to good and to bad streams, and good CDR of every type."""
     rng = np.random.default_rng(0)
     streams = [bytes([k, 0]) + bytes(60) for k in range(3)] + [rng.bytes(200) for _ in range(4)]
-    return {"stream": streams, "cdr": [_type_bytes(k) + data for k, data in _good_cdr()]}
+    return {"stream": streams, "drive": streams, "cdr": [_type_bytes(k) + data for k, data in _good_cdr()]}
 
 
 def _type_bytes(index: int) -> bytes:

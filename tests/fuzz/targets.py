@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 from tests.fuzz import files, streams
 
-STREAMS: dict[str, Callable[[bytes], int]] = {"stream": streams.stream, "cdr": streams.cdr}
+STREAMS: dict[str, Callable[[bytes], int]] = {"stream": streams.stream, "drive": streams.drive, "cdr": streams.cdr}
 NAMES = (*STREAMS, *files.READERS)
 
 

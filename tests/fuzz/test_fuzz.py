@@ -12,7 +12,7 @@ from hypothesis import Phase, given, settings
 from tests.fuzz import targets
 from tests.fuzz.mutation import mutated
 
-EXAMPLES = {"stream": 60, "cdr": 60}
+EXAMPLES = {"stream": 40, "drive": 3, "cdr": 40}
 GROWTH_KB = 1_000_000
 
 
