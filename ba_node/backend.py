@@ -375,6 +375,10 @@ class Backend:
             return None, None
         elapsed = self._clock() - began
         selection, (norms, state, _) = tried.selection, tried.found
+        for stray in selection.strays:
+            text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
+            if text:
+                self.scene.log.warn("stray", text)
         if tried.held:
             self._hold(tried.held)
             state = None

@@ -399,6 +399,13 @@ class NodeConfig:
         minimum=0.0,
         maximum=86_400.0,
     )
+    log_period_s: float = _param(
+        5.0,
+        "How often one line in the log tells rate, residuals, latency, and what became of the solutions; 0: never.",
+        unit="s",
+        minimum=0.0,
+        maximum=86_400.0,
+    )
     latency_budget_ms: float = _param(
         0.0,
         "Time from arrival of a keyframe to its result that the solver may use up: it ends after an iteration"

@@ -87,8 +87,9 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         *(("adjusted", note) for note in report["cameras_adjusted"]),
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
-        *((label, f"{_short(report[key]['input'])} -> {_short(report[key]['refined'])} px") for label, key in _ERRORS),
-        ("rms without outliers", f"{_short(report['rms_px_without_outliers']['refined'])} px"),
+        *((label, _change(report[key])) for label, key in _ERRORS),
+        *_behind(report["observations_behind"]),
+        ("rms without outliers", _short(report["rms_px_without_outliers"]["refined"])),
         (
             "solves",
             f"{report['solves']} ({', '.join(f'{n} {name.lower()}' for name, n in statuses.items()) or 'none'})",
@@ -112,8 +113,22 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _short(value: float) -> str:
-    return f"{value:.3f}" if value < 1e5 else f"{value:.1e}"
+def _change(of: Mapping[str, float | None]) -> str:
+    before, after = of["input"], of["refined"]
+    if before is None or after is None:
+        return f"{_short(before)} -> {_short(after)}"
+    return f"{before:.3f} -> {after:.3f} px"
+
+
+def _short(value: float | None) -> str:
+    return "nothing placed" if value is None else f"{value:.3f} px"
+
+
+def _behind(of: Mapping[str, int]) -> list[tuple[str, str]]:
+    """Return the row of observations that have no residual, if there are any."""
+    if not any(of.values()):
+        return []
+    return [("behind a camera", f"{of['input']} -> {of['refined']} observations, which count in none of these")]
 
 
 def _rejected(report: Mapping[str, Any]) -> dict[str, int]:

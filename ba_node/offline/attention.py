@@ -9,6 +9,13 @@ from typing import Any
 
 # What arrives twice changes nothing.
 HARMLESS = ("duplicate_keyframe", "duplicate_observation")
+# What must not rise by more than a share, and px. Outliers decide the rms of all, and good points do not follow them.
+_MEASURES = (
+    ("rms_px", "rms of all", 0.5),
+    ("bounded_px", "rms with none above 20 px", 0.05),
+    ("median_px", "median residual", 0.05),
+)
+_SLACK_PX = 0.05
 
 
 def attention(report: Mapping[str, Any]) -> list[str]:
@@ -24,12 +31,25 @@ def attention(report: Mapping[str, Any]) -> list[str]:
         of = f"session {session['session_id']}: " if report["older_sessions"] else ""
         if session.get("unrefined"):
             lines.append(f"{of}nothing was refined: {session['unrefined']}")
+        lines += _worse(session, of)
         for name in ("FAILED", "HELD"):
             count = session["solves_by_status"].get(name, 0)
             if count:
                 lines.append(f"{of}{count} of {session['solves']} solves {name.lower()}: their result was not taken")
         lines += _turned_away(session["rejected"], of)
     return lines + _turned_away(report["bag_rejected"], "")
+
+
+def _worse(session: Mapping[str, Any], of: str) -> list[str]:
+    """Return by which measures the result of a session is worse than what came in."""
+    found = []
+    for key, name, share in _MEASURES:
+        before, after = (session.get(key, {}).get(state) for state in ("input", "refined"))
+        if before is not None and after is not None and after > (1.0 + share) * before + _SLACK_PX:
+            found.append(f"{name} {before:.3g} -> {after:.3g} px")
+    if not found:
+        return []
+    return [f"{of}the result explains the observations worse than what came in: {', '.join(found)}"]
 
 
 def _turned_away(rejected: Mapping[str, int], of: str) -> list[str]:

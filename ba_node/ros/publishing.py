@@ -12,6 +12,7 @@ from ba_node.estimate import SolveReport, Status
 from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
 from ba_node.messages.outputs import report_message
 from ba_node.ros import qos
+from ba_node.ros.activity import Activity
 from ba_node.ros.component import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.latency import Sliding
@@ -40,7 +41,7 @@ class Publishing(Component):
         """Advertise."""
         super().__init__(host)
         self._factory = RclpyFactory()
-        self._throttle = Throttle(_LOG_PERIOD_S)
+        self._throttle, self._activity = Throttle(_LOG_PERIOD_S), Activity()
         self._latency, self._stamp_latency = Sliding(), Sliding()
         # The estimate that latched topics are to show, and those of them that do not show it yet.
         self._latest: Estimate | None = None
@@ -106,7 +107,7 @@ class Publishing(Component):
         )
 
     def _log_report(self, report: SolveReport) -> None:
-        """Say why a solve gave nothing. That the first keyframes are not enough is nothing to warn about."""
+        """Say how it goes, and why a solve gave nothing: that the first keyframes are not enough is no warning."""
         if (
             report.solve_count
             and not report.status.usable
@@ -114,3 +115,6 @@ class Publishing(Component):
         ):
             text = f"keyframe {report.newest_keyframe_id} was not refined: {report.reason}"
             log(self.host.node, Severity.INFO if report.status is Status.SKIPPED else Severity.WARNING, text)
+        line = self._activity.line(report, time.monotonic(), self.host.config.node.log_period_s)
+        if line:
+            log(self.host.node, Severity.INFO, line)

@@ -11,7 +11,7 @@ fine; the pose that most views agree with is where it begins. If half of them ag
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -68,8 +68,38 @@ def strays(
     return np.array(found, np.intp)
 
 
-def place(scene: Scene, config: Config, rows: IntArray) -> IntArray:
-    """Move keyframes that begin in the wrong place; return the rows of those whose place is not found.
+class Stray(NamedTuple):
+    """A keyframe that began in the wrong place.
+
+    Attributes:
+        row: in the scene.
+        found: its tracks have shown its place.
+        off_m: how far the front-end had put it from there; 0 where it is not its own pose that is wrong.
+        off_rad: by how much it had turned it.
+    """
+
+    row: int
+    found: bool
+    off_m: float = 0.0
+    off_rad: float = 0.0
+
+    def text(self, keyframe_id: int) -> str:
+        """Return what to say of it, empty if nothing."""
+        if self.found and self.off_m == self.off_rad == 0.0:
+            return ""
+        if not self.found:
+            return (
+                f"keyframe {keyframe_id} is left out, as its tracks contradict what is known wherever it may be: are"
+                " its track ids right?"
+            )
+        return (
+            f"the front-end's pose of keyframe {keyframe_id} is {self.off_m:.3g} m and {np.degrees(self.off_rad):.3g}"
+            " deg off where its tracks show it: it has jumped; the keyframe was placed by its tracks"
+        )
+
+
+def place(scene: Scene, config: Config, rows: IntArray) -> tuple[Stray, ...]:
+    """Move keyframes that begin in the wrong place, and say what became of each.
 
     Args:
         scene: poses of keyframes that were not refined are changed, until they are settled anew.
@@ -77,32 +107,39 @@ def place(scene: Scene, config: Config, rows: IntArray) -> IntArray:
         rows: of keyframes, oldest first.
     """
     newest = set(scene.order[-_SOUGHT:].tolist())
-    return np.array([row for row in rows if not _found(scene, config, int(row), int(row) in newest)], np.intp)
+    return tuple(_placed(scene, config, int(row), int(row) in newest) for row in rows)
 
 
-def _found(scene: Scene, config: Config, row: int, sought: bool) -> bool:
-    """Return whether a keyframe begins where its tracks can bring it in; move it if it is ``sought`` and found."""
+def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
+    """Move a keyframe to where its tracks show it, if it is ``sought`` and found."""
     problem = _views(scene, config, row)
-    if problem is None or _near(problem, problem.start, config) >= _AGREEING * len(problem.observations):
-        return True
+    if problem is None:
+        return Stray(row, found=False)
     best, most = problem.start, 0
     starts = [
         State(rotation[None], translation[None], problem.start.points, problem.start.intrinsics)
         for rotation, translation in (_starts(scene, row) if sought else [])
     ]
-    starts.sort(key=lambda start: -_near(problem, start, config))
-    for start in starts[:_TRIED]:
-        state = _lowered(problem, start)
+    near = [_near(problem, start, config) for start in starts]
+    for i in sorted(range(len(starts)), key=lambda i: -near[i])[:_TRIED]:
+        state = _lowered(problem, starts[i])
         norms = native_kernels.residual_norms(problem, state, config.solver.backend)
         agreeing = int(np.count_nonzero(norms <= _WIDE * config.tracks.outlier_px))
         if agreeing > most:
             best, most = state, agreeing
     if most < max(_MIN_POINTS, _AGREEING * len(problem.observations)):
-        return False
+        return Stray(row, found=False)
+    table = scene.keyframes
     rotation, position = geometry.inverse(best.rotation[0], best.translation[0])
-    scene.keyframes.rotation[row] = geometry.nearest_rotation(rotation)
-    scene.keyframes.position[row] = position + scene.keyframes.position[scene.order[0]]
-    return True
+    rotation, position = geometry.nearest_rotation(rotation), position + table.position[scene.order[0]]
+    if max(near[-_ASKED:]) >= _AGREEING * len(problem.observations):
+        # Its step from one of the keyframes before is right: it is another one that has jumped.
+        table.rotation[row], table.position[row] = rotation, position
+        return Stray(row, found=True)
+    off_m = float(np.linalg.norm(position - table.position[row]))
+    off_rad = float(np.linalg.norm(geometry.so3_log(table.rotation[row].T @ rotation)))
+    table.rotation[row], table.position[row] = rotation, position
+    return Stray(row, True, off_m, off_rad)
 
 
 def _views(scene: Scene, config: Config, row: int) -> Problem | None:

@@ -21,23 +21,30 @@ if TYPE_CHECKING:
     from ba_node.window.selection import Selection
 
 STATES = ("input", "refined")
+# A residual that is longer counts as this: it tells no more than that it is wrong.
+BOUND_PX = 1000.0
+# And this, where two states are compared: outliers are as far off in the one as in the other.
+_COMPARED_PX = 20.0
 
 
 def problem_rms_px(problem: Problem, *states: State) -> list[float]:
     """Return for each state the rms over the observations whose point is in front of the camera; 0 without any."""
     measure = objective.Objective(problem, objective.Rules())
-    return [_rms(_in_front(measure.errors(state))) for state in states]
+    errors = (_in_front(measure.errors(state)) for state in states)
+    return [float(np.sqrt(np.mean(error * error))) if len(error) else 0.0 for error in errors]
 
 
 def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
     """Return the rms over the observations of a solve whose point is in front of the camera; 0 without any.
+
+    One that is farther off than ``BOUND_PX`` counts as that: a point in the plane of a camera is anywhere.
 
     Args:
         selection: what was solved.
         norms: (n_all,) sizes of its residuals, as ``Selection.norms``.
     """
     error = (norms * selection.sightings.sigma_px)[selection.believed]
-    error = error[np.isfinite(error)]
+    error = np.minimum(error[np.isfinite(error)], BOUND_PX)
     return float(np.sqrt(np.mean(error * error) / 2.0)) if len(error) else 0.0
 
 
@@ -79,20 +86,26 @@ def rms_px(scene: Scene, config: Config, state: str) -> float:
     return _rms(errors_px(scene, config, state))
 
 
-def summary(scene: Scene, config: Config, state: str) -> dict[str, float]:
+def summary(scene: Scene, config: Config, state: str) -> dict[str, float | int | None]:
     """Return how well a state explains the observations: one wild outlier rules the rms of all, so that is not all.
 
     Args: as of :func:`errors_px`.
 
     Returns:
         ``rms_px`` of all observations, ``rms_px_without_outliers`` of those that solves use now, ``median_px`` of the
-        lengths of all residuals.
+        lengths of all residuals, ``bounded_px`` the rms of all with none above 20 px, ``observations_behind``, which
+        count in none of these. None where no point is placed.
     """
-    error = errors_px(scene, config, state)
+    error = _all_errors(scene, config, state, outliers=True)
+    behind = int(np.count_nonzero(np.isnan(error[:, 0])))
+    error, inliers = _in_front(error), errors_px(scene, config, state, outliers=False)
+    length = np.hypot(error[:, 0], error[:, 1])
     return {
-        "rms_px": _rms(error),
-        "rms_px_without_outliers": _rms(errors_px(scene, config, state, outliers=False)),
-        "median_px": float(np.median(np.hypot(error[:, 0], error[:, 1]))) if len(error) else 0.0,
+        "rms_px": _rms(error) if len(error) else None,
+        "rms_px_without_outliers": _rms(inliers) if len(inliers) else None,
+        "median_px": float(np.median(length)) if len(error) else None,
+        "bounded_px": float(np.sqrt(np.mean(np.minimum(length, _COMPARED_PX) ** 2) / 2.0)) if len(error) else None,
+        "observations_behind": behind,
     }
 
 
@@ -106,12 +119,20 @@ def errors_px(scene: Scene, config: Config, state: str, *, outliers: bool = True
             without a guess triangulated.
         outliers: count also the observations that are left out of solves as outliers.
     """
+    return _in_front(_all_errors(scene, config, state, outliers=outliers))
+
+
+def _all_errors(scene: Scene, config: Config, state: str, *, outliers: bool) -> FloatArray:
+    """Return the same with NaN for those whose point is not in front."""
     if state not in STATES:
         raise ValueError(f"state {state!r}: expected one of {', '.join(STATES)}")
     if scene.cameras is None or len(scene.keyframes) == 0:
         return np.empty((0, 2))
     table = scene.landmarks
     seen_twice = table.views >= 2
+    if not scene.keyframes.refined.any() and not table.has_position.any():
+        # Nothing was taken: what came in stands.
+        state = "input"
     if state == "refined":
         seen_twice &= table.has_position
     landmarks = np.flatnonzero(seen_twice)
@@ -124,7 +145,7 @@ def errors_px(scene: Scene, config: Config, state: str, *, outliers: bool = True
     positions = table.position[landmarks] - origin
     problem = problem_of(scene, rows, scene.order, landmarks, origin, positions, config)
     if state == "refined":
-        return _errors(problem, problem.start)
+        return objective.reprojection_errors(problem, problem.start)
     return _input_errors(scene, problem, table.guess[landmarks] - origin, origin)
 
 
@@ -136,11 +157,7 @@ def _input_errors(scene: Scene, problem: Problem, guess: FloatArray, origin: Flo
     missing = np.asarray(np.isnan(guess).any(axis=1))
     found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points)
     points = np.where(missing[:, None], found.points, guess)
-    return _errors(problem, dataclasses.replace(problem.start, points=points))
-
-
-def _errors(problem: Problem, state: State) -> FloatArray:
-    return _in_front(objective.reprojection_errors(problem, state))
+    return objective.reprojection_errors(problem, dataclasses.replace(problem.start, points=points))
 
 
 def _in_front(error: FloatArray) -> FloatArray:
@@ -148,4 +165,6 @@ def _in_front(error: FloatArray) -> FloatArray:
 
 
 def _rms(error: FloatArray) -> float:
-    return float(np.sqrt(np.mean(error * error))) if len(error) else 0.0
+    """Return the rms of residuals (n, 2), px, none of which counts for more than BOUND_PX."""
+    squared = np.minimum(np.sum(error * error, axis=1), BOUND_PX**2)
+    return float(np.sqrt(np.mean(squared) / 2.0)) if len(error) else 0.0

@@ -65,6 +65,7 @@ class Selection:
         keyframe_id: (n_kf,) uint64.
         place: (n_kf,) of each keyframe in the order of time.
         measured: the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m.
+        strays: keyframes that began in the wrong place.
     """
 
     problem: Problem
@@ -83,6 +84,7 @@ class Selection:
     keyframe_id: IdArray
     place: IntArray
     measured: tuple[FloatArray, FloatArray]
+    strays: tuple[arrival.Stray, ...]
 
     @cached_property
     def whole(self) -> Problem:
@@ -129,13 +131,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     if reason:
         return reason
     scene.settle_poses()
-    left_out = np.array(without, np.intp)
-    part, norms = _begun(scene, window, config, left_out)
-    if config.guard.enabled:
-        strays = arrival.strays(scene, config, part.problem, part.keyframes, part.landmarks, norms)
-        if len(strays):
-            left_out = np.concatenate([left_out, arrival.place(scene, config, strays)])
-            part, norms = _begun(scene, window, config, left_out)
+    part, norms, strays = _arrived(scene, window, config, without)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     least = config.guard.min_points if config.guard.enabled else 2
@@ -146,7 +142,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     is_old = ~is_new[part.keyframes]
     if is_old.all():
         return "no keyframe of the window sees enough points that a second image sees"
-    obs = part.problem.observations
+    obs, table = part.problem.observations, scene.keyframes
     track_id = scene.landmarks.track_id[part.landmarks]
     tried, aside = trial.choose(track_id, obs.point[usable], config.guard.held_out_tracks)
     held_out = np.zeros(len(part.landmarks), bool)
@@ -155,23 +151,39 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     active = some_observations(part.problem, np.flatnonzero(believed))
     held = gauge.choose(active, is_old)
     return Selection(
-        dataclasses.replace(active, fixed=held.fixed),
-        obs,
-        norms,
-        part.rows,
-        believed,
-        part.keyframes,
-        part.landmarks,
-        window,
-        lost,
-        part.origin,
-        held.unscaled,
-        tried,
-        held_out,
-        scene.keyframes.keyframe_id[part.keyframes],
-        scene.places()[part.keyframes],
-        _measured(scene, part),
+        problem=dataclasses.replace(active, fixed=held.fixed),
+        sightings=obs,
+        norms=norms,
+        rows=part.rows,
+        believed=believed,
+        keyframes=part.keyframes,
+        landmarks=part.landmarks,
+        window=window,
+        lost=lost,
+        origin=part.origin,
+        unscaled=held.unscaled,
+        tried=tried,
+        held_out=held_out,
+        keyframe_id=table.keyframe_id[part.keyframes],
+        place=scene.places()[part.keyframes],
+        measured=_measured(scene, part),
+        strays=strays,
     )
+
+
+def _arrived(
+    scene: Scene, window: IntArray, config: Config, without: tuple[int, ...]
+) -> tuple[_Part, FloatArray, tuple[arrival.Stray, ...]]:
+    """Return what may take part, its residuals at the start (sigmas), and the keyframes that began in a wrong place."""
+    part, norms = _begun(scene, window, config, np.array(without, np.intp))
+    if not config.guard.enabled:
+        return part, norms, ()
+    astray = arrival.strays(scene, config, part.problem, part.keyframes, part.landmarks, norms)
+    if not len(astray):
+        return part, norms, ()
+    strays = arrival.place(scene, config, astray)
+    left_out = [*without, *(stray.row for stray in strays if not stray.found)]
+    return *_begun(scene, window, config, np.array(left_out, np.intp)), strays
 
 
 def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.core import native_kernels, triangulation
-from ba_node.core.cameras import FX, FY, normalise
+from ba_node.core.cameras import FX, FY, rays
 from ba_node.core.problem import Observations, Problem, State
 
 if TYPE_CHECKING:
@@ -103,12 +103,10 @@ class Trial:
         """Keep the rays of some observations, in the body, and to which track each belongs."""
         cams, n_kf = self._problem.cameras, self._problem.n_keyframes
         camera = obs.camera.take(rows)
-        ray = np.ones((len(rows), 3))
-        ray[:, :2] = normalise(obs.uv.take(rows, axis=0), cams.model[camera], cams.params[camera])
-        good = np.isfinite(ray[:, 0])
+        ray = rays(obs.uv.take(rows, axis=0), cams.model[camera], cams.params[camera])
+        good = np.isfinite(ray[:, 2])
         if not good.all():
             rows, group, camera, ray = rows[good], group[good], camera[good], ray[good]
-        ray /= np.sqrt(np.einsum("ij,ij->i", ray, ray))[:, None]
         turn = np.swapaxes(cams.rotation, 1, 2)
         self._direction = np.tile(np.einsum("nij,nj->ni", turn.take(camera, axis=0), ray), (2, 1))
         self._centres = -(turn @ cams.translation[:, :, None])[..., 0]
@@ -174,7 +172,7 @@ class Trial:
         centres = (back[:, None] @ (self._centres - translation[:, None, :])[..., None]).reshape(-1, 3)
         directions = np.einsum("nij,nj->ni", back.take(self._keyframe, axis=0), self._direction)
         nan = np.full(len(self._order), np.nan)
-        rays = triangulation.Rays(
+        seen = triangulation.Rays(
             self._obs.point,
             centres.take(self._image, axis=0),
             directions.take(self._order, axis=0),
@@ -182,7 +180,7 @@ class Trial:
             nan,
             nan,
         )
-        found = triangulation.triangulate(rays, 2 * self._n_groups, self._backend)
+        found = triangulation.triangulate(seen, 2 * self._n_groups, self._backend)
         state = State(rotation, translation, np.nan_to_num(found.points), np.empty((0, 3)))
         problem = Problem(state, np.zeros(len(rotation), bool), self._problem.cameras, self._obs)
         norms = native_kernels.residual_norms(problem, state, self._backend)

@@ -41,3 +41,15 @@ def test_each_thing_is_a_line() -> None:
         "session 0: turned away: 1 bad_pose",
         "turned away: 5 corrupt",
     ]
+
+
+def test_a_result_that_is_worse_than_its_input_is_said() -> None:
+    worse = {"median_px": {"input": 0.4, "refined": 0.9}, "bounded_px": {"input": 1.0, "refined": 1.02}}
+    assert attention(_report(**worse)) == [
+        "the result explains the observations worse than what came in: median residual 0.4 -> 0.9 px"
+    ]
+    assert attention(_report(rms_px={"input": 2.0, "refined": 28.0})) == [
+        "the result explains the observations worse than what came in: rms of all 2 -> 28 px"
+    ]
+    nothing = {"rms_px": {"input": None, "refined": None}, "median_px": {"input": 0.5, "refined": None}}
+    assert attention(_report(**nothing)) == []

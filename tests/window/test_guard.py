@@ -1,0 +1,109 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of the guard by themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ba_node.config import Config, GuardConfig
+from ba_node.core import geometry
+from ba_node.window import steps, trial
+from ba_node.window.trust import Odd, Trust
+
+CONFIG = Config()
+
+
+def poses(rng: np.random.Generator, n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return body from world of a path with steps of a metre and turns of 20 degrees."""
+    turns = geometry.so3_exp(np.cumsum(np.tile([0.0, 0.0, 0.35], (n, 1)), axis=0))
+    position = scale * np.cumsum((turns @ np.array([1.0, 0.0, 0.0])) + 0.02 * rng.normal(size=(n, 3)), axis=0)
+    return geometry.inverse(turns, position)
+
+
+def steps_of(found: tuple[np.ndarray, np.ndarray]) -> steps.Steps:
+    first = np.arange(len(found[0]) - 1)
+    return steps.between(*found, first, first + 1)
+
+
+def test_steps_do_not_depend_on_where_the_map_lies() -> None:
+    rotation, translation = poses(np.random.default_rng(0), 8)
+    turn, shift = geometry.so3_exp(np.array([0.3, -0.2, 1.0])), np.array([5.0, -2.0, 8.0])
+    moved = steps_of((rotation @ turn.T, translation - (rotation @ turn.T @ shift)))
+    as_it_was = steps_of((rotation, translation))
+    np.testing.assert_allclose(moved.move, as_it_was.move, atol=1e-12)
+    np.testing.assert_allclose(moved.turn, as_it_was.turn, atol=1e-12)
+    world = np.swapaxes(rotation, 1, 2)
+    centre = -(world @ translation[:, :, None])[..., 0]
+    np.testing.assert_allclose(as_it_was.length, np.linalg.norm(np.diff(centre, axis=0), axis=1), atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0, 3.0, np.pi])
+def test_angle(angle: float) -> None:
+    assert steps.angle_of(geometry.so3_exp(np.array([[0.0, angle, 0.0]])))[0] == pytest.approx(angle, abs=1e-7)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.2, 1000.0])
+def test_a_common_scale_is_found(scale: float) -> None:
+    found = steps_of(poses(np.random.default_rng(1), 12, scale))
+    measured = steps_of(poses(np.random.default_rng(2), 12))
+    off = steps.compare(found, measured, GuardConfig())
+    assert steps.scale_error(found, measured, off) == pytest.approx(scale, rel=0.05)
+    assert steps.turn_error(found, measured, off) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_is_no_scale(seed: int) -> None:
+    """Steps that are off by 15 % each way in random directions."""
+    rng = np.random.default_rng(seed)
+    found, measured = (steps_of(poses(rng, 12)) for _ in range(2))
+    measured = steps.Steps(measured.turn, measured.move + 0.15 * rng.normal(size=measured.move.shape))
+    off = steps.compare(found, measured, GuardConfig())
+    assert abs(np.log(steps.scale_error(found, measured, off))) < np.log1p(GuardConfig().max_scale_error)
+
+
+def test_a_fixed_choice_of_tracks() -> None:
+    ids = np.random.default_rng(3).integers(0, 2**64 - 1, 1000, dtype=np.uint64, endpoint=True)
+    point = np.repeat(np.arange(1000), 6)
+    tried, aside = trial.choose(ids, point, 16)
+    assert len(tried) == 16 and aside.tolist() == tried[: 1000 // 64].tolist()
+    # Another order, and others beside them, leave the choice as it is where these stay.
+    order = np.random.default_rng(4).permutation(1000)
+    again, _ = trial.choose(ids[order], point, 16)
+    assert ids[order][again].tolist() == ids[tried].tolist()
+    assert [len(part) for part in trial.choose(ids[:40], point[:240], 16)] == [16, 0]
+    assert [len(part) for part in trial.choose(ids, point, 0)] == [0, 0]
+
+
+def test_doubt_grows_and_fades() -> None:
+    trust = Trust()
+    assert trust.hear("a", None, (), CONFIG) == "a"
+    # One bad window costs nothing more.
+    assert trust.hear("", None, (), CONFIG) == ""
+    for _ in range(10):
+        trust.hear("wrong", None, (), CONFIG)
+    assert trust.lost
+    assert trust.bounds(CONFIG).guard.min_inlier_share > CONFIG.guard.min_inlier_share
+    waits = [trust.hear("", None, (), CONFIG) for _ in range(12)]
+    assert sum(map(bool, waits)) == 10 and "wrong" in waits[0] and waits[-1] == ""
+    assert trust.bounds(CONFIG) is CONFIG
+
+
+def test_always_other_keyframes_to_blame_is_doubtful() -> None:
+    trust = Trust()
+    assert trust.hear("", None, (4,), CONFIG) != ""
+    same, others = Trust(), Trust()
+    assert [bool(same.hear("", None, (4,), CONFIG)) for _ in range(4)] == [True, False, False, False]
+    assert all(others.hear("", None, (k,), CONFIG) for k in range(4))
+
+
+def test_odd_steps_wait_for_others_that_agree() -> None:
+    step = steps.Steps(np.eye(3)[None], np.array([[5.0, 0.0, 0.0]]))
+    other = steps.Steps(np.eye(3)[None], np.array([[9.0, 0.0, 0.0]]))
+    trust = Trust()
+    for found, agreeing in ((step, 1), (step, 2), (other, 1), (other, 2)):
+        assert trust.hear("odd", Odd(((3, 4),), found), (), CONFIG) == "odd"
+        assert trust.agreeing == agreeing
+        assert (trust.confirmed(2) is not None) is (agreeing >= 2)
+    assert trust.doubt == 0
