@@ -150,8 +150,8 @@ class TracksConfig:
         maximum=90.0,
     )
     max_triangulation_px: float = _param(
-        12.0,
-        "Largest median reprojection error, in sigmas, of a first point; at least 4.4 x the median of them all.",
+        6.0,
+        "Largest reprojection error, in sigmas, of a view that agrees where a point begins; half of it for two views.",
         unit="px",
         minimum=0.1,
         maximum=1e6,

@@ -6,7 +6,8 @@ A keyframe that was not refined yet stands where the front-end's step from the o
 are known already lie nowhere near where it sees them, the front-end has jumped or the tracks are wrong. Then its pose
 is sought from other starts: where the keyframes before it are, where they were heading, and where the correction of
 each of them puts it. From each the robust error is lowered with the points held, the loss narrowing from coarse to
-fine; the pose that most views agree with is where it begins. If half of them agree with none, it sits the solve out.
+fine; the pose that most views agree with is where it begins. If less than a third of them agree
+with any, it sits the solve out.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ _MIN_POINTS = 10
 _FAR_RAD = 0.2
 # Views agree within this many outlier gates: the newest points are not placed well yet.
 _WIDE = 5.0
-_AGREEING = 0.5
+# Half of the views may be wrong, and some more may see what is not placed well.
+_AGREEING = 0.3
 # Widths of the loss, sigmas, and steps with each.
 _WIDTHS = (200.0, 60.0, 20.0, 6.0, 3.0)
 _ROUNDS = 3

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ba_node.core import methods, solver
 from ba_node.window import guard
+from ba_node.window.graduation import begun
 from ba_node.window.merging import Merged, outcome
 from ba_node.window.selection import Selection, select
 
@@ -58,9 +59,9 @@ def attempt(
         selection = select(scene, config, end, without)
         if isinstance(selection, str):
             return selection
-        result = solver.solve(
-            selection.problem, methods.from_config(config.solver), clock=clock, on_iteration=on_iteration
-        )
+        options = methods.from_config(config.solver)
+        problem = begun(selection.problem, selection.norms[selection.believed], options)
+        result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration)
         found = outcome(scene, selection, result, config.tracks, config.solver.backend)
         if found.state is None:
             return Attempt(selection, result, found, guard.Health(), "", without)

@@ -32,7 +32,7 @@ _BEHIND = 1e4
 BULK = 10
 # Of a point's views more than this share has to agree: half of them may be wrong, and not all of the wrong ones apart.
 _LEAST_SUPPORT = 1.0 / 3.0
-# Two rays meet by chance more easily than three: they have to come as much nearer to each other.
+# Two rays meet by chance more easily than three: they have to come so much nearer to each other.
 _TWO_VIEWS = 0.5
 # A track of as many views that do not agree is tried with its newest third.
 _DIVIDED_VIEWS = 9

@@ -134,7 +134,7 @@ WRONG_RIGS: dict[str, tuple[str, Callable[[CameraRig], CameraRig], str]] = {
     "second camera yawed by 0.3 degrees": ("stereo", turned(1, 0.3), "as long as the front-end's"),
     "second camera yawed by -1 degree": ("stereo", turned(1, -1.0), "as long as the front-end's"),
     "second camera rolled by 1 degree": ("stereo", turned(2, 1.0), "camera 0 alone"),
-    "focal length 20 % short, stereo": ("stereo", zoomed(0.8), "as long as the front-end's"),
+    "focal length 20 % short, stereo": ("stereo", zoomed(0.8), "off the front-end's"),
     "focal length 20 % long, stereo": ("stereo", zoomed(1.2), "as long as the front-end's"),
     "focal length 20 % short, one camera": ("one camera", zoomed(0.8), ""),
     "focal length 20 % long, one camera": ("one camera", zoomed(1.2), ""),
