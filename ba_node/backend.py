@@ -368,12 +368,10 @@ class Backend:
         self, newest: int, end: int, on_iteration: Callable[[Iteration], bool] | None
     ) -> tuple[window.Selection | None, State | None]:
         """Solve the newest window and report; return what was solved, and the solution if it was taken."""
-        began = self._clock()
         tried = attempt(self.scene, self.config, end, self._trust, clock=self._clock, on_iteration=on_iteration)
         if isinstance(tried, str):
             self._report = dataclasses.replace(self._base_report(newest), reason=tried)
             return None, None
-        elapsed = self._clock() - began
         selection, (norms, state, _) = tried.selection, tried.found
         for stray in selection.strays:
             text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
@@ -388,7 +386,7 @@ class Backend:
         figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:
             figures |= {"status": Status.HELD, "reason": tried.held}
-        self._report = dataclasses.replace(self._base_report(newest), **figures, solve_time_s=elapsed)
+        self._report = dataclasses.replace(self._base_report(newest), **figures, solve_time_s=tried.solve_time_s)
         return selection, state
 
     def _hold(self, reason: str) -> None:

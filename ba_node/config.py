@@ -19,7 +19,7 @@ Value = bool | int | float | str
 
 # What core/methods.py and core/choices.py declare, as this file imports nothing; a test compares them.
 METHODS = ("auto", "lma_cd", "bal", "inm", "tnm", "dinm", "adinm", "local_dinm", "irls_huber", "irls_tq")
-LOSSES = ("squared", "huber", "truncated_quadratic", "cauchy", "geman_mcclure")
+LOSSES = ("squared", "huber", "truncated_quadratic", "cauchy", "geman_mcclure", "auto")
 BACKENDS = ("auto", "native", "numpy")
 LINEAR_SOLVERS = ("auto", "cholesky", "dense", "sparse", "pcg")
 CHEIRALITY = ("keep", "constant", "drop")
@@ -197,7 +197,9 @@ class SolverConfig:
         minimum=0,
         maximum=256,
     )
-    loss: str = _param("cauchy", "Robust loss on each residual.", choices=LOSSES)
+    loss: str = _param(
+        "auto", "Robust loss on each residual; auto: that of an irls_* method, Cauchy's for all others.", choices=LOSSES
+    )
     loss_scale_px: float = _param(
         2.0,
         "Residual, in units of sigma, where the robust loss leaves the square.",

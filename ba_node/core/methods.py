@@ -99,10 +99,13 @@ def from_config(config: SolverConfig) -> SolverOptions:
     linear_solver = chosen.linear_solver
     if config.linear_solver != "auto" and chosen.trust_region == "none":
         linear_solver = config.linear_solver
-    keeps_loss = config.loss == chosen.rules.loss
+    loss = config.loss
+    if loss == "auto":
+        loss = chosen.rules.loss if chosen.rules.loss != "squared" else "cauchy"
+    keeps_loss = loss == chosen.rules.loss
     rules = Rules(
         parameterisation=chosen.rules.parameterisation,
-        loss=config.loss,
+        loss=loss,
         loss_scale=config.loss_scale_px,
         cheirality=config.cheirality,
     )

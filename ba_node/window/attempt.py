@@ -31,6 +31,7 @@ class Attempt(NamedTuple):
         health: figures for the report.
         held: why it is not to be taken, empty if it is, or of no use anyway.
         without: rows of keyframes that were left out as they alone were wrong.
+        solve_time_s: time in the solver, s.
     """
 
     selection: Selection
@@ -39,6 +40,7 @@ class Attempt(NamedTuple):
     health: guard.Health
     held: str
     without: tuple[int, ...]
+    solve_time_s: float
 
 
 def attempt(
@@ -55,18 +57,21 @@ def attempt(
     The scene is not changed, but for where keyframes begin that were not refined yet.
     """
     without: tuple[int, ...] = ()
+    solve_time_s = 0.0
     while True:
         selection = select(scene, config, end, without)
         if isinstance(selection, str):
             return selection
         options = methods.from_config(config.solver)
         problem = begun(selection.problem, selection.norms[selection.believed], options)
+        began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration)
+        solve_time_s += clock() - began
         found = outcome(scene, selection, result, config.tracks, config.solver.backend)
         if found.state is None:
-            return Attempt(selection, result, found, guard.Health(), "", without)
+            return Attempt(selection, result, found, guard.Health(), "", without, solve_time_s)
         verdict = guard.judge(config, selection, found, trust)
         if without or not verdict.keyframes:
             held = trust.hear(verdict.reason, verdict.odd, without, config)
-            return Attempt(selection, result, found, verdict.health, held, without)
+            return Attempt(selection, result, found, verdict.health, held, without, solve_time_s)
         without, trust.cause = verdict.keyframes, verdict.reason

@@ -265,12 +265,17 @@ def test_report_carries_every_field(estimate: Estimate, report: SolveReport) -> 
     assert vars(message).keys() == names | {"type_name", "header", "rejected_reason", "rejected_count"}
 
 
-@pytest.mark.parametrize("status", [Status.FAILED, Status.SKIPPED, Status.HELD])
+@pytest.mark.parametrize("status", [Status.FAILED, Status.SKIPPED])
 def test_a_failed_solve_gives_the_report_only(estimate: Estimate, status: Status) -> None:
     failed = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, status=status))
     out = outputs(failed, OutputConfig())
     assert [topic for topic, _, _ in out] == ["report"]
     assert out[0][2].status == status
+
+
+def test_a_held_solve_gives_the_map_as_it_stands(estimate: Estimate) -> None:
+    held = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, status=Status.HELD))
+    assert [topic for topic, _, _ in outputs(held, OutputConfig())] == ["report", "path", "points"]
 
 
 def test_an_empty_map_makes_empty_messages(estimate: Estimate) -> None:
