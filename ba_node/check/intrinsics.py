@@ -64,8 +64,8 @@ _BARREL = (-0.1, -0.2, -0.3, -0.4)
 # Share of the tracks' extent by which a principal point is off their middle where other sizes of the image are tried.
 _OFF_CENTRE = 0.2
 # Another model is better if its sum of residuals is lower by this share, and by so many times its mean.
-_LOWER = 0.035
-_SURE = 40.0
+_LOWER = 0.03
+_SURE = 25.0
 _TEST = "intrinsics"
 _INFO = "camera_info in camera_rig"
 
