@@ -55,6 +55,8 @@ _BRACKET = 1.18
 _SMALLER, _LARGER = (0.92, 0.7, 0.6, 0.5, 0.4), (1.08, 1.4, 1.65, 2.0, 2.5)
 # Factors nearer to 1 than this are not named.
 _LEAST_FACTOR = 0.12
+# Two estimates of a factor agree to this.
+_SAME_FACTOR = 1.15
 # Usual residual, in sigmas, from which on it is more than noise, and factors far from 1 are tried too.
 _LARGE = 1.5
 # Barrel distortion that images have where none is given.
@@ -62,8 +64,8 @@ _BARREL = (-0.1, -0.2, -0.3, -0.4)
 # Share of the tracks' extent by which a principal point is off their middle where other sizes of the image are tried.
 _OFF_CENTRE = 0.2
 # Another model is better if its sum of residuals is lower by this share, and by so many times its mean.
-_LOWER = 0.035
-_SURE = 40.0
+_LOWER = 0.03
+_SURE = 25.0
 _TEST = "intrinsics"
 _INFO = "camera_info in camera_rig"
 
@@ -76,12 +78,28 @@ class Model:
     change: str
     params: FloatArray
 
+    def confirms(self, other: Model) -> bool:
+        """Return True if it says the same, whatever the precise numbers."""
+        ratio = float(self.params[0, FX] / other.params[0, FX])
+        return self.change == other.change and 1.0 / _SAME_FACTOR < ratio < _SAME_FACTOR
+
 
 def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
-    """Compare camera models by how well they explain a dozen keyframes."""
-    problem = _problem(tracks, relations)
+    """Compare camera models by how well they explain a dozen keyframes; other tracks have to confirm what is found."""
+    outcome, model = _compare(tracks, relations, part=0)
+    if model is None:
+        return outcome
+    _, other = _compare(tracks, relations, part=1)
+    if other is not None and other.confirms(model):
+        return outcome
+    return Diagnosis(untold=["the intrinsics: tracks contradict each other"], rows=outcome.rows)
+
+
+def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diagnosis, Model | None]:
+    """Return what half of the tracks tell, and which camera model is better than the given one."""
+    problem = _problem(tracks, relations, part)
     if problem is None:
-        return Diagnosis(untold=["too few long tracks with parallax to judge the intrinsics"])
+        return Diagnosis(untold=["too few long tracks with parallax to judge the intrinsics"]), None
     given = tracks.cameras.params
     adjusted = {1.0: _Adjusted(problem, given)}
     measure = _Measure(adjusted[1.0].norms)
@@ -109,15 +127,15 @@ def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         # Then the given model gets every chance: many iterations, and to begin where the other one ended.
         if _is_lower(lowest, now, n) and _is_lower(lowest, adjusted[1.0].thorough(best.state, measure), n):
             evidence = f"a free adjustment leaves {lowest / now:.0%} of the loss that it leaves as given"
-            return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows)
+            return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows), model
     if flat:
-        return Diagnosis(untold=["the motion so far does not tell the focal length"], rows=rows)
-    return Diagnosis(sound=["the focal length fits"], rows=rows)
+        return Diagnosis(untold=["the motion so far does not tell the focal length"], rows=rows), None
+    return Diagnosis(sound=["the focal length fits"], rows=rows), None
 
 
 def loss_of(tracks: Tracks, relations: list[Relation]) -> float:
     """Return the mean loss of a free adjustment of a dozen keyframes; infinite if there is none."""
-    problem = _problem(tracks, relations)
+    problem = _problem(tracks, relations, part=0)
     if problem is None:
         return np.inf
     norms = np.minimum(_Adjusted(problem, tracks.cameras.params).norms, _CAP)
@@ -213,8 +231,11 @@ def other_sizes(tracks: Tracks) -> list[Model]:
     return models
 
 
-def _problem(tracks: Tracks, relations: list[Relation]) -> Problem | None:
-    """Return the adjustment of a dozen keyframes that turn most, their longest tracks, the first pose fixed."""
+def _problem(tracks: Tracks, relations: list[Relation], part: int) -> Problem | None:
+    """Return the adjustment of a dozen keyframes that turn most, every other of their tracks, the first pose fixed.
+
+    The second part has the other tracks, and keyframes of the other end of the recording.
+    """
     usable = [one for one in relations if one.has_direction]
     if len(usable) < 3:
         return None
@@ -222,6 +243,7 @@ def _problem(tracks: Tracks, relations: list[Relation]) -> Problem | None:
     turning = max(usable, key=lambda one: float(np.trace(np.eye(3) - one.pose.rotation)))
     reach = stride * (_KEYFRAMES - 1)
     first = max(0, min(turning.a[0] - reach // 2, len(tracks) - 1 - reach))
+    first = max(0, len(tracks) - 1 - reach - first) if part else first
     keyframes = np.arange(first, len(tracks))[::stride][:_KEYFRAMES]
     if len(keyframes) < _MIN_KEYFRAMES:
         return None
@@ -231,7 +253,7 @@ def _problem(tracks: Tracks, relations: list[Relation]) -> Problem | None:
     image = np.unique(tracks.track[rows] * len(tracks) + tracks.keyframe[rows])
     views = np.bincount(image // len(tracks))
     # Tracks are numbered as they begin: so some of each keyframe.
-    longest = np.flatnonzero(views >= _MIN_VIEWS)
+    longest = np.flatnonzero(views >= _MIN_VIEWS)[part::2]
     count = np.bincount(tracks.track[rows])[longest].sum()
     longest = longest[spread(len(longest), int(len(longest) * _OBSERVATIONS / max(count, 1)))]
     if len(longest) < _MIN_POINTS:
