@@ -172,6 +172,40 @@ class TracksConfig:
 
 
 @dataclass(frozen=True)
+class OdometryConfig:
+    """How much the front-end's own steps from keyframe to keyframe count in a solve."""
+
+    enabled: bool = _param(True, "Let the steps count; they give one camera its scale, and hold what images do not.")
+    sigma_m: float = _param(
+        0.001, "Standard deviation of a step's translation along each axis at rest.", unit="m", minimum=0.0, maximum=1e6
+    )
+    sigma_m_per_m: float = _param(
+        0.01, "The same, added for each metre of the step.", unit="m/m", minimum=0.0, maximum=1e6
+    )
+    sigma_rad: float = _param(
+        0.001, "Standard deviation of a step's rotation about each axis at rest.", unit="rad", minimum=0.0, maximum=1e3
+    )
+    sigma_rad_per_m: float = _param(
+        0.003, "The same, added for each metre of the step.", unit="rad/m", minimum=0.0, maximum=1e3
+    )
+    sigma_rad_per_rad: float = _param(
+        0.01, "The same, added for each radian of the step.", unit="rad/rad", minimum=0.0, maximum=1e3
+    )
+    max_inflation: float = _param(
+        10.0,
+        "Standard deviations grow up to this many times where well-determined keyframes show the steps to be worse.",
+        minimum=1.0,
+        maximum=1e6,
+    )
+    loss_scale: float = _param(
+        1.0,
+        "Where Cauchy's loss leaves the square, in standard deviations: steps that are off by far more count little.",
+        minimum=1e-3,
+        maximum=1e6,
+    )
+
+
+@dataclass(frozen=True)
 class SolverConfig:
     """How a window is solved."""
 
@@ -461,6 +495,7 @@ class Config:
     window: WindowConfig = field(default_factory=WindowConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     guard: GuardConfig = field(default_factory=GuardConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.core import covariance, geometry
+from ba_node.window import gauge
 
 if TYPE_CHECKING:
     from ba_node.core.options import SolverOptions
@@ -79,6 +80,7 @@ def _scale_condition(members: IntArray, measured: FloatArray, position: FloatArr
     steps = np.diff(position[members], axis=0)
     length = np.linalg.norm(steps, axis=1)
     wanted = np.linalg.norm(np.diff(measured[members], axis=0), axis=1)
+    wanted = np.where(gauge.agreeing_steps(wanted, length), wanted, 2.0 * length)
     along = steps * ((wanted - 2.0 * length) / np.where(length > 0.0, length, 1.0))[:, None]
     np.add.at(by_position, members[1:], along)
     np.subtract.at(by_position, members[:-1], along)

@@ -3,9 +3,10 @@
 """Hold the freedom of a problem: place, heading, and scale where it cannot be seen.
 
 Scale can be seen where two cameras of one keyframe, apart from each other, see the same point, or where depth is
-measured. For each connected part of a problem:
+measured. The front-end's steps (odometry.py) tie consecutive keyframes to each other, and have a scale. For each part
+of a problem that common points and ties connect:
 
-- scale is seen: one fixed keyframe holds the rest;
+- scale is seen, or told by ties and older keyframes take part: one fixed keyframe holds the rest;
 - it is not, and older keyframes take part: two fixed ones hold it, the oldest of the window being the second if need
   be;
 - it is not, and the whole part is free (a map begins): the oldest is fixed, and after the solve the part is scaled
@@ -21,11 +22,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from ba_node.core.problem import Observations, Problem
+    from ba_node.core.problem import Problem
     from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
 # A fixed keyframe with fewer observations takes part, but is not relied on to hold anything.
 _ANCHOR_OBSERVATIONS = 10
+# Steps whose lengths differ by this factor more than those of most of the way say nothing about the scale.
+_RATIO = 3.0
 # Cameras of a rig nearer to each other (m) show no scale.
 _MIN_BASELINE_M = 1e-6
 
@@ -43,23 +46,28 @@ class Gauge:
     unscaled: IntArray
 
 
-def choose(problem: Problem, old: BoolArray) -> Gauge:
+def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
     """Choose what holds a problem.
 
     Args:
         problem: keyframes oldest first.
         old: (n_kf,) keyframes that are fixed in any case.
+        tied: (n_kf - 1,) True where a keyframe is tied to the next by a step of the front-end.
     """
     obs, n_kf = problem.observations, problem.n_keyframes
     fixed, unscaled = old.copy(), np.full(n_kf, -1)
-    part_of = _parts(obs, n_kf, problem.n_points)
+    part_of = _parts(problem, tied)
     shows_scale = _shows_scale(problem)
-    strong = np.bincount(obs.keyframe, minlength=n_kf) >= _ANCHOR_OBSERVATIONS
+    has_tie = np.zeros(n_kf, bool)
+    has_tie[:-1] |= tied
+    has_tie[1:] |= tied
+    strong = has_tie | (np.bincount(obs.keyframe, minlength=n_kf) >= _ANCHOR_OBSERVATIONS)
     for part in np.unique(part_of):
         members = part_of == part
         free = np.flatnonzero(members & ~old)
         scaled = bool(np.any(shows_scale & members.take(obs.keyframe)))
-        missing = (1 if scaled else 2) - int(np.count_nonzero(members & old & strong))
+        needed = 1 if scaled or np.any(members & has_tie) else 2
+        missing = needed - int(np.count_nonzero(members & old & strong))
         if not scaled and not np.any(members & old):
             fixed[free[:1]] = True
             unscaled[members] = free[0]
@@ -71,7 +79,7 @@ def choose(problem: Problem, old: BoolArray) -> Gauge:
 def step_ratio(measured: FloatArray, estimated: FloatArray) -> float:
     """Return the scale that makes the steps between estimated positions as long as between measured ones.
 
-    Least squares over the lengths of consecutive steps; 1 where there is nothing to compare.
+    Least squares over the lengths of those consecutive steps that agree; 1 where there is nothing to compare.
 
     Args:
         measured: (n, 3) positions by the front-end, m.
@@ -79,18 +87,40 @@ def step_ratio(measured: FloatArray, estimated: FloatArray) -> float:
     """
     long = np.linalg.norm(np.diff(measured, axis=0), axis=1)
     short = np.linalg.norm(np.diff(estimated, axis=0), axis=1)
-    top, bottom = float(long @ short), float(short @ short)
+    kept = agreeing_steps(long, short)
+    top, bottom = float(long[kept] @ short[kept]), float(short[kept] @ short[kept])
     return top / bottom if top > 0 and bottom > 0 and np.isfinite(top / bottom) else 1.0
 
 
-def _parts(obs: Observations, n_kf: int, n_points: int) -> IntArray:
-    """Return for each keyframe the first keyframe that it is connected with over common points."""
+def agreeing_steps(measured: FloatArray, estimated: FloatArray) -> BoolArray:
+    """Return which steps have about the ratio of lengths that most of the way has, (n,): a front-end may jump.
+
+    Args:
+        measured: (n,) lengths by the front-end, m.
+        estimated: (n,) in the scale of the problem.
+    """
+    ratio = np.where(estimated > 0, measured / np.where(estimated > 0, estimated, 1.0), np.inf)
+    order = np.argsort(ratio)
+    travelled = np.cumsum(estimated[order])
+    if not len(order) or travelled[-1] <= 0:
+        return np.ones(len(measured), bool)
+    middle = ratio[order[np.searchsorted(travelled, 0.5 * travelled[-1])]]
+    return np.asarray((ratio <= _RATIO * middle) & (ratio * _RATIO >= middle))
+
+
+def _parts(problem: Problem, tied: BoolArray) -> IntArray:
+    """Return for each keyframe the first keyframe that it is connected with over common points and ties."""
+    obs, n_kf, n_points = problem.observations, problem.n_keyframes, problem.n_points
+    # A tie connects as a point does that both keyframes see.
+    ties = np.flatnonzero(tied)
+    keyframe = np.concatenate([obs.keyframe, ties, ties + 1])
+    point = np.concatenate([obs.point, n_points + ties, n_points + ties])
     label = np.arange(n_kf)
     while True:
-        by_point = np.full(n_points, n_kf)
-        np.minimum.at(by_point, obs.point, label.take(obs.keyframe))
+        by_point = np.full(n_points + n_kf, n_kf)
+        np.minimum.at(by_point, point, label.take(keyframe))
         spread = label.copy()
-        np.minimum.at(spread, obs.keyframe, by_point.take(obs.point))
+        np.minimum.at(spread, keyframe, by_point.take(point))
         # Labels name keyframes, so a label's own label is a shortcut: long chains settle in few rounds.
         spread = spread[spread]
         if np.array_equal(spread, label) or not spread.any():

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.core import geometry, native_kernels
-from ba_node.window import arrival, gauge, trial
+from ba_node.window import arrival, gauge, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
 
@@ -40,6 +40,8 @@ _VIEWS = 400
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
 # the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
 _ABSURD = 25.0
+# Rotations alone are looked for in windows, not in whole maps.
+_MOST_TURNS = 200
 # As many residuals of known points tell how good the poses are.
 _BULK = 100
 
@@ -98,18 +100,24 @@ class Selection:
 
 @dataclass(frozen=True)
 class _Part:
-    """What may take part: a problem with all poses fixed, and where its parts stand in the scene, as in Selection."""
+    """What may take part: a problem with all poses fixed, and where its parts stand in the scene, as in Selection.
+
+    ``turned`` are the keyframes whose orientations images alone tell; None if there are none.
+    """
 
     problem: Problem
     rows: IntArray
     keyframes: IntArray
     landmarks: IntArray
     origin: FloatArray
+    turned: turns.Turns | None = None
 
     def only(self, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> _Part:
         """Return some of it, see ``part_of``."""
         problem = part_of(self.problem, rows, keyframes, points)
-        return _Part(problem, self.rows.take(rows), self.keyframes[keyframes], self.landmarks[points], self.origin)
+        turned = None if self.turned is None else self.turned.take(keyframes)
+        places = self.rows.take(rows), self.keyframes[keyframes], self.landmarks[points]
+        return _Part(problem, *places, self.origin, turned)
 
 
 def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
@@ -149,9 +157,11 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     held_out[aside] = True
     believed = usable & ~held_out.take(obs.point)
     active = some_observations(part.problem, np.flatnonzero(believed))
-    held = gauge.choose(active, is_old)
+    held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
+    active = dataclasses.replace(active, fixed=held.fixed)
+    factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned)
     return Selection(
-        problem=dataclasses.replace(active, fixed=held.fixed),
+        problem=dataclasses.replace(active, factors=factors),
         sightings=obs,
         norms=norms,
         rows=part.rows,
@@ -193,7 +203,7 @@ def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:
 
 def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
     """Return what may take part, and its residuals at the start, sigmas."""
-    part = _reach(scene, window, config, without)
+    part = _turned(scene, _reach(scene, window, config, without), config)
     part = dataclasses.replace(part, problem=_placed(scene, part, config))
     start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
     return part, native_kernels.residual_norms(part.problem, start, config.solver.backend)
@@ -259,6 +269,18 @@ def _distinct(rows: NDArray[np.int32], n: int) -> IntArray:
     marked = np.zeros(n, bool)
     marked[rows] = True
     return np.flatnonzero(marked)
+
+
+def _turned(scene: Scene, part: _Part, config: Config) -> _Part:
+    """Return a part that begins with the orientations that images alone tell."""
+    if not config.odometry.enabled or len(part.keyframes) > _MOST_TURNS:
+        return part
+    used = ~scene.sightings.outlier.take(part.rows)
+    found = turns.find(part.problem, part.keyframes, used, scene.landmarks.has_position[part.landmarks])
+    if found is None:
+        return part
+    free = ~scene.keyframes.refined[part.keyframes]
+    return dataclasses.replace(part, problem=found.applied(part.problem, part.keyframes, free), turned=found)
 
 
 def _placed(scene: Scene, part: _Part, config: Config) -> Problem:

@@ -104,7 +104,7 @@ def test_images_of_a_whole_map_as_keyframes(shared_data: Path) -> None:
 
 def test_a_keyframe_that_starts_far_off_is_brought_in(shared_data: Path) -> None:
     """Seven points, five of them seen by the third image, whose residuals begin at some 150 px."""
-    backend = Backend(Config())
+    backend = Backend(Config().with_values({"odometry.enabled": False}))
     replay(backend, messages_of(read_bal(shared_data / "gtsam-dubrovnik-small" / "dubrovnik-3-7-pre.txt")))
     assert backend.scene.keyframes.refined.all()
     assert backend.rms_px("refined") < 0.5, f"{backend.rms_px('refined'):.2f} px"

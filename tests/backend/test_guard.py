@@ -129,7 +129,7 @@ WRONG_RIGS: dict[str, tuple[str, Callable[[CameraRig], CameraRig], str]] = {
     "baseline reversed": ("stereo", reversed_baseline, "observations agree"),
     "cameras swapped": ("stereo", swapped, "observations agree"),
     "extrinsics inverted": ("stereo", inverted, "observations agree"),
-    "extrinsics of one camera inverted": ("one camera", inverted, "observations agree"),
+    "extrinsics of one camera inverted": ("one camera", inverted, "off the front-end's"),
     "second camera pitched by 1 degree": ("stereo", turned(0, 1.0), "observations agree"),
     "second camera yawed by 0.3 degrees": ("stereo", turned(1, 0.3), "as long as the front-end's"),
     "second camera yawed by -1 degree": ("stereo", turned(1, -1.0), "as long as the front-end's"),
@@ -368,4 +368,5 @@ def test_recordings_gone_wrong(name: str, shared_data: Path) -> None:
     backend = Backend(ALONE)
     before, after = errors(stream, truth, replay(backend, stream)[-1])
     assert after <= 1.1 * before, f"{before:.4f} -> {after:.4f} m"
-    assert backend.scene.log.warnings["held"]
+    # The front-end's steps hold one camera that stands still: that is no cause to hold anything back.
+    assert ("held" in backend.scene.log.warnings) == (name != "mono_stands_still")

@@ -36,8 +36,9 @@ def chain(keyframes: range, first_point: int = 0, cameras: tuple[int, ...] = (0,
     ]
 
 
-def choose(problem: Problem, old: list[int]) -> tuple[list[int], list[int]]:
-    held = gauge.choose(problem, np.isin(np.arange(problem.n_keyframes), old))
+def choose(problem: Problem, old: list[int], tied: list[int] | None = None) -> tuple[list[int], list[int]]:
+    number = np.arange(problem.n_keyframes)
+    held = gauge.choose(problem, np.isin(number, old), np.isin(number[:-1], tied or []))
     return np.flatnonzero(held.fixed).tolist(), held.unscaled.tolist()
 
 

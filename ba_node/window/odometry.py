@@ -1,0 +1,163 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Turn the front-end's own steps into factors between consecutive keyframes of a window's problem.
+
+A step is the relative pose of the front-end's poses of two keyframes, however far the map has been corrected since. Its
+standard deviations grow with the path between them, of length l and turn a, over the keyframes that take no part too::
+
+    sigma_translation = sigma_m + sigma_m_per_m l
+    sigma_rotation    = sigma_rad + sigma_rad_per_m l + sigma_rad_per_rad a
+
+They are those of good odometry. Where that of a recording is worse, keyframes that see much tell: with d the distances
+between their refined steps and the front-end's, in standard deviations of three axes, all are multiplied by
+``median(d) / 1.54`` (1.54 is that of a normal distribution), for translation and rotation apart.
+
+So images decide where they see enough. Where these see little (no tracks, no parallax, a camera that stands still or
+turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
+images by far, as where the front-end has jumped, pulls at nothing. Rotation and translation have one each, so that a
+wrong one does not release the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.core.factors import RelativePoses
+
+if TYPE_CHECKING:
+    from ba_node.config import OdometryConfig
+    from ba_node.core.problem import Problem
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+    from ba_node.window.turns import Turns
+
+_LOSS = "cauchy"
+# A standard deviation of zero would be a condition, not a measurement (m, rad).
+_SMALLEST_SIGMA = 1e-9
+# Keyframes further apart than this many steps of the front-end are not tied to each other.
+_MAX_GAP = 100
+# Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
+_LEAST_STEPS = 8
+_MANY_OBSERVATIONS = 50
+# Median of the norm of three standard normal numbers.
+_MEDIAN_NORM = 1.538
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Steps of the front-end between keyframes of a problem and the next ones.
+
+    Attributes:
+        first: (n,) the earlier keyframe of each.
+        rotation: (n, 3, 3) body at the earlier one from body at the later one.
+        translation: (n, 3) the same, m.
+        sigma_rad: (n,) standard deviation about each axis.
+        sigma_m: (n,) along each axis.
+    """
+
+    first: IntArray
+    rotation: FloatArray
+    translation: FloatArray
+    sigma_rad: FloatArray
+    sigma_m: FloatArray
+
+    def factors(self, kept: BoolArray, loss_scale: float) -> tuple[RelativePoses, ...]:
+        """Return the factors of some steps."""
+        pairs = np.stack([self.first, self.first + 1], axis=1)[kept]
+        root = np.zeros((2, len(pairs), 6, 6))
+        index = np.arange(3)
+        root[0][:, index, index] = 1.0 / self.sigma_rad[kept, None]
+        root[1][:, index + 3, index + 3] = 1.0 / self.sigma_m[kept, None]
+        measured = self.rotation[kept], self.translation[kept]
+        return tuple(RelativePoses(pairs, *measured, part, _LOSS, loss_scale) for part in root)
+
+
+def ties(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray:
+    """Return which keyframes of a problem, oldest first, are tied to the next one, (n_kf - 1,)."""
+    return config.enabled & (np.diff(scene.places()[keyframes]) <= _MAX_GAP)
+
+
+def factors(
+    scene: Scene, config: OdometryConfig, problem: Problem, keyframes: IntArray, turned: Turns | None = None
+) -> tuple[RelativePoses, ...]:
+    """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
+
+    Args:
+        scene: where the front-end's poses stand.
+        config: standard deviations.
+        problem: in which they are to count.
+        keyframes: rows of its keyframes, oldest first.
+        turned: what is known of their rotations beside the front-end's.
+    """
+    tied = np.flatnonzero(ties(scene, config, keyframes))
+    free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
+    if not free.any():
+        return ()
+    steps = _inflated(scene, config, problem, keyframes, _front_end(scene, config, keyframes, tied))
+    if turned is not None:
+        rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
+        known = ~np.isnan(sigma_rad)
+        steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
+    return steps.factors(free, config.loss_scale)
+
+
+def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first: IntArray) -> _Steps:
+    """Return the front-end's steps as the parameters have them."""
+    table, place = scene.keyframes, scene.places()[keyframes]
+    poses = table.input_rotation, table.input_position
+    rotation, translation = _relative(*poses, keyframes[first], keyframes[first + 1])
+    length, turn = _travelled(scene, place[first], place[first + 1] - place[first])
+    sigma_rad = config.sigma_rad + config.sigma_rad_per_m * length + config.sigma_rad_per_rad * turn
+    sigma_m = config.sigma_m + config.sigma_m_per_m * length
+    return _Steps(
+        first,
+        rotation,
+        translation,
+        np.maximum(sigma_rad, _SMALLEST_SIGMA),
+        np.maximum(sigma_m, _SMALLEST_SIGMA),
+    )
+
+
+def _inflated(scene: Scene, config: OdometryConfig, problem: Problem, keyframes: IntArray, steps: _Steps) -> _Steps:
+    """Return steps with standard deviations as well-determined keyframes show them to be, but no smaller ones."""
+    table = scene.keyframes
+    many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= _MANY_OBSERVATIONS
+    sure = many & table.refined[keyframes]
+    rows = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
+    if len(rows) < _LEAST_STEPS:
+        return steps
+    first = steps.first[rows]
+    rotation, translation = _relative(table.rotation, table.position, keyframes[first], keyframes[first + 1])
+    turned = geometry.so3_log(np.swapaxes(steps.rotation[rows], 1, 2) @ rotation)
+    off = np.stack(
+        [turned / steps.sigma_rad[rows, None], (translation - steps.translation[rows]) / steps.sigma_m[rows, None]]
+    )
+    worse = np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1) / _MEDIAN_NORM
+    times = np.clip(worse, 1.0, config.max_inflation)
+    return dataclasses.replace(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
+
+
+def _relative(
+    rotation: FloatArray, position: FloatArray, first: IntArray, second: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return relative poses, (n, 3, 3) and (n, 3): body at the first row from body at the second."""
+    back = np.swapaxes(rotation[first], 1, 2)
+    moved = (position[second] - position[first])[:, :, None]
+    return back @ rotation[second], (back @ moved)[..., 0]
+
+
+def _travelled(scene: Scene, place: IntArray, gap: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far (m) and by how much (rad) the front-end moves from some places in time over so many steps each."""
+    factor = np.repeat(np.arange(len(place)), gap)
+    at = np.arange(len(factor)) + (place - (np.cumsum(gap) - gap))[factor]
+    table, order = scene.keyframes, scene.order
+    rotation, translation = _relative(table.input_rotation, table.input_position, order[at], order[at + 1])
+    cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0)
+    turn = np.arccos(np.clip(cosine, -1.0, 1.0))
+    length = np.sqrt(np.sum(translation * translation, axis=1))
+    return np.bincount(factor, length, len(place)).astype(float), np.bincount(factor, turn, len(place)).astype(float)
