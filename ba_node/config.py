@@ -315,7 +315,7 @@ class GuardConfig:
     min_points: int = _param(5, "A keyframe that sees fewer points of a solve is not refined.", minimum=2, maximum=1000)
     held_out_tracks: int = _param(
         16,
-        "Tracks that a solution is tried on, at most one in 64 of which takes no part in it; 0: no trial.",
+        "Tracks that a solution is tried on, at most one in 128 of which takes no part in it; 0: no trial.",
         minimum=0,
         maximum=10_000,
     )

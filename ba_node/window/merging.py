@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # A point so many times as far away as the whole window's parallax can tell is anywhere.
 _NOTICED = 10.0
+# A point that moves by this share of its distance leaps.
+_LEAP = 0.5
 
 
 class Merged(NamedTuple):
@@ -89,17 +91,21 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
     away, began = (np.abs(points - centre).max(axis=1) > limit for points in (state.points, whole.start.points))
     agreeing = np.bincount(point[norms <= gate], minlength=n)
-    doubted = away | (2 * agreeing < np.bincount(point, minlength=n))
+    moved = np.abs(state.points - whole.start.points).max(axis=1)
+    leapt = moved > _LEAP * np.abs(whole.start.points - centre).max(axis=1)
+    doubted = away | leapt | (2 * agreeing < np.bincount(point, minlength=n))
     rows = np.flatnonzero(doubted.take(point))
     if not len(rows):
         return state
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
     start = dataclasses.replace(state, points=whole.start.points[doubted])
     before = native_kernels.residual_norms(views, start, backend)
-    better = np.bincount(views.observations.point[before <= gate], minlength=views.n_points) > agreeing[doubted]
+    support = np.bincount(views.observations.point[before <= gate], minlength=views.n_points)
+    # A leap has to be borne out by more views than there were.
+    better = support + leapt[doubted] > agreeing[doubted]
     back, lost = ~began[doubted] & (better | away[doubted]), (away & began)[doubted]
-    moved = back.take(views.observations.point)
-    norms[rows[moved]] = before[moved]
+    returned = back.take(views.observations.point)
+    norms[rows[returned]] = before[returned]
     norms[rows[lost.take(views.observations.point)]] = np.inf
     points = state.points.copy()
     points[np.flatnonzero(doubted)[back]] = whole.start.points[doubted][back]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ba_node.scene.tables import FloatArray, IdArray, IntArray
 
 # One track in so many may sit a solve out: more would be missed by a small window.
-_SHARE = 64
+_SHARE = 128
 # Rays that meet at fewer standard deviations of a pixel than this tell no distance.
 MIN_PARALLAX = 4.0
 # A track with fewer views by fewer keyframes tells nothing: any poses explain it.

@@ -67,7 +67,7 @@ def test_a_fixed_choice_of_tracks() -> None:
     ids = np.random.default_rng(3).integers(0, 2**64 - 1, 1000, dtype=np.uint64, endpoint=True)
     point = np.repeat(np.arange(1000), 6)
     tried, aside = trial.choose(ids, point, 16)
-    assert len(tried) == 16 and aside.tolist() == tried[: 1000 // 64].tolist()
+    assert len(tried) == 16 and aside.tolist() == tried[: 1000 // 128].tolist()
     # Another order, and others beside them, leave the choice as it is where these stay.
     order = np.random.default_rng(4).permutation(1000)
     again, _ = trial.choose(ids[order], point, 16)
