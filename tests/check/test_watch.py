@@ -55,7 +55,6 @@ def same_as_input(estimate: Estimate, data: SyntheticData) -> None:
         ("depth in mm", "rgbd", "depth_m in millimetres"),
         ("camera from world", "mono", "camera-from-world"),
         ("focal 1.2", "stereo", "focal length off"),
-        ("slots", "mono", "ids reused"),
     ],
 )
 def test_wrong_set_up_is_held(wrong: str, mode: str, words: str) -> None:
