@@ -79,7 +79,7 @@ def objectives(backend: Backend, of: full.Copy) -> tuple[float, float]:
     poses = geometry.inverse(
         scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes] - selection.origin
     )
-    points = scene.landmarks.position[landmarks] - selection.origin
+    points = np.nan_to_num(scene.landmarks.position[landmarks] - selection.origin)
     problem = some_observations(selection.problem, np.flatnonzero(placed[selection.problem.observations.point]))
     now = dataclasses.replace(problem.start, rotation=poses[0], translation=poses[1], points=points)
     chosen = full.options(backend.config.solver, max_iterations=1)
@@ -182,7 +182,10 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     state = scaled(taken.selection, taken.position, state)
     assert full.put(scene, backend.config, taken, state) == 8
     after = backend.estimate()
-    np.testing.assert_allclose(after.trajectory.position, moved(before.trajectory.position), atol=1e-9)
+    # Those that no solve has had follow the front-end's steps, which are not stretched.
+    had = scene.keyframes.refined[scene.order]
+    assert np.count_nonzero(had) >= 16
+    np.testing.assert_allclose(after.trajectory.position[had], moved(before.trajectory.position[had]), atol=1e-9)
     kept = np.isin(after.cloud.track_id, before.cloud.track_id)
     rows = np.searchsorted(before.cloud.track_id, after.cloud.track_id[kept])
     followed = np.isclose(after.cloud.position[kept], moved(before.cloud.position[rows]), rtol=1e-6, atol=1e-6)
