@@ -203,7 +203,7 @@ def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:
 
 def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
     """Return what may take part, and its residuals at the start, sigmas."""
-    part = _turned(scene, _reach(scene, window, config, without), config)
+    part = _turned(scene, _reach(scene, window, config, without), window, config)
     part = dataclasses.replace(part, problem=_placed(scene, part, config))
     start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
     return part, native_kernels.residual_norms(part.problem, start, config.solver.backend)
@@ -271,11 +271,12 @@ def _distinct(rows: NDArray[np.int32], n: int) -> IntArray:
     return np.flatnonzero(marked)
 
 
-def _turned(scene: Scene, part: _Part, config: Config) -> _Part:
+def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Part:
     """Return a part that begins with the orientations that images alone tell."""
     if not config.odometry.enabled or len(part.keyframes) > _MOST_TURNS:
         return part
-    used = ~scene.sightings.outlier.take(part.rows)
+    of_window = np.isin(part.keyframes, window).take(part.problem.observations.keyframe)
+    used = of_window & ~scene.sightings.outlier.take(part.rows)
     found = turns.find(part.problem, part.keyframes, used, scene.landmarks.has_position[part.landmarks])
     if found is None:
         return part

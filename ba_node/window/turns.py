@@ -131,8 +131,9 @@ def find(problem: Problem, rows: IntArray, used: BoolArray, placed: BoolArray) -
         placed: (n_pt,) points that have a place.
     """
     obs, n = problem.observations, problem.n_keyframes
+    every = np.bincount(obs.keyframe[used], minlength=n)
     well = np.bincount(obs.keyframe[used & placed.take(obs.point)], minlength=n)
-    weak = well < _FEW_POINTS
+    weak = (well < _FEW_POINTS) & (every >= _LEAST_SHARED)
     weak[:1] = False
     if not weak.any():
         return None
