@@ -138,13 +138,13 @@ class SqliteSource:
         self._reader = Sqlite3Reader(path)
         try:
             self._reader.open()
+            stack.callback(self._reader.close)
+            facts = self._reader.metadata
+            channels = [_sqlite_channel(connection) for connection in self._reader.connections]
         except Exception as error:  # a damaged database leads the library into errors of every kind
             raise BagError(f"not an SQLite recording of rosbag2, or damaged: {error}") from error
-        stack.callback(self._reader.close)
-        facts = self._reader.metadata
         if facts.message_count == 0:
             raise EmptyBagError("no message can be read: it was closed before anything was recorded")
-        channels = [_sqlite_channel(connection) for connection in self._reader.connections]
         self.facts = SourceFacts(channels, facts.message_count, facts.start_time, facts.end_time - 1)
         journal = path.with_name(f"{path.name}-wal")
         if journal.is_file() and journal.stat().st_size:
@@ -164,6 +164,8 @@ class SqliteSource:
 
 
 def _sqlite_channel(connection: Any) -> BagChannel:
+    if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
+        raise BagError(f"topic {connection.topic!r} of type {connection.msgtype!r}: expected two names")
     type_name = ros_types.full_name(connection.msgtype)
     definition, kind = connection.msgdef.data, _ENCODINGS.get(connection.msgdef.format, "ros2msg")
     if not definition and ros_types.is_known(type_name):

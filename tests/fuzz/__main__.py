@@ -3,8 +3,8 @@
 """Give readers and back-end broken input: the long form of tests/fuzz.
 
 Each target runs in a process of its own. No input may raise anything but an error of this package that speaks of its
-input, take more than 10 s, or more than 1 GB. What does is kept in OUT/TARGET/crash-* (or timeout-*, oom-*); run it
-again with --repeat FILE --only TARGET.
+input, take more than 10 s, or more than 1 GB. What does is kept in OUT/TARGET/crash-* (or current, oom-*); run it again
+with --repeat FILE --only TARGET.
 """
 
 from __future__ import annotations
