@@ -91,7 +91,7 @@ def test_replay_comes_nearer_to_the_truth(options: dict[str, Any]) -> None:
 
 
 def test_a_replay_solves_once_for_every_keyframe() -> None:
-    data = recording()
+    data = recording(landmarks=2000, tracks=120)
     estimates = replay(Backend(Config()), (m for _, _, m in data.timeline()))
     newest = [estimate.report.newest_keyframe_id for estimate in estimates]
     assert newest == data.truth.keyframe_id.tolist()
@@ -211,7 +211,7 @@ def test_more_keyframes_at_once_than_a_window_holds(by_topic: bool) -> None:
 
 
 def test_tracks_that_come_late_make_their_keyframe_due_again() -> None:
-    data = recording()
+    data = recording(landmarks=2000, tracks=120)
     backend = Backend(Config())
     stream: list[Measurement] = [data.rig, *data.keyframes[:3], *data.tracks[0], *data.tracks[2]]
     for measurement in stream:

@@ -133,7 +133,7 @@ def write_robots(path: Path, spaces: dict[str, int]) -> None:
     """Write the recordings of several robots, by namespace and seed, into one file."""
     entries = []
     for space, seed in spaces.items():
-        data = generate(SyntheticOptions(keyframes=8, landmarks=600, tracks=60, length_m=10.0, seed=seed))
+        data = generate(SyntheticOptions(keyframes=12, landmarks=3000, tracks=150, length_m=10.0, seed=seed))
         for topic, stamp, m in data.timeline():
             if isinstance(m, CameraRig):
                 message = rig_message(F, m, stamp)
