@@ -150,7 +150,7 @@ class TracksConfig:
         maximum=90.0,
     )
     max_triangulation_px: float = _param(
-        6.0,
+        12.0,
         "Largest reprojection error, in sigmas, of a view that agrees where a point begins; half of it for two views.",
         unit="px",
         minimum=0.1,
