@@ -57,7 +57,7 @@ SIDE_OUTPUTS = {
     "pose_with_covariance": (
         "reliable",
         (
-            "As `~/pose`, with a covariance against what the solve held fixed; with the default Huber loss its standard"
+            "As `~/pose`, with a covariance against what the solve held fixed; with a robust loss its standard"
             " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed."
         ),
     ),
