@@ -86,6 +86,11 @@ class Diagnosis:
         return any(finding.harmful for finding in self.findings)
 
     @property
+    def usual(self) -> bool:
+        """Return True if all that was found are usual mistakes."""
+        return all(finding.usual for finding in self.findings)
+
+    @property
     def settled(self) -> bool:
         """Return True if nothing is left to be told by more tracks."""
         return self.harmful or not self.untold

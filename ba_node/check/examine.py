@@ -47,7 +47,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "lengths": lambda: units.check_lengths(tracks, related()),
     }
     for name, test in tests.items():
-        if name in told or (outcome.harmful and name not in _RELATIONS):
+        if name in told | outcome.told or (outcome.harmful and name not in _RELATIONS):
             continue
         if name in _BUILD_ON_THESE and not told | outcome.told >= _RELATIONS:
             outcome.untold.append(f"{name}: not before cameras and poses are known to fit")
@@ -56,6 +56,9 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         outcome.add(found)
         if not found.untold:
             outcome.told |= {name}
+        if name == "ids" and found.findings:
+            # Their tracks are of several points, and tell nothing else.
+            outcome.told |= set(_BUILD_ON_THESE)
     if outcome.harmful:
         outcome.sound, outcome.untold = [], []
     return outcome

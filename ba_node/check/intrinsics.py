@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
-from ba_node.check.relations import spread
+from ba_node.check.relations import AGREED, median_share, spread
 from ba_node.core import cameras, geometry, methods, native_kernels, solver, triangulation
 from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
 from ba_node.core.objective import Rules
@@ -66,6 +66,8 @@ _OFF_CENTRE = 0.2
 # Another model is better if its sum of residuals is lower by this share, and by so many times its mean.
 _LOWER = 0.03
 _SURE = 25.0
+# Where fewer tracks than this agree with free relations, the sum has to fall to this share: moving objects pull too.
+_MOST_AGREE, _LEFT = 0.85, 0.75
 _TEST = "intrinsics"
 _INFO = "camera_info in camera_rig"
 
@@ -126,11 +128,21 @@ def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diag
         lowest = measure(best)
         # Then the given model gets every chance: many iterations, and to begin where the other one ended.
         if _is_lower(lowest, now, n) and _is_lower(lowest, adjusted[1.0].thorough(best.state, measure), n):
+            if lowest > _left(relations) * now:
+                return Diagnosis(untold=["too many outliers to judge the intrinsics"], rows=rows), None
             evidence = f"a free adjustment leaves {lowest / now:.0%} of the loss that it leaves as given"
             return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows), model
     if flat:
         return Diagnosis(untold=["the motion so far does not tell the focal length"], rows=rows), None
     return Diagnosis(sound=["the focal length fits"], rows=rows), None
+
+
+def _left(relations: list[Relation]) -> float:
+    """Return the most that another model may leave of the loss, by how many tracks agree with free relations."""
+    share = median_share([one for one in relations if one.has_direction])
+    if share < AGREED:
+        return 0.0
+    return _LEFT if share < _MOST_AGREE else 1.0
 
 
 def loss_of(tracks: Tracks, relations: list[Relation]) -> float:

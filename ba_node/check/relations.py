@@ -52,6 +52,9 @@ _DOUBTFUL_DEG = 15.0
 _ABSURD_DEG = 50.0
 # A hypothesis takes the place of what was given if it halves the angle.
 _BETTER = 0.5
+# Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
+# is estimated, and nothing but the usual mistakes of placement is told.
+AGREED = 0.7
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,16 @@ def in_motion(tracks: Tracks) -> list[Relation]:
     return found
 
 
+def median_share(relations: list[Relation]) -> float:
+    """Return the usual share of the tracks that agree with what is best for two images; 1 if there are none."""
+    return float(np.median([one.share for one in relations])) if relations else 1.0
+
+
+def agreed(relations: list[Relation]) -> bool:
+    """Return True if so many tracks agree that little things can be told."""
+    return median_share(relations) >= AGREED
+
+
 def spread(count: int, wanted: int) -> IntArray:
     """Return at most so many indices of a row of things, evenly spread."""
     return (
@@ -152,10 +165,9 @@ def check_cameras(tracks: Tracks) -> Diagnosis:
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             continue
         found = _check_camera(given, camera, relation)
-        if len(tracks) < _KEYFRAMES_TO_MEASURE and any(not one.usual for one in found.findings):
-            found = Diagnosis(
-                untold=[f"too few keyframes to measure how camera {camera} is off its place"], rows=found.rows
-            )
+        why = "too many outliers" if relation.share < AGREED else "too few keyframes"
+        if (len(tracks) < _KEYFRAMES_TO_MEASURE or relation.share < AGREED) and not found.usual:
+            found = Diagnosis(untold=[f"{why} to measure how camera {camera} is off its place"], rows=found.rows)
         outcome.add(found)
     return outcome
 
@@ -262,6 +274,8 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     if named:
         evidence = f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, so {best:.0f}"
         return Diagnosis([_finding(named, evidence)], rows=rows)
+    if not agreed(usable):
+        return Diagnosis(untold=["too many outliers to tell how the poses are off the tracks"], rows=rows)
     return _unnamed(given, usable, now, rows, tell)
 
 

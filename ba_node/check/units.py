@@ -11,7 +11,7 @@ import numpy as np
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import as_given
-from ba_node.check.relations import Relation, rays, relate, spread
+from ba_node.check.relations import AGREED, Relation, agreed, rays, relate, spread
 from ba_node.check.two_view import Pose
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ _PAIRS = 4
 # Factors of a depth and of a length beyond which they are wrong: the front-end's steps are no better.
 _DEPTH_FACTOR = 1.5
 _LENGTH_FACTOR = 1.3
+# Factors beyond which they are wrong whatever the share of outliers.
+_GROSS = 5.0
 # A factor is named if depths agree on it to this share (median deviation of its logarithm).
 _AGREE = 0.35
 _UNITS = (
@@ -95,6 +97,8 @@ def check_ids(tracks: Tracks) -> Diagnosis:
     rows += [Row("ids", "of the last keyframes that the first had too", persist)]
     if rows[1].share >= _LOST * rows[0].share or persist < _PERSIST:
         return Diagnosis(sound=["tracks keep their ids"], rows=rows)
+    if rows[0].share < AGREED:
+        return Diagnosis(untold=["too many outliers to judge ids"], rows=rows)
     evidence = (
         f"{rows[0].share:.0%} of the tracks agree from one keyframe to the next, {rows[1].share:.0%} over {_FAR},"
         f" and {persist:.0%} of the ids of the first keyframes are in the last"
@@ -103,6 +107,7 @@ def check_ids(tracks: Tracks) -> Diagnosis:
         ("ids reused: the same track_id stands for several points",),
         evidence,
         ("track_id in the feature_tracks: a new id for each point, never one of an ended track",),
+        harmful=False,
     )
     return Diagnosis([finding], rows=rows)
 
@@ -120,7 +125,8 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     factor, spread_of = float(np.exp(np.median(ratio))), _deviation(ratio)
     rows = [Row("depth", f"measured over triangulated: {factor:.4g}", 1.0)]
     given, found = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    if _deviation(np.log(given * found)) < 0.5 * _deviation(np.log(given / found)):
+    many_outliers = not agreed(relations)
+    if not many_outliers and _deviation(np.log(given * found)) < 0.5 * _deviation(np.log(given / found)):
         inverse = float(np.exp(np.median(np.log(given * found))))
         cause = f"depth_m holds inverse depths: it falls as depth grows (their product is {inverse:.3g})"
         return Diagnosis([_depth_finding(cause, f"against {by}")], rows=rows)
@@ -128,6 +134,8 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         return Diagnosis(untold=[f"depths contradict {by}"], rows=rows)
     if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
         return Diagnosis(sound=[f"depths fit {by} (to {abs(factor - 1.0):.0%})"], rows=rows)
+    if many_outliers and 1.0 / _GROSS < factor < _GROSS:
+        return Diagnosis(untold=["too many outliers to compare depths with steps"], rows=rows)
     cause = f"depth_m {_unit(factor) or 'in another unit'}: it is {_times(factor)} what {by} tell"
     return Diagnosis([_depth_finding(cause, f"over {len(pairs)} pairs of keyframes")], rows=rows)
 
@@ -168,7 +176,10 @@ def check_lengths(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         if len(pairs) < _PAIRS:
             outcome.untold.append(f"too little parallax to compare the baseline of camera {camera} with steps")
             continue
-        outcome.add(_lengths(tracks, camera, float(np.linalg.norm(baseline.translation)), pairs))
+        found = _lengths(tracks, camera, float(np.linalg.norm(baseline.translation)), pairs)
+        if found.findings and not agreed(relations):
+            found = Diagnosis(untold=[f"too many outliers to measure the baseline of camera {camera}"], rows=found.rows)
+        outcome.add(found)
     return outcome
 
 

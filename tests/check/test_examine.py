@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from ba_node.check.examine import examine
-from ba_node.check.tracks import Tracks
+from ba_node.check.tracks import Tracks, tracks_of
+from ba_node.config import Config
+from ba_node.scene.scene import Scene
+from ba_node.synthetic.faults import spoiled
 from tests.check.set_ups import recording, seen
 
 # Mistake -> modes in which it shows, and what the likely mistake says.
@@ -58,7 +61,7 @@ CASES = [(wrong, mode) for wrong, (modes, _) in NAMED.items() for mode in modes]
 def test_mistake_is_named(wrong: str, mode: str) -> None:
     found = examine(seen(recording(wrong=wrong, mode=mode)))
     assert re.search(NAMED[wrong][1], found.causes()), found.summary()
-    assert found.harmful == (not wrong.startswith("stamps"))
+    assert found.harmful == (wrong != "slots" and not wrong.startswith("stamps"))
     assert all(finding.changes for finding in found.findings)
 
 
@@ -141,3 +144,31 @@ def test_tracks_without_rays_are_left_out() -> None:
     for rows in tracks.images.values():
         assert np.isfinite(tracks.ray[rows]).all()
         assert (np.diff(tracks.track[rows]) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "rig", "share", "seed"),
+    [
+        ("outliers_uniform", "stereo", 0.5, 0),
+        ("outliers_uniform", "rgbd", 0.2, 0),
+        ("outliers_jumping", "mono", 0.5, 0),
+        ("outliers_moving", "stereo", 0.3, 0),
+        ("outliers_moving", "stereo", 0.4, 0),
+        ("outliers_moving", "stereo", 0.5, 0),
+        ("outliers_moving", "rgbd", 0.4, 0),
+    ],
+)
+def test_outliers_are_no_mistake_of_the_set_up(kind: str, rig: str, share: float, seed: int) -> None:
+    drift = {"drift_rotation_deg": 0.5, "drift_translation": 0.03}
+    size = {"keyframes": 60, "length_m": 30.0, "path": "loop", "tracks": 200, "landmarks": 3000, "outlier_share": 0.0}
+    data = spoiled(kind, rig, share, seed, **drift, **size)
+    scene, due = Scene(Config().scene), [10, 15, 25]
+    for _, _, measurement in data.timeline:
+        scene.add(measurement)
+        if due and len(scene.keyframes) > due[0]:
+            tracks = tracks_of(scene)
+            assert tracks is not None
+            found = examine(tracks)
+            assert not found.harmful, f"{due[0]} keyframes: {found.summary()}"
+            due = due[1:]
+    assert not due
