@@ -55,6 +55,8 @@ _BETTER = 0.5
 # Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
 # is estimated, and nothing but the usual mistakes of placement is told.
 AGREED = 0.7
+# ... unless the given relation of two cameras explains less than this share of what the best does.
+_CLEAR = 0.5
 
 
 @dataclass(frozen=True)
@@ -165,8 +167,9 @@ def check_cameras(tracks: Tracks) -> Diagnosis:
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             continue
         found = _check_camera(given, camera, relation)
-        why = "too many outliers" if relation.share < AGREED else "too few keyframes"
-        if (len(tracks) < _KEYFRAMES_TO_MEASURE or relation.share < AGREED) and not found.usual:
+        unclear = relation.share < AGREED and found.rows[0].share > _CLEAR * relation.share
+        why = "too many outliers" if unclear else "too few keyframes"
+        if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
             found = Diagnosis(untold=[f"{why} to measure how camera {camera} is off its place"], rows=found.rows)
         outcome.add(found)
     return outcome
