@@ -352,5 +352,6 @@ def test_bad_factors_are_named(make_problem: Make) -> None:
         "scale": {"loss_scale": 0.0},
     }
     for text, fields in bad.items():
+        wrong = dataclasses.replace(good, **fields)  # type: ignore[arg-type]
         with pytest.raises(ProblemError, match=text):
-            dataclasses.replace(problem, factors=(dataclasses.replace(good, **fields),)).check()  # type: ignore[arg-type]
+            dataclasses.replace(problem, factors=(wrong,)).check()

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import rclpy
 
+from ba_node.core import geometry
 from ba_node.messages.factory import header_message, pose_message
 from ba_node.ros import adapter, qos
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -65,7 +66,11 @@ def test_the_python_example_feeds_the_node(start_node: StartNode, make_peer: Mak
                 array.array(code, values.tolist())
                 for code, values in (("Q", image.track_id), ("f", image.uv[:, 0]), ("f", image.uv[:, 1]))
             )
-            pose = keyframe.position.tolist(), keyframe.orientation.tolist()
+            # Without a rig the camera is the body.
+            place = mono.rig.position[0], geometry.matrix_from_quaternion(mono.rig.orientation[0])
+            turn = geometry.matrix_from_quaternion(keyframe.orientation)
+            turn, at = geometry.compose(turn, keyframe.position, place[1], place[0])
+            pose = at.tolist(), geometry.quaternion_from_matrix(turn).tolist()
             front_end.send(keyframe.keyframe_id, stamp, *pose, ids, u, v)
         wanted = set(range(len(mono.keyframes)))
         peer.until(lambda: _refined(peer) >= wanted, f"keyframes {sorted(wanted)}")
