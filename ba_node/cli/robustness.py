@@ -36,9 +36,11 @@ def run(args: argparse.Namespace) -> int:
     """Run what is missing and write the page."""
     from ba_node.offline.robustness.page import page  # noqa: PLC0415
     from ba_node.offline.robustness.plots import draw  # noqa: PLC0415
-    from ba_node.offline.robustness.runs import run_all, tasks, write_rows  # noqa: PLC0415
+    from ba_node.offline.robustness.runs import NameChoiceError, run_all, tasks, write_rows  # noqa: PLC0415
 
-    wanted = tasks(max(1, args.seeds), args.only)
+    if args.seeds < 1:
+        raise NameChoiceError(f"--seeds {args.seeds}: expected 1 or more")
+    wanted = tasks(args.seeds, args.only)
     with progress_bar("robustness", "recordings") as progress:
         rows = run_all(wanted, args.out, max(1, args.jobs), progress)
     text = page(rows)

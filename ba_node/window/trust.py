@@ -113,5 +113,5 @@ class Trust:
         new, self.blamed = set(without) - self.blamed, set(without)
         self.doubt = min(self.doubt + _HELD * len(new), _MAX_DOUBT) if new else max(self.doubt - 1, 0)
         if self.doubt > _ENOUGH:
-            return f"{self.doubt - _ENOUGH} more solves have to pass first, as of one before it was said: {self.cause}"
+            return f"{self.cause} (this was found before; {self.doubt - _ENOUGH} more solves have to pass)"
         return ""
