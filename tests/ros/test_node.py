@@ -20,8 +20,9 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo
 
 from ba_node.config import Config
+from ba_node.core import geometry
 from ba_node.estimate import Status
-from ba_node.measurements import Keyframe
+from ba_node.measurements import CameraRig, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.conversion import OUTPUT_TYPES
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -37,6 +38,17 @@ KEYFRAMES = 12
 @pytest.fixture(scope="module")
 def scene() -> SyntheticData:
     return generate(SyntheticOptions(seed=3, keyframes=KEYFRAMES, length_m=12.0, path="line", outlier_share=0.0))
+
+
+def _of_camera(keyframe: Keyframe, rig: CameraRig) -> Keyframe:
+    """Return a keyframe with the pose of camera 0, which is the body where there is no rig."""
+    turn, at = geometry.compose(
+        geometry.matrix_from_quaternion(keyframe.orientation),
+        keyframe.position,
+        geometry.matrix_from_quaternion(rig.orientation[0]),
+        rig.position[0],
+    )
+    return dataclasses.replace(keyframe, position=at, orientation=geometry.quaternion_from_matrix(turn))
 
 
 def _refined_ids(peer: Any) -> set[int]:
@@ -222,7 +234,7 @@ def test_a_camera_driver_is_heard(
     info = conversion.rig_message(RclpyFactory(), mono.rig, 0).cameras[0]
     timer = peer.node.create_timer(0.03, lambda: camera.publish(info))
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
-        peer.publish(measurement, stamp_ns)
+        peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in mono.keyframes}
     peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
     peer.node.destroy_timer(timer)
