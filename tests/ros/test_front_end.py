@@ -164,7 +164,8 @@ ADAPTER = "import sys\nfrom ba_node.ros.adapter import main\nsys.exit(main())"
 
 
 def test_feature_clouds_and_odometry_reach_the_node(start_node: StartNode, make_peer: MakePeer) -> None:
-    scene = generate(SyntheticOptions(seed=3, keyframes=6, length_m=12.0, path="line", outlier_share=0.0))
+    size: dict[str, Any] = {"keyframes": 8, "length_m": 10.0, "landmarks": 4000, "tracks": 200}
+    scene = generate(SyntheticOptions(seed=3, path="line", outlier_share=0.0, **size))
     node, converter, peer = start_node(), start_node(python=ADAPTER), make_peer()
     peer.listen("report", "refined_keyframes")
     profile = qos.reliable(100)
