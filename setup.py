@@ -32,9 +32,9 @@ def extensions() -> list[Extension]:
         flags.append("-march=native")
     kernels = Extension(
         f"{NAME}.native._kernels",
-        sources=[str(sources / "module.cpp")],
-        depends=[str(path) for path in sorted(sources.glob("*.hpp"))],
-        include_dirs=[pybind11.get_include()],
+        sources=[str(sources / "bindings" / "module.cpp")],
+        depends=[str(path) for path in sorted(sources.rglob("*.hpp"))],
+        include_dirs=[str(sources), pybind11.get_include()],
         extra_compile_args=flags,
         language="c++",
         # A compiler that fails leaves a package without kernels.

@@ -9,8 +9,8 @@
 #include <cmath>
 #include <cstdint>
 
-#include "blocks.hpp"
-#include "memory.hpp"
+#include "linalg/blocks.hpp"
+#include "parallel/memory.hpp"
 
 namespace ba {
 

@@ -7,8 +7,8 @@
 #include <cstdint>
 #include <limits>
 
-#include "equations.hpp"
-#include "rows.hpp"
+#include "adjustment/equations.hpp"
+#include "adjustment/rows.hpp"
 
 namespace ba {
 

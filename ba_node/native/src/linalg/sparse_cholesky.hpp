@@ -13,9 +13,9 @@
 #include <utility>
 #include <vector>
 
-#include "block_fill.hpp"
-#include "blocks.hpp"
-#include "simd.hpp"
+#include "linalg/block_fill.hpp"
+#include "linalg/blocks.hpp"
+#include "simd/simd.hpp"
 
 namespace ba {
 

@@ -7,7 +7,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "simd.hpp"
+#include "simd/simd.hpp"
 
 namespace ba {
 

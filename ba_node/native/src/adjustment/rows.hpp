@@ -11,9 +11,9 @@
 #include <type_traits>
 #include <vector>
 
-#include "layout.hpp"
-#include "project.hpp"
-#include "simd.hpp"
+#include "adjustment/layout.hpp"
+#include "adjustment/project.hpp"
+#include "simd/simd.hpp"
 
 namespace ba {
 

@@ -14,9 +14,9 @@
 #include <cstring>
 #include <type_traits>
 
-#include "memory.hpp"
-#include "pool.hpp"
-#include "simd.hpp"
+#include "parallel/memory.hpp"
+#include "parallel/pool.hpp"
+#include "simd/simd.hpp"
 
 namespace ba {
 

@@ -14,9 +14,9 @@
 #include <cstdint>
 #include <numeric>
 
-#include "memory.hpp"
-#include "project.hpp"
-#include "simd.hpp"
+#include "parallel/memory.hpp"
+#include "adjustment/project.hpp"
+#include "simd/simd.hpp"
 
 namespace ba {
 

@@ -9,7 +9,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "layout.hpp"
+#include "adjustment/layout.hpp"
 
 namespace ba {
 

@@ -8,7 +8,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "layout.hpp"
+#include "adjustment/layout.hpp"
 
 namespace ba {
 

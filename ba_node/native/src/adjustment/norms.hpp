@@ -9,9 +9,9 @@
 #include <cstdint>
 #include <limits>
 
-#include "layout.hpp"
-#include "project.hpp"
-#include "rows.hpp"
+#include "adjustment/layout.hpp"
+#include "adjustment/project.hpp"
+#include "adjustment/rows.hpp"
 
 namespace ba {
 

@@ -8,10 +8,10 @@
 #include <cstdint>
 #include <vector>
 
-#include "blocks.hpp"
-#include "equations.hpp"
-#include "layout.hpp"
-#include "rows.hpp"
+#include "linalg/blocks.hpp"
+#include "adjustment/equations.hpp"
+#include "adjustment/layout.hpp"
+#include "adjustment/rows.hpp"
 
 namespace ba {
 

@@ -7,8 +7,8 @@
 #include <cstdint>
 #include <cstring>
 
-#include "memory.hpp"
-#include "simd.hpp"
+#include "parallel/memory.hpp"
+#include "simd/simd.hpp"
 
 namespace ba {
 

@@ -9,7 +9,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "triangulate.hpp"
+#include "adjustment/triangulate.hpp"
 
 namespace ba {
 

@@ -13,18 +13,18 @@
 #include <utility>
 #include <vector>
 
-#include "blocks.hpp"
-#include "cholesky.hpp"
-#include "coupling.hpp"
-#include "equations.hpp"
-#include "layout.hpp"
-#include "pcg.hpp"
-#include "polish.hpp"
-#include "pool.hpp"
-#include "retract.hpp"
-#include "rows.hpp"
-#include "sparse_cholesky.hpp"
-#include "sparse_schur.hpp"
+#include "linalg/blocks.hpp"
+#include "linalg/cholesky.hpp"
+#include "adjustment/coupling.hpp"
+#include "adjustment/equations.hpp"
+#include "adjustment/layout.hpp"
+#include "linalg/pcg.hpp"
+#include "adjustment/polish.hpp"
+#include "parallel/pool.hpp"
+#include "adjustment/retract.hpp"
+#include "adjustment/rows.hpp"
+#include "linalg/sparse_cholesky.hpp"
+#include "adjustment/sparse_schur.hpp"
 
 namespace ba {
 

@@ -9,11 +9,11 @@
 #include <utility>
 #include <vector>
 
-#include "consensus.hpp"
-#include "kernel.hpp"
-#include "norms.hpp"
-#include "relative_poses.hpp"
-#include "triangulate.hpp"
+#include "adjustment/consensus.hpp"
+#include "adjustment/kernel.hpp"
+#include "adjustment/norms.hpp"
+#include "adjustment/relative_poses.hpp"
+#include "adjustment/triangulate.hpp"
 
 namespace py = pybind11;
 

@@ -9,11 +9,11 @@
 #include <limits>
 #include <vector>
 
-#include "block_fill.hpp"
-#include "blocks.hpp"
-#include "coupling.hpp"
-#include "layout.hpp"
-#include "pool.hpp"
+#include "linalg/block_fill.hpp"
+#include "linalg/blocks.hpp"
+#include "adjustment/coupling.hpp"
+#include "adjustment/layout.hpp"
+#include "parallel/pool.hpp"
 
 namespace ba {
 

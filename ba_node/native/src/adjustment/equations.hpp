@@ -10,10 +10,10 @@
 #include <utility>
 #include <vector>
 
-#include "blocks.hpp"
-#include "layout.hpp"
-#include "pool.hpp"
-#include "rows.hpp"
+#include "linalg/blocks.hpp"
+#include "adjustment/layout.hpp"
+#include "parallel/pool.hpp"
+#include "adjustment/rows.hpp"
 
 namespace ba {
 
