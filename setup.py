@@ -90,7 +90,7 @@ setup(
     entry_points={
         "console_scripts": [
             "ba = ba_node.cli.main:main",
-            "ba_adapter = ba_node.ros.adapter:main",
+            "ba_adapter = ba_node.ros.tools.adapter:main",
             "ba_node = ba_node.ros.main:main",
         ],
         # So that the linter ament_copyright understands the second line of this file.

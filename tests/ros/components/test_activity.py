@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ba_node.estimate import SolveReport, Status
-from ba_node.ros.activity import Activity
+from ba_node.ros.components.activity import Activity
 
 REPORT = SolveReport(
     status=Status.CONVERGED, rms_px_after=0.434, inlier_share=0.97, latency_p50_s=0.021, latency_p95_s=0.04

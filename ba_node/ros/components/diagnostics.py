@@ -17,7 +17,7 @@ from ba_node.messages.conversion import INPUT_TYPES
 from ba_node.messages.diagnostics import Health, diagnose, diagnostics_message
 from ba_node.messages.topics import SHARED_TYPES
 from ba_node.ros import qos
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
 
 if TYPE_CHECKING:

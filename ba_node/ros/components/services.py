@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 from ba_node.io.map_file import MapFileError, load_map, write_map
 from ba_node.io.map_folder import MapPathError, path_in_folder
 from ba_node.messages.commands import SERVICE_TYPES
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
-from ba_node.ros.relay import LateService, Owed
+from ba_node.ros.rclpy_compat.deferred import LateService, Owed
 
 if TYPE_CHECKING:
     from collections.abc import Callable

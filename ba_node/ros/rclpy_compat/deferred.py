@@ -27,7 +27,7 @@ from ba_node.ros.log import Severity, fault, log, printable
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from ba_node.ros.component import Component, Host
+    from ba_node.ros.components.base import Component, Host
 
     # Sends success, message and further fields of an answer, on the executor's thread.
     Send = Callable[[bool, str, dict[str, Any]], None]

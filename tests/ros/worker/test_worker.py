@@ -15,8 +15,8 @@ import pytest
 from ba_node.config import Config
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import Keyframe, Measurement
-from ba_node.ros.inbox import Inbox
-from ba_node.ros.worker import Account, Notice, Output, Worker
+from ba_node.ros.worker.inbox import Inbox
+from ba_node.ros.worker.worker import Account, Notice, Output, Worker
 
 
 class FakeBackend:

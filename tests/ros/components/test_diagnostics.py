@@ -13,7 +13,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from ba_node.ros import qos
-from ba_node.ros.diagnostics import _resident_mb, _since
+from ba_node.ros.components.diagnostics import _resident_mb, _since
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 StartNode = Callable[..., Any]

@@ -23,7 +23,7 @@ MakePeer = Callable[..., Any]
 TELLING = """
 import sys
 from ba_node.window import extras
-from ba_node.ros import publishing
+from ba_node.ros.components import publishing
 
 def telling(name):
     work = getattr(extras, name)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ba_node.check.diagnosis import Diagnosis
-    from ba_node.ros.inbox import Inbox
+    from ba_node.ros.worker.inbox import Inbox
     from ba_node.scene.scene import Scene
 
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
-from ba_node.ros.answering import answering
 from ba_node.ros.log import Severity, log
+from ba_node.ros.rclpy_compat.answering import answering
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ from rclpy.clock import Clock, ClockType
 from ba_node.messages.topics import SHARED_TYPES
 from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Severity, log
 

@@ -23,13 +23,14 @@ import rclpy
 
 from ba_node.core import geometry
 from ba_node.messages.factory import header_message, pose_message
-from ba_node.ros import adapter, qos
+from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.tools import adapter
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 STUBS = Path(__file__).resolve().parent / "stubs"
 FACTORY = RclpyFactory()
 StartNode = Callable[..., Any]
@@ -160,7 +161,7 @@ def _send_as_vins(features: Any, odometry: Any, scene: SyntheticData) -> None:
         odometry.publish(_odometry(keyframe))
 
 
-ADAPTER = "import sys\nfrom ba_node.ros.adapter import main\nsys.exit(main())"
+ADAPTER = "import sys\nfrom ba_node.ros.tools.adapter import main\nsys.exit(main())"
 
 
 def test_feature_clouds_and_odometry_reach_the_node(start_node: StartNode, make_peer: MakePeer) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.ros.inbox import Inbox
+from ba_node.ros.worker.inbox import Inbox
 
 
 def _tracks(number: int) -> FeatureTracks:

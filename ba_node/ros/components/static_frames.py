@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from ba_node.messages.topics import SHARED_TYPES, TF_STATIC
 from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, log
-from ba_node.ros.worker import Notice
+from ba_node.ros.worker.worker import Notice
 
 if TYPE_CHECKING:
     from ba_node.measurements import CameraRig

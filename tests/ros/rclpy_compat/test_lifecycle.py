@@ -170,7 +170,7 @@ def test_transitions_during_a_solve(start_node: StartNode, make_peer: MakePeer, 
 
 BROKEN = """
 import sys
-from ba_node.ros import publishing
+from ba_node.ros.components import publishing
 
 configure, activate = publishing.Publishing.__init__, publishing.Publishing.activate
 broken = {"configure", "activate"}

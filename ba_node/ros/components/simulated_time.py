@@ -8,8 +8,8 @@ import time
 
 from rclpy.clock import Clock, ClockType
 
-from ba_node.ros.component import Component, Host
-from ba_node.ros.worker import Notice
+from ba_node.ros.components.base import Component, Host
+from ba_node.ros.worker.worker import Notice
 
 _TOPIC = "/clock"
 _CHECK_S = 0.5

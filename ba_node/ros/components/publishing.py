@@ -12,16 +12,16 @@ from ba_node.estimate import SolveReport, Status
 from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
 from ba_node.messages.outputs import report_message
 from ba_node.ros import qos
-from ba_node.ros.activity import Activity
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.activity import Activity
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
-from ba_node.ros.latency import Sliding
 from ba_node.ros.log import Severity, log
 from ba_node.ros.throttle import Throttle
+from ba_node.ros.worker.latency import Sliding
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate
-    from ba_node.ros.worker import Account
+    from ba_node.ros.worker.worker import Account
 
 _LOG_PERIOD_S = 5.0
 # Leave first; their age is in the report that follows.

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import Empty
 
-from ba_node.ros.executor import EVENT_PERIOD_S, NodeExecutor
+from ba_node.ros.rclpy_compat.executor import EVENT_PERIOD_S, NodeExecutor
 
 
 class Spun:

@@ -28,7 +28,7 @@ from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
-from ba_node.ros.play import Listener, PlayError, PlayOptions, PlaySummary, play
+from ba_node.ros.tools.play import Listener, PlayError, PlayOptions, PlaySummary, play
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 MakePeer = Callable[..., Any]
@@ -154,7 +154,7 @@ def test_a_type_that_is_not_installed_is_skipped(
             raise LookupError(f"message type {type_name!r} is not known")
         return message_class(type_name)
 
-    monkeypatch.setattr("ba_node.ros.play.message_class", lookup)
+    monkeypatch.setattr("ba_node.ros.tools.play.message_class", lookup)
     peer = make_peer()
     peer.node.create_subscription(message_class(INPUT_TYPES["keyframes"]), "keyframes", lambda _: None, qos.lossless())
     notices: list[str] = []

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.estimate import Estimate, SolveReport
     from ba_node.measurements import CameraRig
-    from ba_node.ros.inbox import Inbox
-    from ba_node.ros.relay import Relay
-    from ba_node.ros.worker import Account, Notice, Worker
+    from ba_node.ros.rclpy_compat.deferred import Relay
+    from ba_node.ros.worker.inbox import Inbox
+    from ba_node.ros.worker.worker import Account, Notice, Worker
 
 
 @dataclass

@@ -11,8 +11,8 @@ from rclpy.clock import Clock, ClockType
 
 from ba_node.messages.conversion import INPUT_TYPES
 from ba_node.ros import qos
-from ba_node.ros.component import Component, Host
-from ba_node.ros.worker import Notice
+from ba_node.ros.components.base import Component, Host
+from ba_node.ros.worker.worker import Notice
 
 _CHECK_S = 0.5
 _NEEDED = ("keyframes", "feature_tracks")

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.ros.latency import WINDOW, Sliding
+from ba_node.ros.worker.latency import WINDOW, Sliding
 
 
 @given(st.lists(st.floats(0.0, 1e3), min_size=1, max_size=150))

@@ -11,7 +11,7 @@ from ba_node.messages.markers import marker_array, no_markers
 from ba_node.messages.topics import SIDE_TYPES
 from ba_node.messages.transforms import covariance_messages
 from ba_node.ros import qos
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory, message_class
 
 if TYPE_CHECKING:

@@ -19,16 +19,16 @@ from typing import TYPE_CHECKING
 
 from ba_node.estimate import Estimate, SolveReport, Status
 from ba_node.measurements import Keyframe
-from ba_node.ros.lag import Lag
-from ba_node.ros.latency import Budget
-from ba_node.ros.ledger import Ledger
+from ba_node.ros.worker.keyframe_accounts import Ledger
+from ba_node.ros.worker.lag import Lag
+from ba_node.ros.worker.latency import Budget
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ba_node.backend import Backend
     from ba_node.core.result import Iteration
-    from ba_node.ros.inbox import Arrival, Inbox
+    from ba_node.ros.worker.inbox import Arrival, Inbox
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
 _MAX_OUTPUTS = 20

@@ -25,10 +25,10 @@ from rclpy.qos import QoSProfile
 from ba_node.core.methods import METHODS
 from ba_node.core.result import Status
 from ba_node.messages.commands import ACTION_TYPES
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
-from ba_node.ros.relay import CLEANED_UP, Owed
+from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Owed
 from ba_node.window import full, quality
 
 if TYPE_CHECKING:

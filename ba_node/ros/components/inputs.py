@@ -12,9 +12,9 @@ from typing import Any
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
 from ba_node.ros import qos
-from ba_node.ros.component import Component, Host
+from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
-from ba_node.ros.worker import Notice
+from ba_node.ros.worker.worker import Notice
 
 
 class Inputs(Component):
