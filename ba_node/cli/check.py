@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from ba_node.cli.console import require_folder, table
 
 if TYPE_CHECKING:
-    from ba_node.check.diagnosis import Diagnosis, Row
+    from ba_node.backend import Diagnosis, Row
 
 SUMMARY = "find out from the tracks whether the set-up is what it is said to be"
 EXAMPLE = "ba check bags/stereo_loop.mcap"
