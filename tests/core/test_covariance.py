@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from ba_node.core import covariance, geometry, matrix_forms, methods, objective, solver
+from ba_node.core import covariance, geometry, methods, objective, solver
 from ba_node.core.objective import Objective, Rules
 from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Observations, Problem, State
+from experiments.thesis import matrix_forms
 
 MakeProblem = Callable[..., tuple[Problem, State]]
 
