@@ -13,11 +13,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.benchmarks import problems, solvers, suite
+from experiments.benchmarks import plots, problems, solvers, suite
 from experiments.benchmarks.floor import Peak, measure
-from experiments.benchmarks.plots import draw_growth, draw_profiles, fit_growth
 from experiments.benchmarks.process import Limits
 from experiments.benchmarks.report import overview, problem_section
+from experiments.figures import png
 
 _EPILOG = "Problems, solvers, rules and how to read the tables: docs/performance.md"
 
@@ -97,10 +97,10 @@ def _machine() -> str:
 
 def _write(out: Path, comparisons: list[suite.Comparison], absent: list[str], peak: Peak) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    growth = fit_growth(comparisons)
     common: dict[str, Any] = {"machine": _machine(), "peak": peak.__dict__, "absent": absent}
     (out / "runs.json").write_text(json.dumps({**common, "problems": [c.as_dict() for c in comparisons]}))
     short = [{k: v for k, v in c.as_dict().items() if k != "solvers"} | {"solvers": c.medians()} for c in comparisons]
+    growth = plots.fit_growth(short, [c.problem.family for c in comparisons])
     versions = {r.solver: one.version for c in comparisons for r in c.results for one in r.runs if one.trace}
     summary = {**common, "versions": versions, "problems": short, "growth": growth}
     (out / "summary.json").write_text(json.dumps(_finite(summary), indent=1) + "\n")
@@ -108,8 +108,9 @@ def _write(out: Path, comparisons: list[suite.Comparison], absent: list[str], pe
     sections = "\n".join(problem_section(comparison) for comparison in comparisons)
     (out / "report.md").write_text(f"## Against the fastest peer\n\n{text}\n\n## Problems\n\n{sections}")
     if comparisons:
-        draw_profiles(comparisons, out / "profiles.png")
-        draw_growth(growth, out / "growth.png")
+        (out / "profiles.png").write_bytes(png(plots.profiles(short)))
+    if growth:
+        (out / "growth.png").write_bytes(png(plots.growth(growth)))
     print(f"{text}\n\nwritten to {os.path.relpath(out)}")
 
 

@@ -1,59 +1,92 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Plots of a comparison: performance profiles, and growth of time and memory with size."""
+"""Plots of a comparison: performance profiles, and growth of time and memory with size.
+
+``python -m experiments.benchmarks.plots SUMMARY.json DIR`` draws them again from what a run has recorded.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-
-mpl.use("Agg")
-
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from experiments.benchmarks import metrics
-from experiments.benchmarks.suite import Comparison
+from experiments.figures import curve, new_figure, png
+
+# By problem: figures of a summary, and figures by solver.
+Problems = Sequence[Mapping[str, Any]]
 
 _TITLES = {
-    **{f"tau {tau:.0e}": f"f_best + {tau:g} (f_0 - f_best)" for tau in metrics.TAUS},
-    **{f"gap {gap:.0e}": f"within {100.0 * gap:g} % of f_best" for gap in metrics.GAPS},
+    "tau 1e-02": "f_best + 0.01 (f_0 - f_best)",
+    "tau 1e-04": "f_best + 0.0001 (f_0 - f_best)",
+    "gap 1e-03": "within 0.1 % of f_best",
+    "gap 1e-06": "within 0.0001 % of f_best",
+}
+_OURS = ("ba_node", "ba_node 2 threads")
+# Solvers that are drawn in one plot, beside ours: those whose names begin so, and all others.
+_GROUPS = (("ceres", "pycolmap"), ("rootba",), ("",))
+_QUANTITIES: dict[str, Callable[[Mapping[str, float]], float]] = {
+    "s to within 0.01 %": lambda row: row["gap 1e-04"],
+    "MB above the start": lambda row: row["peak_mb"] - row["start_mb"],
 }
 
 
-def draw_profiles(comparisons: Sequence[Comparison], path: Path) -> None:
-    """Draw, for each target, the share of problems solved within a factor of the fastest."""
-    medians = [comparison.medians() for comparison in comparisons]
+def groups(solvers: Sequence[str]) -> list[list[str]]:
+    """Return the solvers in groups that a plot can show, ours in each."""
+    ours = [name for name in _OURS if name in solvers]
+    left = [name for name in solvers if name not in _OURS]
+    out = []
+    for begins in _GROUPS:
+        chosen = [name for name in left if name.startswith(begins)]
+        left = [name for name in left if name not in chosen]
+        if chosen:
+            out.append(ours + chosen)
+    return out or [ours]
+
+
+def profiles(problems: Problems) -> Figure:
+    """Draw, for each target, the share of problems solved within a factor of the fastest of all solvers."""
+    medians = [problem["solvers"] for problem in problems]
     solvers = list(dict.fromkeys(name for row in medians for name in row))
-    figure, axes = plt.subplots(2, 4, figsize=(16, 7), sharey=True, layout="constrained")
-    for axis, (key, title) in zip(axes.flat, _TITLES.items(), strict=True):
+    rows = groups(solvers)
+    figure = new_figure(16.0, 3.6 * len(rows), dpi=110)
+    axes = figure.subplots(len(rows), len(_TITLES), sharey=True, squeeze=False)
+    for column, (key, title) in zip(axes.T, _TITLES.items(), strict=True):
         times = {name: [row.get(name, {}).get(key, math.nan) for row in medians] for name in solvers}
-        for name, (ratios, share) in metrics.profile(times).items():
-            if ratios:
-                steps = [1.0, *ratios, 1e3], [0.0, *share, share[-1]]
-                axis.step(*steps, where="post", label=name, **_style(solvers.index(name)))
-        axis.set(title=title, xscale="log", xlim=(1.0, 1e3), ylim=(0.0, 1.05), xlabel="factor over the fastest")
-        axis.grid(visible=True, alpha=0.3)
-    axes[0, 0].set_ylabel("share of problems")
-    axes[1, 0].set_ylabel("share of problems")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", fontsize="small")
-    _save(figure, path)
+        found = metrics.profile(times)
+        for axis, group in zip(column, rows, strict=True):
+            for index, name in enumerate(group):
+                ratios, share = found[name]
+                if ratios:
+                    steps = [1.0, *ratios, 1e3], [0.0, *share, share[-1]]
+                    axis.step(*steps, where="post", label=name, **curve(index))
+            axis.set(title=title, xscale="log", xlim=(1.0, 1e3), ylim=(0.0, 1.05), xlabel="factor over the fastest")
+            axis.grid(visible=True, alpha=0.3)
+    for line in axes:
+        line[0].set_ylabel("share of problems")
+        fullest = max(line, key=lambda axis: len(axis.lines))
+        line[-1].legend(
+            *fullest.get_legend_handles_labels(), loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=4.0
+        )
+    return figure
 
 
-def fit_growth(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
+def fit_growth(problems: Problems, families: Sequence[str]) -> list[dict[str, Any]]:
     """Return, for each family, quantity and solver, sizes, values and the fitted ``c size^p``."""
     rows = []
-    for family in sorted({c.problem.family for c in comparisons if c.problem.family}):
-        members = [c for c in comparisons if c.problem.family == family]
-        medians = [comparison.medians() for comparison in members]
-        for name in dict.fromkeys(name for row in medians for name in row):
+    for family in sorted(set(families) - {""}):
+        members = [problem for problem, name in zip(problems, families, strict=True) if name == family]
+        for name in dict.fromkeys(name for member in members for name in member["solvers"]):
             for quantity, value in _QUANTITIES.items():
-                sizes = [float(c.counts[2]) for c in members]
-                values = [value(row[name]) if name in row else math.nan for row in medians]
+                sizes = [float(member["observations"]) for member in members]
+                values = [value(m["solvers"][name]) if name in m["solvers"] else math.nan for m in members]
                 known = [(s, v) for s, v in sorted(zip(sizes, values, strict=True)) if math.isfinite(v) and v > 0]
                 factor, exponent = metrics.growth([s for s, _ in known], [v for _, v in known])
                 if len(known) > 1:
@@ -64,39 +97,45 @@ def fit_growth(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     return rows
 
 
-_QUANTITIES: dict[str, Callable[[dict[str, float]], float]] = {
-    "s to within 0.01 %": lambda row: row["gap 1e-04"],
-    "MB above the start": lambda row: row["peak_mb"] - row["start_mb"],
-}
-
-
-def draw_growth(rows: Sequence[dict[str, Any]], path: Path) -> None:
+def growth(rows: Sequence[dict[str, Any]]) -> Figure:
     """Draw time and memory over the number of observations, with the fitted exponents."""
     families = sorted({row["family"] for row in rows})
-    if not families:
-        return
-    figure, axes = plt.subplots(
-        len(families), len(_QUANTITIES), figsize=(17, 5 * len(families)), squeeze=False, layout="constrained"
-    )
-    solvers = list(dict.fromkeys(row["solver"] for row in rows))
-    for line, family in zip(axes, families, strict=True):
-        for axis, quantity in zip(line, _QUANTITIES, strict=True):
-            for row in rows:
-                if (row["family"], row["quantity"]) == (family, quantity):
-                    x, y = zip(*row["points"], strict=True)
-                    style = _style(solvers.index(row["solver"]))
-                    axis.plot(x, y, marker="o", label=f"{row['solver']}: N^{row['exponent']:.2f}", **style)
-            axis.set(title=family, xscale="log", yscale="log", xlabel="observations N", ylabel=quantity)
+    parts = {
+        name: groups(list(dict.fromkeys(row["solver"] for row in rows if row["family"] == name))) for name in families
+    }
+    lines = [(family, quantity) for family in families for quantity in _QUANTITIES]
+    width = max((len(part) for part in parts.values()), default=1)
+    figure = new_figure(8.0 * width, 3.2 * max(1, len(lines)), dpi=110)
+    axes = figure.subplots(max(1, len(lines)), width, squeeze=False, sharey="row")
+    for line, (family, quantity) in zip(axes, lines, strict=False):
+        found = {row["solver"]: row for row in rows if (row["family"], row["quantity"]) == (family, quantity)}
+        for axis, group in zip(line, parts[family], strict=False):
+            for index, name in enumerate(group):
+                if name in found:
+                    x, y = zip(*found[name]["points"], strict=True)
+                    axis.plot(x, y, label=f"{name}: N^{found[name]['exponent']:.2f}", **curve(index))
+            axis.set(title=family, xscale="log", yscale="log", xlabel="observations N")
+            axis.xaxis.set_minor_formatter(NullFormatter())
             axis.grid(visible=True, which="both", alpha=0.3)
-            axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _save(figure, path)
+            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=4.0)
+        for axis in line[len(parts[family]) :]:
+            axis.set_visible(False)
+        line[0].set_ylabel(quantity)
+    return figure
 
 
-def _style(solver: int) -> dict[str, str]:
-    """Return colour and dashes by which the n-th solver is known from the others."""
-    return {"color": f"C{solver % 10}", "linestyle": ("-", "--", ":")[solver // 10 % 3]}
+def main() -> int:
+    """Draw the plots of a summary."""
+    source, out = Path(sys.argv[1]), Path(sys.argv[2])
+    summary = json.loads(source.read_text(), parse_constant=float)
+    for problem in summary["problems"]:
+        for row in problem["solvers"].values():
+            row |= {name: {"never": math.inf, None: math.nan}.get(value, value) for name, value in row.items()}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "bench_profiles.png").write_bytes(png(profiles(summary["problems"])))
+    (out / "bench_growth.png").write_bytes(png(growth(summary["growth"])))
+    return 0
 
 
-def _save(figure: Any, path: Path) -> None:
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(figure)
+if __name__ == "__main__":
+    sys.exit(main())

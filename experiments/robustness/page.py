@@ -27,10 +27,10 @@ _ABOUT_FAULTS = """## Faults
 ![Error published against error that came in, for every fault](images/robustness_faults.png)
 
 A drive of 20 m with good odometry (noise 0.5 px, 1 % outliers). **before** and **after**: translation RMSE of the
-front-end's poses and of what is published (se3 alignment), m, median over the seeds, the worst in brackets where it is
-twice as much. **verdict**, the worst of the seeds: *better* than what came in; *kept*, within 10 % and 5 mm of it (of
-the rotation: 10 % and 0.1 degrees); *refused*, nothing is published; *harm*. **named**: in how many of the runs the
-words for the user name the cause; a dash where there is nothing to say. Of sound recordings, how many gave no warning.
+front-end's poses and of what is published (se3 alignment), m{median}.
+**verdict**{worst}: *better* than what came in; *kept*, within 10 % and 5 mm of it (of the rotation: 10 % and 0.1
+degrees); *refused*, nothing is published; *harm*. **named**: in how many of the runs the words for the user name the
+cause; a dash where there is nothing to say. Of sound recordings, how many gave no warning.
 
 """
 _ABOUT_OUTLIERS = """## Outliers
@@ -38,9 +38,10 @@ _ABOUT_OUTLIERS = """## Outliers
 ![Error by share of outliers, for every rig and kind](images/robustness_outliers.png)
 
 A loop of 30 m, 60 keyframes, 200 tracks. Each figure is the error published, divided by that of the same recording
-without its outliers: the median over the seeds, the worst in brackets where it is twice as much. Bold where it misses
-the goal: 1.5 at 30 % and 3 at 50 % for outliers anywhere in the image and for tracks that jump to another point, 3 at
-30 % for points on moving objects. **before**: the error of the front-end's poses by the same measure.
+without its outliers{median}.
+Bold where it misses the goal: 1.5 at 30 % and 3 at 50 % for outliers anywhere in the image and for tracks that jump to
+another point, 3 at 30 % for points on moving objects. **before**: the error of the front-end's poses by the same
+measure.
 
 """
 
@@ -51,10 +52,24 @@ def page(rows: Sequence[Row]) -> str:
     outliers = [row for row in rows if row["table"] == OUTLIER_TABLE]
     parts = [_HEAD]
     if faults:
-        parts += [_summary(faults), _ABOUT_FAULTS, fault_table(faults)]
+        parts += [_summary(faults), _about(_ABOUT_FAULTS, faults), fault_table(faults)]
     if outliers:
-        parts += ["\n" * bool(faults), _ABOUT_OUTLIERS, outlier_table(outliers)]
+        parts += ["\n" * bool(faults), _about(_ABOUT_OUTLIERS, outliers), outlier_table(outliers)]
     return "".join(parts)
+
+
+def seeds(rows: Sequence[Row]) -> int:
+    """Return with how many seeds the recordings were made."""
+    return len({row["seed"] for row in rows})
+
+
+def _about(text: str, rows: Sequence[Row]) -> str:
+    """Say of how many recordings a figure tells."""
+    count = seeds(rows)
+    if count == 1:
+        return text.format(median=", of one recording each", worst="")
+    several = f", median of {count} recordings with other seeds, the worst in brackets where it is twice as much"
+    return text.format(median=several, worst=", the worst of them")
 
 
 def _summary(rows: Sequence[Row]) -> str:

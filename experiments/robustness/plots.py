@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from experiments.figures import COLOURS, new_figure, png
 from experiments.robustness.faults import FAULTS, RIGS, SOUND
-from experiments.robustness.page import grouped
+from experiments.robustness.page import grouped, seeds
 from experiments.robustness.runs import FAULT_TABLE, KINDS, OUTLIER_TABLE, Row
 
-# Okabe-Ito colours, told apart by colour-blind readers; markers and line styles say the same.
-_BEFORE, _AFTER, _BEST = "#D55E00", "#0072B2", "#000000"
+_BEFORE, _AFTER, _BEST = COLOURS[1], COLOURS[0], COLOURS[-1]
 # Shown for an error of zero, m.
 _FLOOR = 1e-4
 
@@ -28,30 +28,18 @@ def draw(folder: Path, rows: Sequence[Row]) -> list[Path]:
         if some:
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / f"robustness_{name}.png"
-            plot(some).savefig(path, metadata={"Software": None})
+            path.write_bytes(png(plot(some)))
             written.append(path)
     return written
-
-
-def _figure(width: float, height: float) -> Any:
-    # Slow to import, and needed here only; the canvas is Agg, so no display is asked for.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _faults(rows: Sequence[Row]) -> Any:
     """Draw a line a fault, from what came in to what was published, of its worst rig and amount."""
     names = [name for name in (SOUND, *FAULTS) if any(row["fault"] == name for row in rows)]
-    figure = _figure(9.0, 1.6 + 0.24 * len(names))
+    figure = new_figure(9.0, 1.6 + 0.24 * len(names), dpi=100)
     axes = figure.subplots()
     for place, name in enumerate(names):
-        worst = max(
-            grouped(rows, name).values(), key=lambda cell: _median(cell, "published_m") / _median(cell, "input_m")
-        )
+        worst = max(grouped(rows, name).values(), key=_growth)
         before, after = _median(worst, "input_m"), _median(worst, "published_m")
         axes.plot([before, after], [place, place], "-", color="#8C8C8C", lw=1.2, zorder=1)
         axes.plot(before, place, "o", color=_BEFORE, ms=7, mfc="none", mew=1.6, label="came in" if not place else None)
@@ -60,7 +48,9 @@ def _faults(rows: Sequence[Row]) -> Any:
     axes.set_yticks(range(len(names)), [about.split(", ")[0] for about in abouts])
     axes.invert_yaxis()
     axes.set_xscale("log")
-    axes.set_xlabel("translation RMSE [m], worst rig and amount, median of the seeds")
+    count = seeds(rows)
+    several = f", median of {count} seeds" if count > 1 else ""
+    axes.set_xlabel(f"translation RMSE [m], worst rig and amount{several}")
     axes.grid(axis="x", alpha=0.3)
     figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
@@ -68,7 +58,7 @@ def _faults(rows: Sequence[Row]) -> Any:
 
 def _outliers(rows: Sequence[Row]) -> Any:
     kinds = [kind for kind in KINDS if any(row["fault"] == kind for row in rows)]
-    figure = _figure(11.0, 0.8 + 2.4 * len(kinds))
+    figure = new_figure(11.0, 0.8 + 2.4 * len(kinds), dpi=100)
     grid = figure.subplots(len(kinds), len(RIGS), sharex=True, sharey="row", squeeze=False)
     styles = {
         "input_m": ("o:", _BEFORE, "came in"),

@@ -4,42 +4,24 @@
 
 from __future__ import annotations
 
-import io
 import math
 import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from experiments.figures import COLOURS, curve, new_figure, spread
 from experiments.thesis.experiments import Experiment
 
 Record = Mapping[str, Any]
 Records = Mapping[str, Record]
 Plot = Callable[[Experiment, Records], Figure]
 
-# Okabe-Ito colours, told apart by colour-blind readers; then the same dashed.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_STYLES = ("-", "--", ":")
 # Below this share objectives are the same.
 _LEVEL = 1e-9
 _MEASURED, _PREDICTED = "#D55E00", "#0072B2"
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure that needs no display."""
-    figure = Figure(figsize=(width, height), dpi=80, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def png(figure: Figure) -> bytes:
-    """Return a figure as PNG; the same figure gives the same bytes with the same version of matplotlib."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
-    return stream.getvalue()
 
 
 def _title(figure: Figure, text: str) -> None:
@@ -47,36 +29,47 @@ def _title(figure: Figure, text: str) -> None:
     figure.suptitle("\n".join(textwrap.wrap(text, int(9.5 * figure.get_figwidth()))))
 
 
-def style(index: int) -> dict[str, Any]:
-    """Return how the curve of a number is drawn."""
-    return {"color": COLOURS[index % len(COLOURS)], "ls": _STYLES[index // len(COLOURS) % len(_STYLES)], "lw": 1.4}
+def _legend(figure: Figure, axis: Any) -> None:
+    """Write one legend for all plots, below them; its lines are long enough to show the dashes."""
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, handlelength=4.0)
 
 
 def curves(experiment: Experiment, records: Records) -> Figure:
     """Draw objective, what it is above the lowest one, and norm of the gradient, against steps taken and time."""
-    figure = new_figure(13.0, 12.5)
-    axes = figure.subplots(3, 2, sharey="row", sharex="col")
     runs = {label: record for label, record in records.items() if len(record.get("trace", ())) > 1}
     lowest = _lowest(runs)
-    for index, (label, record) in enumerate(runs.items()):
-        rows = [row for row in record["trace"] if row["accepted"]]
-        best = lowest[record["options"]["loss"]]
-        objective, gradient = (np.array([row[n] or math.nan for row in rows]) for n in ("objective", "gradient_norm"))
-        above = np.maximum((objective - best) / best, _LEVEL) if best > 0.0 else np.full(len(rows), math.nan)
-        for line, values in zip(axes, (objective, above, gradient), strict=True):
-            line[0].plot(range(len(rows)), values, label=label, **style(index))
-            line[1].plot([row["time_s"] for row in rows], values, label=label, **style(index))
+    groups = spread(list(runs))
+    figure = new_figure(13.0, 0.5 + 12.0 * len(groups))
+    grid = figure.subplots(3 * len(groups), 2, sharey="row", sharex="col", squeeze=False)
     names = ("objective", "objective above the lowest of its loss, share", "norm of the gradient")
-    for line, name in zip(axes, names, strict=True):
-        for axis in line:
-            axis.set_yscale("log")
-            axis.grid(visible=True, alpha=0.3)
-        line[0].set_ylabel(name)
-    for axis, unit in zip(axes[-1], ("steps taken", "processor time [s]"), strict=True):
-        axis.set_xlabel(unit)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    for number, group in enumerate(groups):
+        axes = grid[3 * number : 3 * number + 3]
+        for index, label in enumerate(group):
+            _curve(axes, runs[label], lowest, index, label)
+        for line, name in zip(axes, names, strict=True):
+            for axis in line:
+                axis.set_yscale("log")
+                axis.grid(visible=True, alpha=0.3)
+            line[0].set_ylabel(name)
+        for axis, unit in zip(axes[-1], ("steps taken", "processor time [s]"), strict=True):
+            axis.set_xlabel(unit)
+            axis.tick_params(labelbottom=True)
+        axes[0, 1].legend(*axes[0, 0].get_legend_handles_labels(), loc="upper right", ncols=2, handlelength=4.0)
     _title(figure, experiment.heading)
     return figure
+
+
+def _curve(axes: Any, record: Record, lowest: Mapping[str, float], index: int, label: str) -> None:
+    """Draw one run as the n-th curve of six plots (3, 2)."""
+    rows = [row for row in record["trace"] if row["accepted"]]
+    best = lowest[record["options"]["loss"]]
+    objective, gradient = (np.array([row[n] or math.nan for row in rows]) for n in ("objective", "gradient_norm"))
+    above = np.maximum((objective - best) / best, _LEVEL) if best > 0.0 else np.full(len(rows), math.nan)
+    style = curve(index, every=7)
+    for line, values in zip(axes, (objective, above, gradient), strict=True):
+        line[0].plot(range(len(rows)), values, label=label, **style)
+        line[1].plot([row["time_s"] for row in rows], values, label=label, **style)
 
 
 def _lowest(runs: Records) -> dict[str, float]:
@@ -95,8 +88,8 @@ def taylor(experiment: Experiment, records: Records) -> Figure:
     axis = figure.subplots()
     for label, record in records.items():
         tau, remainder = (np.array(record["data"][name]) for name in ("tau", "remainder"))
-        axis.loglog(tau, remainder, "o-", color=COLOURS[0], label=label)
-        axis.loglog(tau, remainder[4] * (tau / tau[4]) ** 2, "--", color=COLOURS[1], label="slope 2")
+        axis.loglog(tau, remainder, label=label, **curve(0))
+        axis.loglog(tau, remainder[4] * (tau / tau[4]) ** 2, label="slope 2", **curve(1))
     axis.set(xlabel="τ", ylabel="|F(u + τδ) - F(u) - τJδ|", title=experiment.heading)
     axis.grid(visible=True, which="both", alpha=0.3)
     axis.legend(frameon=False)
@@ -176,7 +169,7 @@ def growth(experiment: Experiment, records: Records) -> Figure:
         rows = [record["figures"] for label, record in records.items() if label.split(",")[0] == kind]
         x, y = (np.array([row[name] for row in rows]) for name in ("observations", "seconds"))
         exponent = float(np.polyfit(np.log(x), np.log(y), 1)[0])
-        axis.loglog(x, y, marker="o", label=f"{kind}: N^{exponent:.2f}", **style(index))
+        axis.loglog(x, y, label=f"{kind}: N^{exponent:.2f}", **curve(index))
     axis.set(xlabel="observations N", ylabel="processor time [s]", title=experiment.heading)
     axis.grid(visible=True, which="both", alpha=0.3)
     axis.legend(frameon=False)
@@ -184,17 +177,21 @@ def growth(experiment: Experiment, records: Records) -> Figure:
 
 
 def pcg(experiment: Experiment, records: Records) -> Figure:
-    """Draw the PCG steps of every linear solve; what follows a comma in a label is dashed in the colour before it."""
-    figure = new_figure(9.0, 5.0)
-    axis = figure.subplots()
+    """Draw the PCG steps of every linear solve: labels without a comma on the left, with one on the right."""
+    figure = new_figure(12.0, 5.0)
+    axes = figure.subplots(1, 2, sharey=True)
     kinds = list(dict.fromkeys(label.split(",")[0] for label in records))
     for label, record in records.items():
+        kind, comma, rest = label.partition(", ")
+        axis = axes[1 if comma else 0]
         steps = [row["linear_iterations"] for row in record["trace"][1:]]
-        colour = COLOURS[kinds.index(label.split(",")[0]) % len(COLOURS)]
-        axis.plot(range(1, len(steps) + 1), steps, color=colour, ls="--" if "," in label else "-", lw=1.4, label=label)
-    axis.set(yscale="log", xlabel="step tried", ylabel="PCG steps of its linear solve")
-    axis.grid(visible=True, alpha=0.3)
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False)
+        axis.plot(range(1, len(steps) + 1), steps, label=kind, **curve(kinds.index(kind), every=7))
+        axis.set_title(rest or "scaled", fontsize=10)
+    for axis in axes:
+        axis.set(yscale="log", xlabel="step tried")
+        axis.grid(visible=True, alpha=0.3)
+    axes[0].set_ylabel("PCG steps of its linear solve")
+    _legend(figure, axes[0])
     _title(figure, experiment.heading)
     return figure
 
@@ -211,7 +208,7 @@ def conditions(experiment: Experiment, records: Records) -> Figure:
             broken = np.array(columns["plain"]) == 0.0
             for axis, name in zip(line, "cbs", strict=True):
                 values = np.array(columns[f"condition_{name}"])
-                axis.semilogy(steps, values, label=label.removesuffix(", cured"), **style(index))
+                axis.semilogy(steps, values, label=label.removesuffix(", cured"), **curve(index, every=12))
                 if name == "s":
                     axis.semilogy(steps[broken], values[broken], "x", color=COLOURS[index], ms=4.0)
         for axis, name in zip(line, ("C, worst block", "B, worst block", "S"), strict=True):
@@ -221,7 +218,9 @@ def conditions(experiment: Experiment, records: Records) -> Figure:
         axis.set_xlabel("step tried")
     for line in axes:
         line[0].set_ylabel("condition, damping included")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, handlelength=4.0
+    )
     _title(figure, f"{experiment.heading}; crosses: textbook algebra breaks")
     return figure
 
@@ -238,11 +237,13 @@ def shares(experiment: Experiment, records: Records) -> Figure:
     for index, (method, rows) in enumerate(found.items()):
         for axis, (name, _) in zip(axes, names, strict=True):
             x, y = [share for share, _ in rows], [errors[name] for _, errors in rows]
-            axis.plot(x, y, marker="o", ms=4.0, label=method, **style(index))
+            axis.plot(x, y, label=method, **curve(index))
     for axis, (_, title) in zip(axes, names, strict=True):
         axis.set(yscale="log", xlabel="outliers [%]", ylabel=title)
         axis.grid(visible=True, which="both", alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, handlelength=4.0
+    )
     _title(figure, experiment.heading)
     return figure
 

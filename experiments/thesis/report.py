@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from ba_node.io.files import whole_file
+from experiments.figures import png
 from experiments.thesis.experiments import Experiment
 from experiments.thesis.judging import Verdict
 from experiments.thesis.page import grounds, verdict_table
-from experiments.thesis.plots import PLOTS, png
+from experiments.thesis.plots import PLOTS
 from experiments.thesis.quantities import figures
 from experiments.thesis.tables import Table, table
 

@@ -84,6 +84,14 @@ def test_tables_show_the_worst_and_mark_what_misses_its_goal() -> None:
     assert spread([1.0, 1.1, 3.0], ".2f") == "1.10 (3.00)"
 
 
+def test_the_page_says_of_how_many_seeds_it_tells() -> None:
+    three, one = rows()[:3], rows()[3:]
+    assert "median of 3 recordings with other seeds" in page(three)
+    assert "**verdict**, the worst of them:" in page(three)
+    assert "outliers, of one recording each" in page(one)
+    assert "median" not in page(one)
+
+
 def test_pictures(tmp_path: Path) -> None:
     paths = draw(tmp_path / "images", rows())
     assert [path.name for path in paths] == ["robustness_faults.png", "robustness_outliers.png"]
