@@ -28,7 +28,7 @@ class BagFiles(NamedTuple):
 
     Attributes:
         paths: the files, in no particular order.
-        are_parts: something says that they are parts of one recording.
+        are_parts: a metadata.yaml says that they are parts of one recording.
         warnings: what somebody has to know about them, by kind.
     """
 
@@ -41,15 +41,54 @@ def find_files(paths: Sequence[Path]) -> BagFiles:
     """Return the files of a recording that is given as a folder, its metadata.yaml, or files.
 
     Raises:
-        BagError: there are none, or none of a kind that is read; says what to do.
+        BagError: there are none, none of a kind that is read, or they are of several recordings; says what to do.
     """
-    if len(paths) > 1:
-        single = [find_files([path]) for path in paths]
-        unique = dict.fromkeys(file.resolve() for found in single for file in found.paths)
-        # That a file is a part of more is no news where more are given.
-        warnings = [item for found in single for item in found.warnings.items() if item[0] != "split"]
-        return BagFiles(list(unique), True, dict(warnings))
-    path = paths[0]
+    return _find_several(paths) if len(paths) > 1 else _find_one(paths[0])
+
+
+def _find_several(paths: Sequence[Path]) -> BagFiles:
+    given = list(dict.fromkeys(Path(path).resolve() for path in paths))
+    folder = next((path for path in given if path.is_dir()), None)
+    if folder is not None and len(given) > 1:
+        raise BagError(f"{folder}: a folder is a recording by itself: give it alone")
+    single = [_find_one(path) for path in given]
+    files = list(dict.fromkeys(file for found in single for file in found.paths))
+    # That a file is a part of more is no news where more are given.
+    warnings = [item for found in single for item in found.warnings.items() if item[0] != "split"]
+    are_parts = _of_one_metadata(files)
+    if not are_parts:
+        _require_common_name(files)
+    return BagFiles(files, are_parts, dict(warnings))
+
+
+def _of_one_metadata(files: list[Path]) -> bool:
+    """Return True if one metadata.yaml lists all of some files."""
+    folders = {file.parent for file in files}
+    if len(folders) > 1 or not (files[0].parent / METADATA).is_file():
+        return False
+    try:
+        names = {Path(str(name)).name for name in _metadata(files[0].parent)["relative_file_paths"]}
+    except (YamlError, OSError):
+        return False
+    return {file.name.removesuffix(PACKED) for file in files} <= {name.removesuffix(PACKED) for name in names}
+
+
+def _require_common_name(files: list[Path]) -> None:
+    """Raise BagError unless files are called as parts of one recording are: alike but for a number at the end."""
+    for file in files[1:]:
+        if _base_name(file) != _base_name(files[0]):
+            raise BagError(
+                f"{files[0].name} and {file.name} are two recordings by their names, and are not mixed: give one;"
+                " parts of one recording are called NAME_0, NAME_1, ... or lie in a folder, which is given alone"
+            )
+
+
+def _base_name(path: Path) -> str:
+    name = path.name.removesuffix(PACKED)
+    return re.sub(r"[-_.]?\d+$", "", name.removesuffix(Path(name).suffix))
+
+
+def _find_one(path: Path) -> BagFiles:
     if path.name == METADATA and path.is_file():
         path = path.parent
     if not path.is_dir():

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import pickle
 import tempfile
 from collections import Counter, deque
-from itertools import chain, pairwise
+from itertools import chain, combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,7 +33,7 @@ __all__ = ["ROSBAGS_FACTORY", "BagError", "BagReader", "BagWriter", "TopicChoice
 _NOTES = 100
 # Messages that are looked at for the frames that a topic names.
 _LOOKED_AT = 20
-# Parts of a recording follow each other but for this, s: messages wait a while before they are written.
+# Parts of a recording follow each other but for this: messages wait a while before they are written.
 _MAX_OVERLAP_NS = 1_000_000_000
 
 
@@ -80,17 +81,20 @@ class BagReader:
         self._decoders: dict[int, Callable[[bytes], Any]] = {}
         self._sources: list[tuple[Path, Source]] = []
         self._channels: list[BagChannel] = []
+        self._are_parts = True
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> BagReader:
         with contextlib.ExitStack() as stack:
             self._open(stack)
+            self._channels = [channel for _, source in self._sources for channel in source.facts.channels]
+            self.topics = {}
+            for channel in self._channels:
+                self.topics.setdefault(channel.topic, channel.type_name)
+            if not self._are_parts:
+                self._require_one_recording()
             self._stack = stack.pop_all()
         self.message_count = sum(source.facts.message_count for _, source in self._sources)
-        self._channels = [channel for _, source in self._sources for channel in source.facts.channels]
-        self.topics = {}
-        for channel in self._channels:
-            self.topics.setdefault(channel.topic, channel.type_name)
         for path, source in self._sources:
             for reason, words in source.facts.problems:
                 self._reject(path, reason, words)
@@ -340,17 +344,35 @@ class BagReader:
         notes = [str(error) for error in errors if not isinstance(error, EmptyBagError)]
         self.rejected.update(["unreadable_file"] * len(notes))
         self.rejection_notes.extend(notes)
-        if not files.are_parts:
-            self._require_parts()
+        self._are_parts = files.are_parts
 
-    def _require_parts(self) -> None:
-        """Raise BagError if files overlap in time, as parts of one recording do not."""
-        for (path, source), (other, later) in pairwise(self._sources):
-            if source.facts.end_ns - later.facts.start_ns > _MAX_OVERLAP_NS:
-                raise BagError(
-                    f"{self.path}: holds several recordings: {path.name} and {other.name} are of the same time:"
-                    " give one of them"
-                )
+    def _require_one_recording(self) -> None:
+        """Raise BagError if files cannot be parts of one recording: of the same time, or with other cameras."""
+        for (path, source), (other, later) in combinations(self._sources, 2):
+            shared = {c.topic for c in source.facts.channels} & {c.topic for c in later.facts.channels}
+            inputs = {topic for topic in shared if self.topics[topic] in INPUT_TYPES.values()}
+            why = ""
+            if inputs and source.facts.end_ns - later.facts.start_ns > _MAX_OVERLAP_NS:
+                why = "are of the same time"
+            elif any(self._other_cameras(topic, source, later) for topic in inputs):
+                why = "have different cameras"
+            if why:
+                where = f"{self.path}: holds several recordings: " if len(self.paths) == 1 else ""
+                raise BagError(f"{where}{path.name} and {other.name} {why}: give one of them")
+
+    def _other_cameras(self, topic: str, *sources: Source) -> bool:
+        """Return True if files say different things of the cameras on a topic."""
+        if self.topics[topic] not in [INPUT_TYPES[name] for name in CAMERAS]:
+            return False
+        found = set()
+        for source in sources:
+            own = {id(channel) for channel in source.facts.channels if channel.topic == topic}
+            first = self._first_cameras({n for n, channel in enumerate(self._channels) if id(channel) in own})
+            if first is not None:
+                channel = self._channels[first.channel]
+                content = measurement_from_message(channel.type_name, self._decoder(first.channel)(first.data))
+                found.add(pickle.dumps(content))
+        return len(found) > 1
 
 
 def _source_or_error(path: Path, folder: Path | None, stack: contextlib.ExitStack) -> Source | BagError:

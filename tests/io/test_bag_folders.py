@@ -155,6 +155,53 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path: Path, single: Path)
         pass
 
 
+def shifted(messages: list[Message], seconds: float) -> list[Message]:
+    return [(topic, kind, time + round(1e9 * seconds), data) for topic, kind, time, data in messages]
+
+
+def write(path: Path, messages: list[Message]) -> Path:
+    with BagWriter(path) as bag:
+        for topic, kind, time, data in messages:
+            bag.write(topic, kind, data, time)
+    return path
+
+
+def test_several_recordings_are_not_mixed(tmp_path: Path, single: Path) -> None:
+    first = messages_of(single)
+    data = generate(SyntheticOptions(keyframes=4, landmarks=600, tracks=60, length_m=10.0, baseline_m=0.3, seed=5))
+    record(tmp_path / "other.mcap", data.timeline())
+    other = messages_of(tmp_path / "other.mcap")
+    drive_0 = write(tmp_path / "drive_0.mcap", first)
+    for name, messages, words in (
+        ("drive_1.mcap", first, r"drive_0\.mcap and drive_1\.mcap are of the same time: give one of them"),
+        ("drive_1.mcap", shifted(other, 100.0), r"drive_0\.mcap and drive_1\.mcap have different cameras: give one"),
+        (
+            "tour.mcap",
+            shifted(first, 100.0),
+            r"two recordings by their names, .* NAME_0, NAME_1, \.\.\. or lie",
+        ),
+    ):
+        path = write(tmp_path / name, messages)
+        with pytest.raises(BagError, match=words), BagReader([drive_0, path]):
+            pass
+        path.unlink()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(BagError, match="a folder is a recording by itself: give it alone"):
+        find_files([drive_0, tmp_path / "folder"])
+    # Two recorders at a time, each with topics of its own, have made one recording; and a file may be given twice.
+    split_by_topic = [[m for m in first if ("camera" in m[0]) is cameras] for cameras in (True, False)]
+    paths = [write(tmp_path / f"part_{i}.mcap", messages) for i, messages in enumerate(split_by_topic)]
+    assert sorted(messages_of(paths)) == sorted(first)
+    assert messages_of([drive_0, drive_0]) == first
+
+
+def test_files_of_one_metadata_may_have_any_name(tmp_path: Path, single: Path) -> None:
+    folder = tmp_path / "bag"
+    paths = [path.rename(folder / name) for path, name in zip(split(folder, messages_of(single), 2), "ab", strict=True)]
+    write_metadata(folder, ["a", "b"])
+    assert messages_of(paths) == messages_of(single)
+
+
 @pytest.mark.parametrize(
     ("facts", "words"),
     [
