@@ -17,10 +17,9 @@ import numpy as np
 
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
 from ba_node.check.relations import AGREED, median_share, spread
+from ba_node.config import SolverOptions
 from ba_node.core import cameras, geometry, methods, native_kernels, solver, triangulation
 from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
-from ba_node.core.objective import Rules
-from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Observations, Problem, State
 
 if TYPE_CHECKING:
@@ -37,7 +36,8 @@ _MIN_KEYFRAMES = 8
 _WIDE, _NARROW = (
     dataclasses.replace(
         methods.options("auto"),
-        rules=Rules(loss="cauchy", loss_scale=scale),
+        loss="cauchy",
+        loss_scale_px=scale,
         max_iterations=iterations,
         function_tolerance=1e-3,
     )
