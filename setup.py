@@ -32,9 +32,9 @@ def extensions() -> list[Extension]:
         flags.append("-march=native")
     kernels = Extension(
         f"{NAME}.native._kernels",
-        sources=[str(sources / "module.cpp")],
-        depends=[str(path) for path in sorted(sources.glob("*.hpp"))],
-        include_dirs=[pybind11.get_include()],
+        sources=[str(sources / "bindings" / "module.cpp")],
+        depends=[str(path) for path in sorted(sources.rglob("*.hpp"))],
+        include_dirs=[str(sources), pybind11.get_include()],
         extra_compile_args=flags,
         language="c++",
         # A compiler that fails leaves a package without kernels.
@@ -90,7 +90,7 @@ setup(
     entry_points={
         "console_scripts": [
             "ba = ba_node.cli.main:main",
-            "ba_adapter = ba_node.ros.adapter:main",
+            "ba_adapter = ba_node.ros.tools.adapter:main",
             "ba_node = ba_node.ros.main:main",
         ],
         # So that the linter ament_copyright understands the second line of this file.

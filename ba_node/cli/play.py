@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play."""
-    from ba_node.ros.play import Listener, PlayOptions, play, take_leave  # noqa: PLC0415
+    from ba_node.ros.tools.play import Listener, PlayOptions, play, take_leave  # noqa: PLC0415
 
     remaps = [word for remap in args.remap for word in ("-r", remap)]
     options = PlayOptions(

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Factors on relative poses by the C++ kernels (native/src/relative_poses.hpp), all others by numpy."""
+"""Factors on relative poses by the C++ kernels (native/src/adjustment/relative_poses.hpp), all others by numpy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ba_node import native
 from ba_node.core.factors import FactorSum, FactorTerms, KeyframeFactors, RelativePoses
 from ba_node.core.problem import State
 
-# As in the enum of relative_poses.hpp.
+# As in the enum of adjustment/relative_poses.hpp.
 _LOSSES = ("squared", "huber", "cauchy")
 
 

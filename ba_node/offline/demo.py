@@ -26,8 +26,8 @@ from ba_node.io.trajectory import write_tum
 from ba_node.measurements import Keyframe
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.offline.recording import read_truth
-from ba_node.ros.domain import free_domain, isolation
-from ba_node.ros.listen import NodeListener
+from ba_node.ros.tools.domain import free_domain, isolation
+from ba_node.ros.tools.listen import NodeListener
 
 SHIPPED = "stereo_loop.mcap"
 RATE = 2.0

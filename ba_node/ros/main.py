@@ -19,9 +19,9 @@ from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
 from ba_node.ros import arguments
-from ba_node.ros.executor import NodeExecutor
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
+from ba_node.ros.rclpy_compat.executor import NodeExecutor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

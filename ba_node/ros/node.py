@@ -24,25 +24,25 @@ from rclpy.clock import Clock, ClockType
 
 from ba_node.backend import Backend
 from ba_node.estimate import Estimate
-from ba_node.ros.component import Component, Host
-from ba_node.ros.diagnostics import Diagnostics
-from ba_node.ros.inbox import Inbox
-from ba_node.ros.inputs import Inputs
-from ba_node.ros.lifecycle import ManagedNode
+from ba_node.ros.components.base import Component, Host
+from ba_node.ros.components.diagnostics import Diagnostics
+from ba_node.ros.components.inputs import Inputs
+from ba_node.ros.components.map_transform import MapTransform
+from ba_node.ros.components.optimize import Optimize
+from ba_node.ros.components.publishing import Publishing
+from ba_node.ros.components.services import Services
+from ba_node.ros.components.side_outputs import SideOutputs
+from ba_node.ros.components.silence import Silence
+from ba_node.ros.components.simulated_time import SimulatedTime
+from ba_node.ros.components.static_frames import StaticFrames
 from ba_node.ros.log import Severity, fault, log
-from ba_node.ros.map_transform import MapTransform
-from ba_node.ros.optimize import Optimize
 from ba_node.ros.parameters import Parameters
-from ba_node.ros.publishing import Publishing
-from ba_node.ros.relay import Relay
-from ba_node.ros.services import Services
-from ba_node.ros.setup_check import on_a_thread
-from ba_node.ros.side_outputs import SideOutputs
-from ba_node.ros.silence import Silence
-from ba_node.ros.simulated_time import SimulatedTime
-from ba_node.ros.static_frames import StaticFrames
+from ba_node.ros.rclpy_compat.deferred import Relay
+from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.throttle import Throttle
-from ba_node.ros.worker import Account, Notice, Worker
+from ba_node.ros.worker.inbox import Inbox
+from ba_node.ros.worker.setup_check import on_a_thread
+from ba_node.ros.worker.worker import Account, Notice, Worker
 
 if TYPE_CHECKING:
     from ba_node.config import Config

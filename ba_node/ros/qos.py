@@ -25,7 +25,7 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from ba_node.ros.worker import Notice
+from ba_node.ros.worker.worker import Notice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

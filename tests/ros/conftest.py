@@ -29,7 +29,7 @@ from ba_node.messages import conversion
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
-from ba_node.ros.domain import free_domain, isolation
+from ba_node.ros.tools.domain import free_domain, isolation
 from ba_node.synthetic import SyntheticData
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -285,7 +285,7 @@ class Gates:
     SCRIPT = """
 import pathlib, sys, threading, time
 from ba_node.core import solver
-from ba_node.ros import services
+from ba_node.ros.components import services
 from ba_node.ros.main import main
 
 folder, solve, write_map = pathlib.Path({folder!r}), solver.solve, services.write_map

@@ -1,0 +1,125 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Which views of a point agree: the search of core/consensus.py, where it is described, one point after the other.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "adjustment/triangulate.hpp"
+
+namespace ba {
+
+// As in core/consensus.py.
+constexpr std::int64_t kMaxPairs = 45, kMaxSingles = 8;
+constexpr double kLeastSine2 = 1e-12;
+
+class Consensus {
+ public:
+  Consensus(const RaysView& rays, std::int64_t n_points, double gate)
+      : rays_(rays), gate2_(gate * gate), begin_(n_points + 1), row_(rays.n_rays) {
+    for (std::int64_t o = 0; o < rays.n_rays; ++o) ++begin_[rays.point[o] + 1];
+    for (std::int64_t p = 0; p < n_points; ++p) begin_[p + 1] += begin_[p];
+    std::vector<std::int64_t> next(begin_.begin(), begin_.end() - 1);
+    for (std::int64_t o = 0; o < rays.n_rays; ++o) row_[next[rays.point[o]]++] = o;
+  }
+
+  // Whether each ray agrees with the place that its point's rays agree on best: (n_rays,).
+  void run(bool* agrees) {
+    for (std::size_t p = 0; p + 1 < begin_.size(); ++p) {
+      first_ = row_.data() + begin_[p];
+      n_ = begin_[p + 1] - begin_[p];
+      if (n_ == 0) continue;
+      search();
+      for (std::int64_t k = 0; k < n_; ++k) agrees[first_[k]] = error2(k, best_, best_far_) < gate2_;
+    }
+  }
+
+ private:
+  const double* centre(std::int64_t k) const { return rays_.centre + 3 * first_[k]; }
+  const double* direction(std::int64_t k) const { return rays_.direction + 3 * first_[k]; }
+
+  void search() {
+    best_score_ = std::numeric_limits<double>::infinity();
+    const std::int64_t singles = std::min(n_, kMaxSingles);
+    for (std::int64_t s = 0; s < singles; ++s) attempt(direction(s * n_ / singles), true);
+    for (std::int64_t s = 0; s < singles; ++s) {
+      const std::int64_t k = s * n_ / singles;
+      const double distance = rays_.distance[first_[k]];
+      if (!std::isfinite(distance)) continue;
+      double x[3];
+      for (int i = 0; i < 3; ++i) x[i] = centre(k)[i] + distance * direction(k)[i];
+      attempt(x, false);
+    }
+    if (n_ * (n_ - 1) / 2 <= kMaxPairs) {
+      for (std::int64_t i = 0; i < n_; ++i)
+        for (std::int64_t j = i + 1; j < n_; ++j) meet(i, j);
+    } else {
+      for (std::int64_t k = 0; k < kMaxPairs; ++k) {
+        const std::int64_t i = k * n_ / kMaxPairs;
+        meet(i, (i + 1 + (k * 2654435761 % 4294967296) * (n_ - 1) / 4294967296) % n_);
+      }
+    }
+  }
+
+  // Where two rays are nearest to each other, by their angles.
+  void meet(std::int64_t i, std::int64_t j) {
+    const double *a = direction(i), *b = direction(j), *from = centre(i), *to = centre(j);
+    double between[3], cosine = 0.0, along_a = 0.0, along_b = 0.0;
+    for (int k = 0; k < 3; ++k) {
+      between[k] = to[k] - from[k];
+      cosine += a[k] * b[k];
+      along_a += between[k] * a[k];
+      along_b += between[k] * b[k];
+    }
+    const double sine2 = 1.0 - cosine * cosine;
+    if (!(sine2 > kLeastSine2)) return;
+    const double s = (along_a - cosine * along_b) / sine2, t = (cosine * along_a - along_b) / sine2;
+    if (!(s > 0.0 && t > 0.0)) return;
+    const double share = s * s / (s * s + t * t);
+    double x[3];
+    for (int k = 0; k < 3; ++k) x[k] = (1.0 - share) * (from[k] + s * a[k]) + share * (to[k] + t * b[k]);
+    attempt(x, false);
+  }
+
+  void attempt(const double* x, bool far) {
+    double score = 0.0;
+    for (std::int64_t k = 0; k < n_; ++k) {
+      score += error2(k, x, far);
+      if (!(score < best_score_)) return;
+    }
+    best_score_ = score;
+    best_far_ = far;
+    std::copy_n(x, 3, best_);
+  }
+
+  // Squared angle between a ray and a point (or a direction, for one far away), in sigmas; at most the gate's.
+  double error2(std::int64_t k, const double* x, bool far) const {
+    const double *d = direction(k), *c = centre(k);
+    double away[3], dot = 0.0;
+    for (int i = 0; i < 3; ++i) {
+      away[i] = far ? x[i] : x[i] - c[i];
+      dot += away[i] * d[i];
+    }
+    if (!(dot > 0.0)) return gate2_;
+    const double cross[3] = {d[1] * away[2] - d[2] * away[1], d[2] * away[0] - d[0] * away[2],
+                             d[0] * away[1] - d[1] * away[0]};
+    const double scale = rays_.px_per_rad[first_[k]];
+    const double across = cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2];
+    const double length = away[0] * away[0] + away[1] * away[1] + away[2] * away[2];
+    return std::min(scale * scale * across / length, gate2_);
+  }
+
+  RaysView rays_;
+  double gate2_;
+  std::vector<std::int64_t> begin_, row_;  // of each point's rays; rows by point
+  const std::int64_t* first_ = nullptr;    // rows of the point at hand
+  std::int64_t n_ = 0;
+  double best_[3] = {}, best_score_ = 0.0;
+  bool best_far_ = false;
+};
+
+}  // namespace ba

@@ -1,0 +1,326 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The normal equations of one problem, H = [B E; E' C] and g, at a state. Of E only the weighted rows of the Jacobian
+// are kept, as it follows from them: with a for a row's derivative by the point x, that by the pose is (x x a, a).
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+#include "linalg/blocks.hpp"
+#include "adjustment/layout.hpp"
+#include "parallel/pool.hpp"
+#include "adjustment/rows.hpp"
+
+namespace ba {
+
+// C (packed), g and cost of a batch of points.
+struct PointSums {
+  Packed c;
+  V8 g[3];
+  V8 cost;
+};
+
+template <int kRows>
+[[gnu::always_inline]] inline void add_point_rows(const Seen& seen, PointSums& out) {
+#pragma GCC unroll 3
+  for (int row = 0; row < kRows; ++row) {
+    const V8 *d = seen.d_point[row], w = seen.weight[row == 2];
+    const V8 a = w * d[0], b = w * d[1], c = w * d[2], r = seen.residual[row];
+    out.c[0] += a * d[0];
+    out.c[1] += b * d[0];
+    out.c[2] += b * d[1];
+    out.c[3] += c * d[0];
+    out.c[4] += c * d[1];
+    out.c[5] += c * d[2];
+    out.g[0] += a * r;
+    out.g[1] += b * r;
+    out.g[2] += c * r;
+  }
+  out.cost += seen.cost;
+}
+
+// The derivative by a pose, from that by the point at x.
+[[gnu::always_inline]] inline void pose_row(const V8* x, const V8* a, V8* out) {
+  out[0] = x[1] * a[2] - x[2] * a[1];
+  out[1] = x[2] * a[0] - x[0] * a[2];
+  out[2] = x[0] * a[1] - x[1] * a[0];
+  for (int i = 0; i < 3; ++i) out[3 + i] = a[i];
+}
+
+// What is kept at a state.
+struct AtPoints {
+  // By batch: three registers of points, six of C (packed), three of g.
+  Buffer<V8> point, c, gradient_p;
+  // By observation: the rows of the Jacobian: (a_u, a_v, r_u, r_v); (i_u, i_v, -, -) with i by f, k1, k2 if those are
+  // free; (a_depth, r_depth, -) if depth is measured. The last is zero, of no observation.
+  Buffer<V8> record;
+};
+
+template <int D>
+class Equations : public AtPoints {
+ public:
+  explicit Equations(const Layout& layout)
+      : lines(lines_with(layout.has_depth)), l_(layout) {
+    const std::int64_t bytes = resize(*this);
+    if (bytes <= kMostAhead) resize(ahead_);
+    b.resize(l_.n_free);
+    gradient_c.resize(l_.n_free);
+    part_.resize(l_.n_chunks());
+    const std::int64_t lists = l_.n_seen_parts() > 1 ? l_.n_seen_parts() * l_.n_free : 0;
+    part_b_.resize(lists);
+    part_gradient_.resize(lists);
+  }
+
+  double gradient_norm = 0;
+  Buffer<Block<D>> b;
+  Buffer<Column<D>> gradient_c;
+  // Rows of the Jacobian an observation, each `lines` registers.
+  const int lines;
+
+  double linearise(Rows& rows, const StateView& s, Pool& pool) {
+    rows.load_images(s);
+    rows.with_kind([&](auto lens, auto depth) {
+      pool.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+        part_[chunk] = linearise_chunk<decltype(lens)::value, decltype(depth)::value>(rows, s, chunk);
+      });
+    });
+    sum_keyframes(pool);
+    double total = 0;
+    for (double part : part_) total += part;
+    return total;
+  }
+
+  // Add to B and to the gradient what factors have: n_free x 36 and n_free x 6.
+  void add_factors(const double* diagonal, const double* gradient) {
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      for (int i = 0; i < 6; ++i) {
+        set(gradient_c[k], i, at(gradient_c[k], i) + gradient[6 * k + i]);
+        for (int j = 0; j < 6; ++j) set_entry(b[k], i, j, entry(b[k], i, j) + diagonal[36 * k + 6 * i + j]);
+      }
+    find_gradient_norm();
+  }
+
+  // Polishing ends with what a linearisation at its end begins with; that is kept if it is small.
+  bool looks_ahead() const { return ahead_.record.size() == this->record.size(); }
+  // Registers a record, and those that hold() needs for a slot.
+  static constexpr int lines_with(bool depth) { return (D == 9 ? 2 : 1) + (depth ? 1 : 0); }
+  static constexpr int held_with(bool depth) { return kLanes * lines_with(depth) + 2; }
+
+  // Rows of a slot, by lane, into `to`; weights last.
+  template <bool kDepth>
+  [[gnu::always_inline]] static void hold(const Seen& seen, V8* to) {
+    constexpr int kLines = lines_with(kDepth);
+    for (int i = 0; i < 6; ++i) to[i] = seen.d_point[i / 3][i % 3];
+    to[6] = seen.residual[0];
+    to[7] = seen.residual[1];
+    to[kLanes * kLines] = seen.weight[0];
+    if constexpr (D == 9)
+      for (int i = 0; i < 6; ++i) to[kLanes + i] = seen.d_intrinsics[i / 3][i % 3];
+    if constexpr (kDepth) {
+      V8* last = to + kLanes * (kLines - 1);
+      for (int i = 0; i < 3; ++i) last[i] = seen.d_point[2][i];
+      last[3] = seen.residual[2];
+      to[kLanes * kLines + 1] = seen.weight[1];
+    }
+  }
+
+  // The rows of a batch as held, and what else follows from them at x, for a linearisation to come.
+  template <bool kDepth>
+  void put_ahead(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, const V8* rows) {
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot, rows += held_with(kDepth))
+      write<kDepth>(rows, slot, ahead_);
+    put(batch, x, sums, ahead_);
+  }
+
+  // Linearise where the last polishing ended.
+  void go_ahead(Pool& pool) {
+    std::swap(static_cast<AtPoints&>(*this), ahead_);
+    sum_keyframes(pool);
+  }
+
+ private:
+  // Bytes of records up to which a second set stays in the caches with the first; beyond, it costs what it saves.
+  static constexpr std::int64_t kMostAhead = 4 << 20;
+  // Pieces of the keyframes of a part.
+  static constexpr std::int64_t kRanges = 4;
+
+  std::int64_t resize(AtPoints& at) const {
+    at.record.resize((kLanes * l_.n_slots() + 1) * lines);
+    clear(&at.record[kLanes * l_.n_slots() * lines], lines);
+    at.point.resize(3 * l_.n_batches);
+    at.c.resize(6 * l_.n_batches);
+    at.gradient_p.resize(3 * l_.n_batches);
+    return static_cast<std::int64_t>(at.record.size() * sizeof(V8));
+  }
+
+  void sum_keyframes(Pool& pool) {
+    const std::int64_t parts = l_.n_seen_parts(), n = l_.n_free;
+    const auto sum_list = [this](std::int64_t list, Block<D>& block, Column<D>& gradient) {
+      if (l_.has_depth) {
+        sum_keyframe<true>(list, block, gradient);
+      } else {
+        sum_keyframe<false>(list, block, gradient);
+      }
+    };
+    if (parts == 1) {
+      pool.each(n, [&](std::int64_t k, int) { sum_list(k, b[k], gradient_c[k]); });
+    } else {
+      // Each thread what it has seen itself.
+      pool.each(parts * kRanges, [&](std::int64_t piece, int) {
+        const std::int64_t part = piece / kRanges, range = piece % kRanges;
+        for (std::int64_t i = part * n + n * range / kRanges; i < part * n + n * (range + 1) / kRanges; ++i)
+          sum_list(i, part_b_[i], part_gradient_[i]);
+      });
+      for (std::int64_t k = 0; k < n; ++k) {
+        b[k] = part_b_[k];
+        gradient_c[k] = part_gradient_[k];
+        for (std::int64_t i = k + n; i < parts * n; i += n) {
+          add(b[k], part_b_[i]);
+          add(gradient_c[k], part_gradient_[i]);
+        }
+      }
+    }
+    find_gradient_norm();
+  }
+
+  void find_gradient_norm() {
+    double norm2 = 0;
+    for (const auto& x : gradient_c) norm2 += dot(x, x);
+    V8 squares{};
+    for (const V8& x : this->gradient_p) squares += x * x;
+    gradient_norm = std::sqrt(norm2 + sum(squares));
+  }
+
+  template <Lens kLens, bool kDepth>
+  double linearise_chunk(const Rows& rows, const StateView& s, std::int64_t chunk) {
+    V8 total{};
+    for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+      V8 x[3];
+      rows.load_points(i, s.points, x);
+      PointSums sums{};
+      for (std::int64_t slot = l_.slot_begin[i]; slot < l_.slot_begin[i + 1]; ++slot) {
+        Images images;
+        Seen seen;
+        V8 held[held_with(kDepth)];
+        rows.gather<kLens>(slot, images);
+        rows.see<kLens, kDepth, true>(slot, images, x, seen);
+        add_point_rows<kDepth ? 3 : 2>(seen, sums);
+        hold<kDepth>(seen, held);
+        write<kDepth>(held, slot, *this);
+      }
+      put(i, x, sums, *this);
+      total += sums.cost;
+    }
+    return 0.5 * sum(total);
+  }
+
+  static void put(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, AtPoints& to) {
+    for (int j = 0; j < 3; ++j) to.point[3 * batch + j] = x[j];
+    for (int j = 0; j < 6; ++j) to.c[6 * batch + j] = sums.c[j];
+    for (int j = 0; j < 3; ++j) to.gradient_p[3 * batch + j] = sums.g[j];
+  }
+
+  // Records of a slot, of its rows as held: weighted, by observation.
+  template <bool kDepth>
+  [[gnu::always_inline]] static void write(const V8* held, std::int64_t slot, AtPoints& to) {
+    constexpr int kLines = lines_with(kDepth);
+    V8* record = &to.record[kLanes * slot * kLines];
+    const auto put_line = [&](int line, int count, const V8& weight) {
+      V8 r[8];
+#pragma GCC unroll 8
+      for (int i = 0; i < 8; ++i) r[i] = i < count ? weight * held[kLanes * line + i] : V8{};
+      transpose(r);
+#pragma GCC unroll 8
+      for (int l = 0; l < kLanes; ++l) record[l * kLines + line] = r[l];
+    };
+    const V8 weight = root(held[kLanes * kLines]);
+    put_line(0, 8, weight);
+    if constexpr (D == 9) put_line(1, 6, weight);
+    if constexpr (kDepth) put_line(kLines - 1, 4, root(held[kLanes * kLines + 1]));
+  }
+
+  // B and g of the observations of a list.
+  template <bool kDepth>
+  void sum_keyframe(std::int64_t list, Block<D>& block, Column<D>& gradient) {
+    constexpr int kRows = kDepth ? 3 : 2;
+    V8 h[D * (D + 1) / 2] = {}, g[D] = {};
+    for (std::int64_t first = l_.keyframe_seen[list]; first < l_.keyframe_seen[list + 1]; first += kLanes) {
+      V8 j[3][D], r[3];
+      load_rows<kDepth>(first, j, r);
+      int t = 0;
+#pragma GCC unroll 9
+      for (int m = 0; m < D; ++m) {
+#pragma GCC unroll 3
+        for (int row = 0; row < kRows; ++row) g[m] += j[row][m] * r[row];
+#pragma GCC unroll 9
+        for (int n = 0; n <= m; ++n, ++t)
+#pragma GCC unroll 3
+          for (int row = 0; row < kRows; ++row) h[t] += j[row][m] * j[row][n];
+      }
+    }
+    clear(&block, 1);
+    clear(&gradient, 1);
+    int t = 0;
+    for (int m = 0; m < D; ++m) {
+      set(gradient, m, sum(g[m]));
+      for (int n = 0; n <= m; ++n, ++t) {
+        const double value = sum(h[t]);
+        set_entry(block, m, n, value);
+        set_entry(block, n, m, value);
+      }
+    }
+  }
+
+  // Rows of the Jacobian by the keyframe, and residuals, of eight observations of one keyframe.
+  template <bool kDepth>
+  [[gnu::always_inline]] void load_rows(std::int64_t first, V8 (&j)[3][D], V8 (&r)[3]) const {
+    V8 x[3], t[8];
+    const auto read = [&](int line) {
+#pragma GCC unroll 8
+      for (int l = 0; l < kLanes; ++l) t[l] = record[l_.seen[first + l] * static_cast<std::int64_t>(lines) + line];
+      transpose(t);
+    };
+    const double* points = reinterpret_cast<const double*>(point.data());
+    const std::int32_t* of_lane = &l_.seen_point[first];
+    for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[of_lane[l] + kLanes * i]; });
+    read(0);
+    r[0] = t[6];
+    r[1] = t[7];
+    pose_row(x, t, j[0]);
+    pose_row(x, t + 3, j[1]);
+    if constexpr (D == 9) {
+      read(1);
+      for (int i = 0; i < 3; ++i) {
+        j[0][6 + i] = t[i];
+        j[1][6 + i] = t[3 + i];
+        j[2][6 + i] = V8{};
+      }
+    }
+    if constexpr (kDepth) {
+      read(lines - 1);
+      pose_row(x, t, j[2]);
+      r[2] = t[3];
+    }
+  }
+
+  static void set(Column<D>& x, int i, double value) {
+    if constexpr (D == 9) {
+      if (i == 8) {
+        x.b = value;
+        return;
+      }
+    }
+    x.a[i] = value;
+  }
+  const Layout& l_;
+  std::vector<double> part_;
+  Buffer<Block<D>> part_b_;  // by part, if there are several
+  Buffer<Column<D>> part_gradient_;
+  AtPoints ahead_;
+};
+
+}  // namespace ba

@@ -1,0 +1,68 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The polishing of points, eight at once; core/polish.py says what it does and is this file's oracle.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+
+#include "adjustment/equations.hpp"
+#include "adjustment/rows.hpp"
+
+namespace ba {
+
+constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4, kMinPromise = 1e-8;
+
+// Objectives at the start and at the end.
+struct Polished {
+  double before = 0, after = 0;
+};
+
+// Improve the points of a batch, keyframes held. images: room for those of all its slots, filled here. keep(slot, seen):
+// called for all slots, the last time at the x that is returned; sums: of the same.
+template <Lens kLens, bool kDepth, class Keep>
+inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, Keep keep,
+                         V8 (&x)[3], PointSums& sums, V8& before, V8& best_cost) {
+  V8 best[3] = {x[0], x[1], x[2]};
+  Mask active = ~Mask{}, worse{};
+  double mu = kFirstDamping;
+  best_cost = splat(std::numeric_limits<double>::infinity());
+  const auto see = [&](bool again) {
+    sums = PointSums{};
+    for (std::int64_t slot = first; slot < end; ++slot) {
+      Seen seen;
+      if (!again) rows.gather<kLens>(slot, images[slot - first]);
+      rows.see<kLens, kDepth, true>(slot, images[slot - first], x, seen);
+      add_point_rows<kDepth ? 3 : 2>(seen, sums);
+      keep(slot, seen);
+    }
+  };
+  for (int step = 0; step <= steps; ++step) {
+    see(step > 0);
+    if (step == 0) before = sums.cost;
+    const Mask better = active & (sums.cost < best_cost);  // not if worse, or not a number
+    const Mask arrived = best_cost - sums.cost < kMinGain * sums.cost;
+    best_cost = select(better, sums.cost, best_cost);
+    for (int i = 0; i < 3; ++i) best[i] = select(better, x[i], best[i]);
+    worse = active & ~better;
+    active = better & ~arrived;
+    if (step == steps || !any(active)) break;
+    V8 damping[3], y[3], move[3];
+    const int diagonal[3] = {0, 2, 5};
+    for (int i = 0; i < 3; ++i) damping[i] = mu * maximum(sums.c[diagonal[i]], splat(kMinDiagonal));
+    Packed li;
+    inverse_cholesky(sums.c, damping, li);
+    lower_times(li, sums.g, y);
+    upper_times(li, y, move);
+    // What the model promises is known before the step.
+    active &= ~(y[0] * y[0] + y[1] * y[1] + y[2] * y[2] <= kMinPromise * sums.cost);
+    if (!any(active)) break;
+    for (int i = 0; i < 3; ++i) x[i] = select(active, best[i] - move[i], best[i]);
+    mu *= 0.1;
+  }
+  for (int i = 0; i < 3; ++i) x[i] = best[i];
+  if (any(worse)) see(true);
+}
+
+}  // namespace ba

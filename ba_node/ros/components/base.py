@@ -1,0 +1,137 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a part of the node is, and what it gets to work with.
+
+The node (``node.py``) is a list of components. A component makes its publishers, subscriptions, services and timers
+when the node is configured, and they are destroyed when the node is cleaned up. All its methods, and all callbacks of
+the entities that it made, run on the executor's thread; what is to run on the solver's thread goes through
+``host.inbox.post(command)``, and comes back with the next estimate, or as a Notice.
+
+To add one: a class derived from :class:`Component` in a file of its own, and its name in ``node.COMPONENTS``::
+
+    class Status(Component):
+        def __init__(self, host: Host) -> None:
+            super().__init__(host)
+            self._publisher = self.publisher(message_class("std_msgs/msg/String"), "~/status", qos.reliable(1))
+
+        def take(self, estimate: Estimate, newest: bool) -> None:
+            if newest and self._publisher.get_subscription_count():
+                self._publisher.publish(...)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from ba_node.ros import qos
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.config import Config
+    from ba_node.estimate import Estimate, SolveReport
+    from ba_node.measurements import CameraRig
+    from ba_node.ros.rclpy_compat.deferred import Relay
+    from ba_node.ros.worker.inbox import Inbox
+    from ba_node.ros.worker.worker import Account, Notice, Worker
+
+
+@dataclass
+class Host:
+    """What the node lends its components, from configure to cleanup.
+
+    Attributes:
+        node: the rclpy node: names, clock, logger. Entities are made with the methods of Component.
+        config: the parameters as they are now.
+        inbox: where measurements and commands for the back-end go.
+        worker: the solver's thread.
+        relay: brings work to the executor's thread, and knows what is owed to clients.
+        log: log a Notice, the same one not more often than every few seconds.
+        active: True between activate and deactivate.
+        ignoring: why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken.
+        counted: what this side of the inbox turned away, by reason; it goes into the report.
+        arrived: messages that came in, by topic; ignored ones too.
+        place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
+        tf: what becomes of the transform map -> odom, in words.
+        clock: what is wrong with simulated time, in words; empty if nothing is.
+        at_cleanup: what is undone when the node is cleaned up, last made first.
+        after_cleanup: what is undone a moment later: who was answered at cleanup must still hear it.
+        report: of the last solve, with its latency; None before the first.
+    """
+
+    node: Any
+    config: Config
+    inbox: Inbox
+    worker: Worker
+    relay: Relay
+    log: Callable[[Notice], None]
+    active: bool = False
+    ignoring: set[str] = field(default_factory=lambda: {"inactive"})
+    counted: Counter[str] = field(default_factory=Counter)
+    arrived: Counter[str] = field(default_factory=Counter)
+    place_cameras: Callable[[CameraRig], CameraRig | None] = lambda rig: rig
+    tf: str = ""
+    clock: str = ""
+    report: SolveReport | None = None
+    at_cleanup: ExitStack = field(default_factory=ExitStack)
+    after_cleanup: ExitStack = field(default_factory=ExitStack)
+
+
+class Component:
+    """A part of the node. Made when the node is configured; derived classes override what concerns them."""
+
+    def take_account(self, account: Account) -> None:
+        """Take a report on what was turned away, when no solve tells it."""
+
+    def __init__(self, host: Host) -> None:
+        """Make the entities. An exception refuses the configuration and destroys those made so far."""
+        self.host = host
+
+    def activate(self) -> None:
+        """Begin: from now on estimates are delivered. ``host.active`` is True already."""
+
+    def deactivate(self) -> None:
+        """Pause: nothing may be published until :meth:`activate`. ``host.active`` is False already."""
+
+    def reconfigure(self, before: Config) -> None:
+        """Follow a change of parameters: ``host.config`` is new already. The back-end is told by the node."""
+
+    def take(self, estimate: Estimate, newest: bool) -> None:
+        """Take an estimate as it leaves the worker, oldest first; only while active.
+
+        Args:
+            estimate: of every solve, failed and skipped ones too (``estimate.report.status.usable``).
+            newest: the last one of those that came together that replaces the map (``estimate.replaces_map``): what
+                replaces the ones before needs only this.
+        """
+
+    def publisher(self, kind: Any, topic: str, profile: Any, **options: Any) -> Any:
+        """Make a publisher that is destroyed at cleanup. Its profile can be overridden by parameters.
+
+        Args:
+            kind: message class.
+            topic: name, relative to the node's namespace or ``~/``.
+            profile: quality of service.
+            options: ``matched``, called when a subscriber comes or goes; others as of rclpy.
+        """
+        matched = options.pop("matched", None)
+        options = qos.for_publisher(self.host.node, topic, self.host.log, matched) | options
+        return self._owned("publisher", kind, topic, profile, **options)
+
+    def subscription(self, kind: Any, topic: str, take: Callable[[Any], None], profile: Any, **options: Any) -> Any:
+        """Make a subscription that is destroyed at cleanup. Its profile can be overridden by parameters."""
+        options = qos.for_subscription(self.host.node, topic, self.host.log) | options
+        return self._owned("subscription", kind, topic, take, profile, **options)
+
+    def timer(self, *arguments: Any, **options: Any) -> Any:
+        """Make a timer that is destroyed at cleanup. Without ``clock=`` it stands still when /clock does."""
+        return self._owned("timer", *arguments, **options)
+
+    def _owned(self, kind: str, *arguments: Any, **options: Any) -> Any:
+        entity = getattr(self.host.node, f"create_{kind}")(*arguments, **options)
+        # For what is not made here, an action server or a listener: self.host.at_cleanup.callback(its.destroy).
+        self.host.at_cleanup.callback(getattr(self.host.node, f"destroy_{kind}"), entity)
+        return entity

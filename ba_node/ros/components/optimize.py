@@ -1,0 +1,238 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Offer the action ~/optimize: all keyframes and points that are kept are refined, one goal at a time.
+
+The solver's thread makes a copy of the map and goes on with its windows; a thread of the goal's own solves the copy;
+the solver's thread puts the result in, see ``window/full.py``. A goal ends without a result as soon as its map is no
+longer the current one: after a reset, another map, or a new session.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import threading
+import time
+import traceback
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import GoalEvent, GoalStatus
+from rclpy.qos import QoSProfile
+
+from ba_node.core.methods import METHODS
+from ba_node.core.result import Status
+from ba_node.messages.commands import ACTION_TYPES
+from ba_node.ros.components.base import Component, Host
+from ba_node.ros.convert import message_class
+from ba_node.ros.log import Severity, fault, log
+from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Owed
+from ba_node.window import full, quality
+
+if TYPE_CHECKING:
+    from ba_node.backend import Backend
+    from ba_node.core.result import Iteration
+    from ba_node.estimate import Estimate
+
+_NAME = "optimize"
+_GONE = "the map was reset or replaced meanwhile"
+# Feedback comes in bursts where iterations are short.
+_FEEDBACK_DEPTH = 100
+
+
+@dataclass
+class _Goal:
+    """A goal at work. ``stop`` may be set by any thread, in words that say why."""
+
+    handle: Any
+    began_s: float
+    owed: Owed
+    stop: str = ""
+    result: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def elapsed_s(self) -> float:
+        return time.monotonic() - self.began_s
+
+    def end(self, status: Status, reason: str) -> None:
+        """Answer, from any thread."""
+        self.owed.give_later(success=status.usable, message=reason, status=status, **self.result)
+
+
+class Optimize(Component):
+    """The action of the node."""
+
+    def __init__(self, host: Host) -> None:
+        """Advertise."""
+        super().__init__(host)
+        self._goal: _Goal | None = None
+        self._type = message_class(ACTION_TYPES[_NAME])
+        self._server = ActionServer(
+            host.node,
+            self._type,
+            f"~/{_NAME}",
+            execute_callback=_never,
+            goal_callback=self._judge,
+            handle_accepted_callback=self._accept,
+            cancel_callback=self._cancel,
+            feedback_pub_qos_profile=QoSProfile(depth=_FEEDBACK_DEPTH),
+        )
+        host.at_cleanup.callback(self._stop)
+        # Who is answered at cleanup must still hear it.
+        host.after_cleanup.callback(self._server.destroy)
+
+    def _judge(self, request: Any) -> Any:
+        """Accept a goal, or reject it and say why in the log: the answer to a goal has no room for it."""
+        try:
+            reason = self._objection(request)
+        except Exception as error:
+            reason = fault(error)
+        if reason:
+            log(self.host.node, Severity.WARNING, f"goal of ~/{_NAME} rejected: {reason}")
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _objection(self, request: Any) -> str:
+        reason = ""
+        if not self.host.relay.open:
+            reason = CLEANED_UP
+        elif self._goal is not None and not self._goal.owed.given:
+            reason = "another goal is at work: cancel it, or wait for its result"
+        elif request.method and request.method not in METHODS:
+            reason = f"method = {request.method!r}: choose one of {', '.join(METHODS)}"
+        elif not (math.isfinite(request.time_budget_s) and request.time_budget_s >= 0.0):
+            reason = f"time_budget_s = {request.time_budget_s}: expected seconds, or 0 for no limit"
+        return reason
+
+    def _accept(self, handle: Any) -> None:
+        goal: _Goal
+
+        def send(success: bool, message: str, fields: dict[str, Any]) -> None:
+            self._finish(goal, message, {"success": success} | fields)
+
+        owed = self.host.relay.owe(send)
+        self._goal = goal = _Goal(handle, time.monotonic(), owed)
+        try:
+            with owed.at_work():
+                # What handle.execute() does first; then it would hand over to a callback that returns the result.
+                handle._update_state(GoalEvent.EXECUTE)
+                self.host.inbox.post(lambda backend: self._copy(backend, goal))
+        except Exception:
+            log(self.host.node, Severity.ERROR, f"~/{_NAME}: {traceback.format_exc()}")
+
+    def _cancel(self, handle: Any) -> Any:
+        if self._goal is not None and self._goal.handle is handle:
+            self._goal.stop = self._goal.stop or "cancelled; the map is as it was"
+        return CancelResponse.ACCEPT
+
+    def _stop(self) -> None:
+        """End the solve of a goal after its iteration when the node is cleaned up."""
+        if self._goal is not None:
+            self._goal.stop = CLEANED_UP
+
+    def _copy(self, backend: Backend, goal: _Goal) -> None:
+        """Copy the map, on the solver's thread."""
+        with goal.owed.at_work():
+            taken = full.copy(backend.scene, backend.config)
+            if isinstance(taken, str):
+                goal.end(Status.SKIPPED, taken)
+                return
+            # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
+            threading.Thread(target=self._solve, args=(backend, goal, taken), name=_NAME, daemon=False).start()
+
+    def _solve(self, backend: Backend, goal: _Goal, taken: full.Copy) -> None:
+        """Solve the copy, on a thread of its own."""
+        with goal.owed.at_work():
+            solved = self._solved(backend, goal, taken)
+            goal.result = _figures(taken, solved)
+            if goal.stop:
+                goal.end(Status.SKIPPED, goal.stop)
+            else:
+                self.host.inbox.post(lambda backend: self._merge(backend, goal, taken, solved))
+
+    def _solved(self, backend: Backend, goal: _Goal, taken: full.Copy) -> full.Solved:
+        request = goal.handle.request
+        out_of_time = False
+
+        def watch(row: Iteration) -> bool:
+            nonlocal out_of_time
+            self.host.relay.call(lambda: self._tell(goal, row, goal.elapsed_s))
+            if backend.scene is not taken.scene:
+                goal.stop = goal.stop or _GONE
+            out_of_time = 0.0 < request.time_budget_s <= goal.elapsed_s
+            return not (goal.stop or goal.owed.given or out_of_time)
+
+        chosen = full.options(self.host.config.solver, request.method, request.max_iterations)
+        solved = taken.solve(chosen, clock=time.perf_counter, on_iteration=watch)
+        if out_of_time and solved.result.status is Status.MAX_ITERATIONS:
+            text = f"stopped after {request.time_budget_s:g} s"
+            return solved._replace(result=dataclasses.replace(solved.result, reason=text))
+        return solved
+
+    def _merge(self, backend: Backend, goal: _Goal, taken: full.Copy, solved: full.Solved) -> Estimate | None:
+        """Put the result in, on the solver's thread; what it returns is published."""
+        with goal.owed.at_work():
+            merged = None if goal.stop or goal.owed.given else backend.merge(taken, solved)
+            result = solved.result
+            if merged is None:
+                lost = result.status.usable
+                reason = (goal.stop or backend.refusal or _GONE) if lost else result.reason
+                held = lost and not goal.stop and backend.refusal
+                goal.end(Status.HELD if held else Status.SKIPPED if lost else result.status, reason)
+                return None
+            estimate, goal.result["followed_keyframes"] = merged
+            goal.end(result.status, result.reason)
+            return estimate
+
+    def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:
+        """Publish feedback."""
+        if not goal.owed.given:
+            feedback = self._type.Feedback(
+                iteration=row.iteration,
+                accepted=row.accepted,
+                objective=float(row.objective),
+                gradient_norm=float(row.gradient_norm),
+                linear_iterations=row.linear_iterations,
+                elapsed_s=elapsed_s,
+            )
+            goal.handle.publish_feedback(feedback)
+
+    def _finish(self, goal: _Goal, reason: str, fields: dict[str, Any]) -> None:
+        """Send the result of a goal; what raises before it has left may be tried again with fewer fields."""
+        success = fields["success"]
+        status = fields.pop("status", Status.FAILED if self.host.relay.open else Status.SKIPPED)
+        result = self._type.Result(reason=reason, status=int(status), elapsed_s=goal.elapsed_s, **fields)
+        event = GoalEvent.SUCCEED if success else GoalEvent.ABORT
+        if goal.handle.is_cancel_requested and not success:
+            event = GoalEvent.CANCELED
+        reached = _end_state(goal.handle, event)
+        response = self._type.Impl.GetResultService.Response(status=reached, result=result)
+        # As rclpy does after its callback; without an executor the result goes out now, before a cleanup goes on.
+        future = self._server._result_futures[bytes(goal.handle.goal_id.uuid)]
+        future._set_executor(None)
+        future.set_result(response)
+        severity = Severity.INFO if success else Severity.WARNING
+        log(self.host.node, severity, f"~/{_NAME}: {status.name.lower()}: {reason}")
+
+
+def _end_state(handle: Any, event: Any) -> int:
+    """Bring a goal to its end and return the state that it has then; one that never began is aborted."""
+    for step in (event, GoalEvent.EXECUTE, GoalEvent.ABORT):
+        if not handle.is_active:
+            break
+        with contextlib.suppress(Exception):  # a step that is not allowed from here, or nobody to tell of it
+            handle._update_state(step)
+    return GoalStatus.STATUS_ABORTED if handle.is_active else int(handle.status)
+
+
+def _never(_handle: Any) -> None:
+    raise AssertionError("goals are executed by the threads of this module")
+
+
+def _figures(taken: full.Copy, solved: full.Solved) -> dict[str, Any]:
+    """Return what the result tells of a solve."""
+    figures = quality.figures(taken.selection, solved.result, solved.norms)
+    names = ("method", "iterations", "objective_before", "objective_after", "rms_px_before", "rms_px_after")
+    return {name: figures[name] for name in (*names, "keyframes", "landmarks", "observations")}

@@ -1,0 +1,156 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Offer ~/reset, ~/pause, ~/save_map and ~/load_map; they exist from configure on, active or not.
+
+The map belongs to the solver's thread: what changes or copies it is posted there, and is done between two solves.
+Files are written and read by a thread of their own, one at a time.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ba_node.io.map_file import MapFileError, load_map, write_map
+from ba_node.io.map_folder import MapPathError, path_in_folder
+from ba_node.messages.commands import SERVICE_TYPES
+from ba_node.ros.components.base import Component, Host
+from ba_node.ros.convert import message_class
+from ba_node.ros.rclpy_compat.deferred import LateService, Owed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node import archive
+    from ba_node.backend import Backend
+    from ba_node.estimate import Estimate
+    from ba_node.scene.map_content import MapContent
+
+_PAUSED = "paused"
+
+
+class Services(Component):
+    """The services of the node."""
+
+    def __init__(self, host: Host) -> None:
+        """Advertise."""
+        super().__init__(host)
+        self._busy: Owed | None = None
+        begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}
+        for name, kind in SERVICE_TYPES.items():
+            LateService(self, message_class(kind), f"~/{name}", begin[name])
+
+    def _reset(self, _request: Any, answer: Owed) -> None:
+        def reset(backend: Backend) -> Estimate:
+            keyframes = len(backend.scene.keyframes)
+            backend.reset()
+            text = f"forgot {keyframes} keyframes; the next keyframe begins a new map"
+            answer.give_later(success=True, message=text)
+            return backend.estimate()
+
+        self._post(answer, reset)
+
+    def _pause(self, request: Any, answer: Owed) -> None:
+        """Ignore data, or take it again. What a solver has begun with goes on."""
+        ignoring = self.host.ignoring
+        was = _PAUSED in ignoring
+        (ignoring.add if request.data else ignoring.discard)(_PAUSED)
+        text = "paused: keyframes and tracks are ignored and counted" if request.data else "running"
+        answer.give(success=True, message=f"{text}{' (as before)' if was == request.data else ''}")
+
+    def _save(self, request: Any, answer: Owed) -> None:
+        path = self._begin_file(request.path, answer, to_write=True)
+        if path is None:
+            return
+
+        def copy(backend: Backend) -> None:
+            content = backend.snapshot()
+            # A file is written to the end when the node ends.
+            self._in_thread(answer, lambda: self._write(path, content, answer), daemon=False)
+
+        self._post(answer, copy)
+
+    def _write(self, path: Path, content: MapContent, answer: Owed) -> None:
+        try:
+            write_map(path, content)
+        except OSError as error:
+            text = f"cannot write {path}: {error.strerror or error}; nothing was saved"
+            answer.give_later(success=False, message=text)
+            return
+        counts = _counts(content)
+        answer.give_later(success=True, message=f"{path}: {_told(counts)}", **counts)
+
+    def _load(self, request: Any, answer: Owed) -> None:
+        path = self._begin_file(request.path, answer, to_write=False)
+        if path is not None:
+            # Nothing is lost with a read that does not come to its end.
+            self._in_thread(answer, lambda: self._read(path, answer), daemon=True)
+
+    def _read(self, path: Path, answer: Owed) -> None:
+        try:
+            known = load_map(path, self.host.config.scene)
+        except MapFileError as error:
+            answer.give_later(success=False, message=f"{error}; the map is as before")
+            return
+
+        def take_over(backend: Backend) -> Estimate:
+            backend.take_over(known)
+            counts = _known(known)
+            session = known.scene.session_id or 0
+            text = f"{path}: {_told(counts)} of session {session}"
+            answer.give_later(success=True, message=text, **counts, session_id=session)
+            return backend.estimate()
+
+        self._post(answer, take_over)
+
+    def _begin_file(self, name: str, answer: Owed, *, to_write: bool) -> Path | None:
+        """Return the path to work on, or None after saying why not."""
+        if self._busy is not None and not self._busy.given:
+            text = "another map is being saved or loaded: try again when that is done"
+            answer.give(success=False, message=text)
+            return None
+        try:
+            path = path_in_folder(name, self.host.config.node.map_folder, to_write=to_write)
+        except MapPathError as error:
+            answer.give(success=False, message=str(error))
+            return None
+        self._busy = answer
+        return path
+
+    def _post(self, answer: Owed, command: Callable[[Backend], Estimate | None]) -> None:
+        """Have the solver's thread do something."""
+
+        def guarded(backend: Backend) -> Estimate | None:
+            with answer.at_work():
+                return command(backend)
+
+        self.host.inbox.post(guarded)
+
+    def _in_thread(self, answer: Owed, action: Callable[[], None], *, daemon: bool) -> None:
+        def guarded() -> None:
+            with answer.at_work():
+                action()
+
+        threading.Thread(target=guarded, name="map file", daemon=daemon).start()
+
+
+def _counts(content: MapContent) -> dict[str, int]:
+    return {
+        "keyframes": len(content.arrays["keyframes/keyframe_id"]),
+        "landmarks": len(content.arrays["landmarks/track_id"]),
+        "observations": len(content.arrays["sightings/keyframe"]),
+    }
+
+
+def _known(known: archive.Known) -> dict[str, int]:
+    scene = known.scene
+    return {
+        "keyframes": len(scene.keyframes),
+        "landmarks": len(scene.landmarks),
+        "observations": len(scene.sightings),
+    }
+
+
+def _told(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())

@@ -1,0 +1,194 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Answer every client: late, from any thread, and whatever happens meanwhile.
+
+rclpy's way to answer later is a coroutine as callback. It keeps its callback group until it ends, so all other
+callbacks of the group wait for it, and it is resumed by looking again each time the executor wakes up; when the service
+is destroyed meanwhile, the caller never hears. So here the callback returns at once, and what rclpy would send is kept.
+
+What a client waits for is an :class:`Owed`, and the relay knows all of them. Whoever works on one does so inside
+``with owed.at_work()``: what is raised there, in any thread, becomes the answer. What is owed when the solver's thread
+is found dead, or when the node is cleaned up, is answered then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import traceback
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
+
+from ba_node.ros.log import Severity, fault, log, printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from ba_node.ros.components.base import Component, Host
+
+    # Sends success, message and further fields of an answer, on the executor's thread.
+    Send = Callable[[bool, str, dict[str, Any]], None]
+
+_RCLError = rclpy_implementation.RCLError
+CLEANED_UP = "the node was cleaned up meanwhile"
+DEAD = "the solver's thread has ended: start the node anew"
+# How often it is looked whether the solver lives, and for what was not told of.
+_LOOK_S = 0.5
+
+
+class Relay:
+    """Runs things on the executor's thread, in order, and keeps what is owed to clients; until cleanup.
+
+    Attributes:
+        left_waiting: clients that were answered because of a cleanup, when that was.
+    """
+
+    def __init__(self, node: Any, solver_lives: Callable[[], bool]) -> None:
+        """Make what wakes the executor."""
+        self._node = node
+        self._solver_lives = solver_lives
+        self._actions: deque[Callable[[], None]] = deque()
+        self._owed: dict[Owed, None] = {}
+        self._lock = threading.Lock()
+        self._open = True
+        self.left_waiting = 0
+        self._guard = node.create_guard_condition(self._run)
+        # Silence is no reason not to look, and /clock may stand still.
+        self._timer = node.create_timer(_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    @property
+    def open(self) -> bool:
+        """Return False once the node was cleaned up."""
+        return self._open
+
+    def owe(self, send: Send) -> Owed:
+        """Return a new answer that is owed; at cleanup and after it is given at once."""
+        owed = Owed(self, self._node, send)
+        self._owed[owed] = None
+        if not self._open:
+            owed.give(success=False, message=CLEANED_UP)
+        return owed
+
+    def settled(self, owed: Owed) -> None:
+        """Forget what is owed no longer."""
+        self._owed.pop(owed, None)
+
+    def call(self, action: Callable[[], None]) -> None:
+        """Have something run on the executor's thread. May be called from any; after cleanup it does nothing."""
+        with self._lock:
+            if not self._open:
+                return
+            self._actions.append(action)
+            with contextlib.suppress(_RCLError):  # then the timer finds it
+                self._guard.trigger()
+
+    def close(self) -> None:
+        """Answer all who still wait, and go."""
+        with self._lock:
+            self._open = False
+        self._run()
+        self.left_waiting = len(self._owed)
+        self._give_up(CLEANED_UP)
+        self._node.destroy_guard_condition(self._guard)
+        self._node.destroy_timer(self._timer)
+
+    def _run(self) -> None:
+        """Do what was asked for; a fault in one action costs that one."""
+        while self._actions:
+            self._do(self._actions.popleft())
+
+    def _do(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception as error:
+            log(self._node, Severity.ERROR, f"{fault(error)}; going on\n{traceback.format_exc()}")
+
+    def _look(self) -> None:
+        self._run()
+        if self._owed and not self._solver_lives():
+            self._give_up(DEAD)
+
+    def _give_up(self, reason: str) -> None:
+        for owed in list(self._owed):
+            owed.give(success=False, message=reason)
+
+
+class Owed:
+    """An answer that is owed to a client: given once, on the executor's thread."""
+
+    def __init__(self, relay: Relay, node: Any, send: Send) -> None:
+        self.given = False
+        self._relay = relay
+        self._node = node
+        self._send = send
+
+    def give(self, *, success: bool, message: str, **fields: Any) -> None:
+        """Send the answer. If it cannot be sent as it is, the client hears that; if it has gone, that is its business.
+
+        Raises nothing. To be called on the executor's thread.
+        """
+        if self.given:
+            return
+        self.given = True
+        self._relay.settled(self)
+        try:
+            self._send(success, printable(message), fields)
+        except _RCLError:
+            return
+        except Exception as error:
+            reason = printable(fault(error))
+            log(self._node, Severity.ERROR, f"{reason}; this was the answer: {message}")
+            with contextlib.suppress(Exception):
+                self._send(False, reason, {})
+
+    def give_later(self, *, success: bool, message: str, **fields: Any) -> None:
+        """Send the answer, from any thread."""
+        self._relay.call(lambda: self.give(success=success, message=message, **fields))
+
+    @contextlib.contextmanager
+    def at_work(self) -> Iterator[None]:
+        """Work on the answer, in any thread: what is raised becomes the answer, and goes on."""
+        try:
+            yield
+        except BaseException as error:
+            self.give_later(success=False, message=fault(error))
+            raise
+
+
+class LateService:
+    """A service that answers later.
+
+    Args:
+        component: whose service it is.
+        kind: type of the service; its response has ``success`` and ``message``.
+        name: its name.
+        begin: called with each request and the answer that is owed for it; must not block.
+    """
+
+    def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Owed], None]) -> None:
+        self._begin = begin
+        self._kind = kind
+        self._host: Host = component.host
+        self._service = self._host.node.create_service(kind, name, lambda request, _response: request)
+        self._send = self._service.send_response
+        # The executor passes on to it what the callback returns, with the address of the caller.
+        self._service.send_response = self._receive
+        # Who is answered at cleanup must still hear it.
+        self._host.after_cleanup.callback(self._host.node.destroy_service, self._service)
+
+    def _receive(self, request: Any, header: Any) -> None:
+        def send(success: bool, message: str, fields: dict[str, Any]) -> None:
+            self._send(self._kind.Response(success=success, message=message, **fields), header)
+            log(self._host.node, Severity.INFO if success else Severity.WARNING, message)
+
+        owed = self._host.relay.owe(send)
+        if owed.given:
+            return
+        try:
+            with owed.at_work():
+                self._begin(request, owed)
+        except Exception:
+            log(self._host.node, Severity.ERROR, f"{self._service.srv_name}: {traceback.format_exc()}")

@@ -1,0 +1,117 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Make rclpy's lifecycle node fit for use: requests that make no sense are answered, and failures are told.
+
+In Jazzy an invalid request raises out of the executor and is never answered (rclpy issue 1209), and so is a parameter
+of a type that does not exist; what a transition raises is swallowed without a word. Here a request is answered with
+success = false and a line in the log, and a transition that raises is logged and ends in a state from which the node
+can be configured anew.
+"""
+
+from __future__ import annotations
+
+import traceback
+from typing import TYPE_CHECKING, Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+from ba_node.ros.log import Severity, log
+from ba_node.ros.rclpy_compat.answering import answering
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_RCLError = rclpy_implementation.RCLError
+
+
+class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
+    """A lifecycle node whose transitions are the methods below; each may raise."""
+
+    def __init__(self, node_name: str, **node_options: Any) -> None:
+        """Make the node, unconfigured."""
+        super().__init__(node_name, **node_options)
+        self._answer = self._service_change_state.callback
+        self._service_change_state.callback = self._on_request
+        for service in self.services:
+            service.callback = answering(self, service.srv_name, service.srv_type.Response, service.callback)
+
+    def configure(self) -> None:
+        """Acquire everything."""
+        raise NotImplementedError
+
+    def activate(self) -> None:
+        """Begin to work."""
+        raise NotImplementedError
+
+    def deactivate(self) -> None:
+        """Stop work, keep everything."""
+        raise NotImplementedError
+
+    def cleanup(self) -> None:
+        """Release everything, also what a configure that raised has left. Must be safe at any time, repeatedly."""
+        raise NotImplementedError
+
+    @property
+    def state(self) -> str:
+        """Return the label of the state: unconfigured, inactive, active or finalized."""
+        return str(self._state_machine.current_state[1])
+
+    def request(self, transition: str) -> bool:
+        """Make a transition from within (configure, activate, ...); return False, with a log line, if it fails."""
+        try:
+            done = getattr(self, f"trigger_{transition}")() == TransitionCallbackReturn.SUCCESS
+        except _RCLError:
+            done = False
+        if not done:
+            self._tell(transition)
+        return bool(done)
+
+    def on_configure(self, _state: Any) -> Any:
+        """Configure, for rclpy."""
+        return self._guarded("configure", self.configure)
+
+    def on_activate(self, _state: Any) -> Any:
+        """Activate, for rclpy."""
+        return self._guarded("activate", self.activate)
+
+    def on_deactivate(self, _state: Any) -> Any:
+        """Deactivate, for rclpy."""
+        return self._guarded("deactivate", self.deactivate)
+
+    def on_cleanup(self, _state: Any) -> Any:
+        """Clean up, for rclpy."""
+        return self._guarded("cleanup", self.cleanup)
+
+    def on_shutdown(self, _state: Any) -> Any:
+        """Shut down, for rclpy, from any state."""
+        return self._guarded("shutdown", self.cleanup)
+
+    def on_error(self, _state: Any) -> Any:
+        """Release everything after a transition that raised: rclpy then goes back to unconfigured."""
+        return self._guarded("cleanup after the error", self.cleanup)
+
+    def _guarded(self, name: str, action: Callable[[], None]) -> Any:
+        try:
+            action()
+        except Exception as error:
+            text = f"{name} failed: {type(error).__name__}: {error}"
+            log(self, Severity.ERROR, f"{text}\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.ERROR
+        log(self, Severity.INFO, f"{name}: done")
+        return TransitionCallbackReturn.SUCCESS
+
+    def _on_request(self, request: Any, response: Any) -> Any:
+        """Answer a request of `ros2 lifecycle set`."""
+        try:
+            response = self._answer(request, response)
+        except _RCLError:
+            response.success = False
+        if not response.success:
+            self._tell(request.transition.label or str(request.transition.id))
+        return response
+
+    def _tell(self, transition: str) -> None:
+        possible = sorted({item[1] for item in self._state_machine.available_transitions})
+        text = f"transition {transition!r} was refused or failed; the node is {self.state}, from where it can "
+        log(self, Severity.WARNING, text + (" or ".join(possible) or "go nowhere"))

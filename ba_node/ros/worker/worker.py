@@ -1,0 +1,282 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run the back-end on a thread of its own, fed by the inbox. Nothing here calls ROS.
+
+The worker takes everything that waits, gives it to the back-end, and solves at most once: keyframes that came while
+it was solving are solved together with the newest of them. With no message for ``node.settle_time_s`` the newest
+keyframe counts as complete with what has arrived.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+import traceback
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ba_node.estimate import Estimate, SolveReport, Status
+from ba_node.measurements import Keyframe
+from ba_node.ros.worker.keyframe_accounts import Ledger
+from ba_node.ros.worker.lag import Lag
+from ba_node.ros.worker.latency import Budget
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.backend import Backend
+    from ba_node.core.result import Iteration
+    from ba_node.ros.worker.inbox import Arrival, Inbox
+
+# Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
+_MAX_OUTPUTS = 20
+# A report on what was turned away goes out without a solve, but not more often.
+_ACCOUNT_PERIOD_S = 1.0
+# Texts that begin alike say the same.
+_HEAD = 40
+# Falling behind for this long is warned about.
+_PATIENCE_S = 5.0
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something to log.
+
+    Attributes:
+        key: what it is about; the reader may limit how often each is logged.
+        text: one line, or several with a traceback.
+        is_error: a fault of ours, not of the input.
+    """
+
+    key: str
+    text: str
+    is_error: bool = False
+
+
+@dataclass(frozen=True)
+class Account:
+    """The report of the last solve with what has been turned away since, when there is no new solve to tell it."""
+
+    report: SolveReport
+    stamp_ns: int
+
+
+Output = Estimate | Notice | Account
+
+
+class Worker:
+    """The solver's thread.
+
+    Args:
+        backend: used by this thread alone from :meth:`start` on.
+        inbox: where measurements and commands come from.
+        settle_time_s: silence after which the newest keyframe is complete.
+        notify: called, on this thread, when :meth:`outputs` has something new.
+        clock: steady clock, s.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        inbox: Inbox,
+        settle_time_s: float,
+        notify: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._backend = backend
+        self._inbox = inbox
+        self._settle_time_s = settle_time_s
+        self._notify = notify
+        self._clock = clock
+        self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
+        self._budget = Budget(clock)
+        self._ledger = Ledger()
+        self._lag = Lag(_PATIENCE_S)
+        self._told: Counter[str] = Counter()
+        self._told_map = 0
+        self._warned: set[str] = set()
+        # What the last report said of things turned away, when that was, and whether there is more to say.
+        self._accounted: object = None
+        self._account_s = -_ACCOUNT_PERIOD_S
+        self._owes = False
+        self._settled = True
+        self._behind = False
+        self._failures: Counter[str] = Counter()
+        self._thread = threading.Thread(target=self._run, name="solver", daemon=True)
+
+    @property
+    def refined(self) -> int:
+        """Return how many keyframes took part in a usable solve so far."""
+        return self._ledger.refined
+
+    @property
+    def alive(self) -> bool:
+        """Return True while the thread works, or before it was started."""
+        return self._thread.ident is None or self._thread.is_alive()
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 10.0) -> bool:
+        """End, after at most the current iteration of a solve; return False if that took longer than the timeout."""
+        self._inbox.close()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def outputs(self) -> list[Output]:
+        """Return what has come out since the last call, oldest first."""
+        taken = []
+        while self._outputs:
+            taken.append(self._outputs.popleft())
+        return taken
+
+    def _run(self) -> None:
+        while True:
+            arrivals = self._inbox.drain(self._patience_s())
+            if self._inbox.closed:
+                return
+            self._guard(self.step, arrivals)
+
+    def _patience_s(self) -> float | None:
+        """Return how long to wait for messages: not while there is more to solve, and for ever once all is said."""
+        if self._behind:
+            return 0.0
+        if not self._settled:
+            return self._settle_time_s
+        return _ACCOUNT_PERIOD_S if self._owes else None
+
+    def step(self, arrivals: list[Arrival]) -> None:
+        """Take in what arrived (nothing means silence, unless there is more to solve), and solve if there is need."""
+        for arrival in arrivals:
+            self._guard(self._take, arrival)
+        self._settled = not arrivals and not self._behind
+        if self._settled:
+            self._guard(self._backend.flush)
+        self._behind = False
+        if self._backend.ready:
+            self._guard(self._solve)
+        self._tell_rejections()
+        self._guard(self._account)
+
+    def _take(self, arrival: Arrival) -> None:
+        if callable(arrival.content):
+            estimate, now_s = arrival.content(self._backend), self._clock()
+            if estimate is not None and not self._inbox.closed:
+                self._put(self._finished(estimate, now_s, now_s))
+            return
+        content, backend = arrival.content, self._backend
+        backend.refused.clear()
+        backend.add(content)
+        refused = list(backend.refused)
+        if isinstance(content, Keyframe) and all(one is not content for one in refused):
+            self._ledger.take(content.session_id, content.keyframe_id, arrival.time_s)
+        for one in refused:
+            if one is content:
+                self._ledger.rejected += 1
+            else:
+                self._ledger.refuse(one.session_id, one.keyframe_id)
+
+    def _solve(self) -> None:
+        start_s = self._clock()
+        before = int(self._backend.scene.keyframes.solved.sum())
+        arrived_s = self._arrival_s(start_s)
+        self._budget.begin(arrived_s, 1e-3 * self._backend.config.node.latency_budget_ms)
+        estimate = self._backend.solve(on_iteration=self._goes_on)
+        self._budget.end()
+        n_solved = int(self._backend.scene.keyframes.solved.sum()) - before
+        lag = self._lag.update(start_s, self._clock(), n_solved, estimate, self._backend.config)
+        if lag:
+            self._put(Notice("falling_behind", lag))
+        # More keyframes than a window holds take several solves; without progress the next try waits for new data.
+        self._behind = n_solved > 0 and self._backend.ready
+        if estimate is not None and not self._inbox.closed:
+            self._put(self._finished(estimate, start_s, arrived_s))
+
+    def _arrival_s(self, now_s: float) -> float:
+        """Return when the keyframe came in that the next solve is for; now if it was solved before."""
+        newest = self._backend.due
+        arrived_s = None if newest is None else self._ledger.arrival_s(*newest)
+        return now_s if arrived_s is None else arrived_s
+
+    def _goes_on(self, _: Iteration) -> bool:
+        return self._budget.allows_more() and not self._inbox.closed
+
+    def _finished(self, estimate: Estimate, start_s: float, arrived_s: float) -> Estimate:
+        """Add to the report what only the worker knows."""
+        report, ledger = estimate.report, self._ledger
+        refined = set(estimate.refined.keyframe_id.tolist()) if report.status.usable else set()
+        held = {(one.session_id, one.keyframe_id) for one in self._backend.held}
+        ledger.settle(self._backend.scene, refined, held)
+        budget_ms = self._backend.config.node.latency_budget_ms
+        spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
+        report = dataclasses.replace(
+            report,
+            reason=spent if self._budget.spent and report.status is Status.MAX_ITERATIONS else report.reason,
+            queue_wait_s=start_s - arrived_s,
+        )
+        return dataclasses.replace(estimate, report=self._counted(report), arrived_s=arrived_s)
+
+    def _counted(self, report: SolveReport) -> SolveReport:
+        """Return a report with the accounts of the worker as they are now."""
+        ledger, keyframes = self._ledger, self._inbox.keyframes
+        self._accounted, self._owes = self._turned_away(), False
+        return dataclasses.replace(
+            report,
+            rejected={**report.rejected, **self._failures},
+            warnings=(*report.warnings, *self._lag.warnings),
+            dropped=self._inbox.dropped,
+            coalesced=ledger.coalesced,
+            received=keyframes.received,
+            solved=ledger.solved,
+            dropped_keyframes=keyframes.dropped + ledger.forgotten,
+            rejected_keyframes=ledger.rejected,
+            waiting=keyframes.waiting + ledger.waiting,
+        )
+
+    def _turned_away(self) -> object:
+        """Return what a report says of things turned away."""
+        return self._backend.map_index, Counter(self._backend.rejected), tuple(self._backend.warnings)
+
+    def _account(self) -> None:
+        """Report what was turned away since the last report, if no solve did."""
+        now_s = self._clock()
+        self._owes = self._turned_away() != self._accounted and bool(self._backend.rejected or self._backend.warnings)
+        if self._owes and now_s - self._account_s >= _ACCOUNT_PERIOD_S:
+            self._account_s = now_s
+            self._put(Account(self._counted(self._backend.report), self._backend.stamp_ns))
+
+    def _tell_rejections(self) -> None:
+        rejected, told = Counter(self._backend.rejected), []
+        if self._backend.map_index != self._told_map:
+            self._told_map, self._told, self._warned = self._backend.map_index, Counter(), set()
+        for reason in sorted(rejected - self._told):
+            notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
+            told.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
+        self._told = rejected
+        # What is a rejection too has been told with its count.
+        heads = tuple(notice.text[:_HEAD] for notice in told)
+        warnings = self._backend.warnings
+        news = [text for text in warnings if text not in self._warned]
+        self._warned = set(warnings)
+        told += [Notice(f"warning {text[:_HEAD]}", text) for text in news if text[:_HEAD] not in heads]
+        for notice in told:
+            self._put(notice)
+
+    def _guard(self, action: Callable[..., None], *arguments: object) -> None:
+        """Run one step of the work; a fault in it is reported and costs that step only.
+
+        One that would end the thread, as SystemExit does, is none of its business either.
+        """
+        try:
+            action(*arguments)
+        except BaseException as error:
+            self._failures["internal_error"] += 1
+            text = f"internal error, going on: {type(error).__name__}: {error}\n{traceback.format_exc()}"
+            self._put(Notice(f"failure {type(error).__name__}", text, is_error=True))
+
+    def _put(self, output: Output) -> None:
+        self._outputs.append(output)
+        self._notify()

@@ -1,0 +1,131 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Markers and covariances over a real middleware: only for those who subscribe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ba_node.messages.topics import SIDE_TYPES
+from ba_node.ros import qos
+from ba_node.ros.convert import message_class
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+
+pytestmark = pytest.mark.dds
+
+StartNode = Callable[..., Any]
+MakePeer = Callable[..., Any]
+
+TELLING = """
+import sys
+from ba_node.window import extras
+from ba_node.ros.components import publishing
+
+def telling(name):
+    work = getattr(extras, name)
+    def tell(*arguments):
+        print("works out", name, flush=True)
+        return work(*arguments)
+    return tell
+
+for name in ("covariances", "view"):
+    setattr(extras, name, telling(name))
+build = publishing.output_messages
+def tell_topics(*arguments):
+    built = build(*arguments)
+    print("builds", *sorted({topic for topic, _, _ in built}), flush=True)
+    return built
+publishing.output_messages = tell_topics
+from ba_node.ros.main import main
+sys.exit(main())
+"""
+
+
+@pytest.fixture(scope="module")
+def data() -> SyntheticData:
+    options = SyntheticOptions(seed=6, keyframes=6, length_m=10.0, path="line", outlier_share=0.0, tracks=100)
+    return generate(options)
+
+
+def watch(peer: Any, topic: str) -> Any:
+    profile = qos.latched(100) if topic == "markers" else qos.reliable(1000)
+    cls = message_class(SIDE_TYPES[topic])
+    return peer.node.create_subscription(cls, f"ba_node/{topic}", peer.received[topic].append, profile)
+
+
+def test_nothing_is_worked_out_that_nobody_looks_at(
+    start_node: StartNode, make_peer: MakePeer, data: SyntheticData
+) -> None:
+    node, peer = start_node(python=TELLING), make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    peer.connect()
+    peer.play(data, session_id=0)
+    assert "works out" not in node.out
+    assert "builds refined_keyframes\n" in node.out and "builds report\n" in node.out
+    assert "pose" not in node.out and "path" not in node.out and "points" not in node.out
+    late = make_peer()
+    late.listen("path", "points")
+    late.until(lambda: late.received["path"] and late.received["points"], "the map for one who comes late")
+    assert len(late.received["path"][0].poses) == len(data.keyframes)
+    late.close()
+    subscription = watch(peer, "pose_with_covariance")
+    peer.until(subscription.get_publisher_count, "the publisher")
+    # The node learns of a subscriber a moment after the subscriber of it: from some solve on.
+    session = 1
+    while "works out covariances" not in node.out:
+        peer.play(data, session)
+        session += 1
+        assert session < 20
+    assert "works out view" not in node.out
+    poses = peer.received["pose_with_covariance"]
+    peer.until(lambda: poses and np.any(poses[-1].pose.covariance), "a pose with a covariance")
+    covariance = np.asarray(poses[-1].pose.covariance).reshape(6, 6)
+    deviation = np.sqrt(np.diagonal(covariance))
+    assert np.all((deviation > 1e-5) & (deviation < 0.5)), deviation
+    assert deviation[:3].max() > deviation[3:].max(), "metres first, then radians"
+    assert poses[-1].header.frame_id == "map"
+
+    peer.node.destroy_subscription(subscription)
+    said = 0
+    while said != node.out.count("works out"):
+        said = node.out.count("works out")
+        peer.play(data, session)
+        session += 1
+        assert session < 30
+    assert node.stop() == 0
+
+
+def test_markers_show_the_window_and_begin_anew_with_a_session(
+    start_node: StartNode, make_peer: MakePeer, data: SyntheticData
+) -> None:
+    start_node("--ros-args", "-p", "window.max_keyframes:=3")
+    peer = make_peer()
+    peer.advertise()
+    peer.listen("report")
+    subscription = watch(peer, "markers")
+    peer.connect()
+    peer.until(subscription.get_publisher_count, "the publisher")
+    arrays = peer.received["markers"]
+    session = 0
+    while not arrays or len(arrays[-1].markers[-1].points) < 6:
+        peer.play(data, session)
+        session += 1
+        assert session < 20
+    assert arrays[0].markers[0].action == 3, "DELETEALL comes first"
+    newest = {marker.ns: marker for marker in arrays[-1].markers}
+    assert {"free", "fixed", "links"} <= {name for name, marker in newest.items() if marker.points}
+    assert len(newest["free"].points) == 3 * 2 * 16
+    assert all(marker.header.frame_id == "map" for marker in newest.values())
+    ends = np.array([(p.x, p.y, p.z) for marker in newest.values() for p in marker.points])
+    assert np.isfinite(ends).all()
+    before = len(arrays)
+    peer.play(data, session)
+    peer.until(lambda: any(array.markers[0].action == 3 for array in arrays[before:]), "DELETEALL of the new session")
+    late = make_peer()
+    watch(late, "markers")
+    late.until(lambda: late.received["markers"], "the markers that are kept")

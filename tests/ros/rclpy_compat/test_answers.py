@@ -1,0 +1,316 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every client gets an answer, whatever raises on the way to it: faults are put into a running node one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatus
+from ba_msgs.action import Optimize
+from ba_msgs.srv import LoadMap, SaveMap
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.action import ActionClient
+from std_srvs.srv import SetBool, Trigger
+
+from ba_node.core.result import Status
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from tests.ros.conftest import NodeProcess, Peer
+
+pytestmark = pytest.mark.dds
+
+KEYFRAMES = 6
+# Beside the node of the module.
+ALONE = ("--ros-args", "-r", "__ns:=/alone")
+# Where a fault can be put: module, what of it, and what it then raises. A file of the name in a folder arms it.
+FAULTS = {
+    "reset": ("ba_node.backend", "Backend.reset", "RuntimeError"),
+    "estimate": ("ba_node.backend", "Backend.estimate", "RuntimeError"),
+    "exit": ("ba_node.backend", "Backend.reset", "SystemExit"),
+    "interrupt": ("ba_node.backend", "Backend.reset", "KeyboardInterrupt"),
+    "post": ("ba_node.ros.worker.inbox", "Inbox.post", "MemoryError"),
+    "path": ("ba_node.ros.components.services", "path_in_folder", "RecursionError"),
+    "snapshot": ("ba_node.backend", "Backend.snapshot", "MemoryError"),
+    "write": ("ba_node.ros.components.services", "write_map", "ZeroDivisionError"),
+    "disk": ("ba_node.ros.components.services", "write_map", "OSError"),
+    "write_exit": ("ba_node.ros.components.services", "write_map", "SystemExit"),
+    "thread": ("threading", "Thread.start", "RuntimeError"),
+    "counts": ("ba_node.ros.components.services", "_counts", "IndexError"),
+    "read": ("ba_node.ros.components.services", "load_map", "MemoryError"),
+    "take_over": ("ba_node.backend", "Backend.take_over", "KeyError"),
+    "known": ("ba_node.ros.components.services", "_known", "ValueError"),
+    "logger": ("rclpy.impl.rcutils_logger", "RcutilsLogger.log", "ValueError"),
+    "copy": ("ba_node.window.full", "copy", "IndexError"),
+    "options": ("ba_node.window.full", "options", "KeyError"),
+    "solve": ("ba_node.window.full", "Copy.solve", "FloatingPointError"),
+    "solve_exit": ("ba_node.window.full", "Copy.solve", "SystemExit"),
+    "figures": ("ba_node.ros.components.optimize", "_figures", "TypeError"),
+    "merge": ("ba_node.backend", "Backend.merge", "AssertionError"),
+    "state": ("rclpy.action.server", "ServerGoalHandle._update_state", "RuntimeError"),
+    "feedback": ("rclpy.action.server", "ServerGoalHandle.publish_feedback", "RuntimeError"),
+    "objection": ("ba_node.ros.components.optimize", "Optimize._objection", "RuntimeError"),
+    "parameters": ("ba_node.config", "Config.with_values", "RuntimeError"),
+    "response": ("ba_msgs.srv", "SaveMap.Response.__init__", "AssertionError"),
+    "components": ("ba_node.ros.components.inputs", "Inputs.__init__", "RuntimeError"),
+    "cleanup": ("ba_node.ros.worker.worker", "Worker.stop", "RuntimeError"),
+    "solver": ("ba_node.ros.worker.worker", "Worker._guard", "SystemExit"),
+}
+SCRIPT = """
+import builtins, functools, importlib, pathlib, sys
+
+folder = pathlib.Path({folder!r})
+
+PARTLY = {{"response": lambda _, options: options, "logger": lambda arguments, _: arguments[2] >= 20}}
+
+def put(name, module, place, kind):
+    owner = importlib.import_module(module)
+    *path, last = place.split(".")
+    owner = functools.reduce(getattr, path, owner)
+    real = getattr(owner, last)
+
+    @functools.wraps(real)
+    def call(*arguments, **options):
+        # Not where rclpy makes an empty response, nor its own lines of debugging.
+        armed = name not in PARTLY or PARTLY[name](arguments, options)
+        if armed and (folder / name).exists():
+            if name != "logger":
+                (folder / name).unlink()
+            raise getattr(builtins, kind)("put in: " + name)
+        return real(*arguments, **options)
+
+    setattr(owner, last, call)
+
+for name, place in {faults!r}.items():
+    put(name, *place)
+from ba_node.ros.main import main
+sys.exit(main(sys.argv))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("faults")
+
+
+@pytest.fixture(scope="module")
+def script(folder: Path) -> str:
+    return SCRIPT.format(folder=str(folder), faults=FAULTS)
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticData:
+    return generate(SyntheticOptions(seed=3, keyframes=KEYFRAMES, length_m=10.0, path="line", outlier_share=0.0))
+
+
+class Client:
+    """Talks to a node, and knows how to put a fault into it."""
+
+    def __init__(self, node: Any, peer: Any, folder: Path) -> None:
+        self.node, self.peer, self.folder = node, peer, folder
+        self.action = ActionClient(peer.node, Optimize, "ba_node/optimize")
+
+    def arm(self, fault: str) -> None:
+        (self.folder / fault).touch()
+
+    def disarm(self) -> None:
+        for file in self.folder.iterdir():
+            if file.name in FAULTS:
+                file.unlink(missing_ok=True)
+
+    def call(self, service: str) -> Any:
+        kind, request = {
+            "reset": (Trigger, Trigger.Request()),
+            "pause": (SetBool, SetBool.Request(data=False)),
+            "save_map": (SaveMap, SaveMap.Request(path="site")),
+            "load_map": (LoadMap, LoadMap.Request(path="kept")),
+        }[service]
+        return self.peer.call(kind, f"ba_node/{service}", request)
+
+    def send_goal(self, **goal: Any) -> Any:
+        self.peer.until(self.action.server_is_ready, "the action")
+        sent = self.action.send_goal_async(Optimize.Goal(**goal))
+        self.peer.until(sent.done, "an answer to the goal")
+        return sent.result()
+
+    def optimize(self, **goal: Any) -> Any:
+        handle = self.send_goal(**goal)
+        assert handle.accepted
+        result = handle.get_result_async()
+        self.peer.until(result.done, "a result")
+        return result.result()
+
+    def change(self, number: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=number))
+        return bool(self.peer.call(ChangeState, "ba_node/change_state", request).success)
+
+    def state(self) -> str:
+        return str(self.peer.call(GetState, "ba_node/get_state", GetState.Request()).current_state.label)
+
+
+@pytest.fixture(scope="module")
+def shared(domain: int, script: str, folder: Path, scene: SyntheticData) -> Iterator[Client]:  # noqa: ARG001
+    """Return a client of a node that outlives all faults of this module."""
+    node = NodeProcess("--ros-args", "-p", f"node.map_folder:={folder}", python=script)
+    peer = Peer()
+    peer.advertise()
+    peer.play(scene)
+    client = Client(node, peer, folder)
+    assert client.peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path="kept")).success
+    yield client
+    peer.close()
+    node.kill()
+
+
+@pytest.fixture
+def client(shared: Client) -> Iterator[Client]:
+    yield shared
+    shared.disarm()
+    # Whatever was put in, the node goes on, and has its map.
+    assert shared.call("load_map").success
+    assert shared.node.alive
+
+
+@pytest.mark.parametrize(
+    ("service", "fault"),
+    [
+        *(("reset", fault) for fault in ("reset", "estimate", "exit", "interrupt", "post")),
+        *(("save_map", fault) for fault in ("path", "snapshot", "write", "disk", "write_exit", "thread", "counts")),
+        *(("save_map", fault) for fault in ("post", "response")),
+        *(("load_map", fault) for fault in ("path", "read", "thread", "take_over", "known", "estimate", "post")),
+    ],
+)
+def test_a_service_answers_whatever_raises(service: str, fault: str, client: Client) -> None:
+    client.arm(fault)
+    answer = client.call(service)
+    if (service, fault) == ("reset", "estimate") or (service, fault) == ("load_map", "estimate"):
+        assert answer.success, "it was done; what fails is to publish it"
+        return
+    assert not answer.success
+    assert f"put in: {fault}" in answer.message, answer.message
+    assert not (client.folder / fault).exists()
+    assert client.call(service).success, "and then as ever"
+
+
+@pytest.mark.parametrize("service", ["reset", "pause", "save_map", "load_map"])
+def test_a_log_that_raises_keeps_nobody_waiting(service: str, client: Client) -> None:
+    client.arm("logger")
+    assert client.call(service).success
+    assert client.optimize(max_iterations=1).result.reason
+
+
+@pytest.mark.parametrize(
+    "fault", ["copy", "options", "solve", "solve_exit", "figures", "merge", "state", "thread", "post", "feedback"]
+)
+def test_a_goal_gets_a_result_whatever_raises(fault: str, client: Client) -> None:
+    client.arm(fault)
+    response = client.optimize(max_iterations=2)
+    if fault == "feedback":
+        assert response.status == GoalStatus.STATUS_SUCCEEDED, "feedback is lost, the result is not"
+    else:
+        assert response.status == GoalStatus.STATUS_ABORTED
+        assert (response.result.success, response.result.status) == (False, Status.FAILED)
+        assert f"put in: {fault}" in response.result.reason
+    assert not (client.folder / fault).exists()
+    again = client.optimize(max_iterations=2)
+    assert again.result.success, again.result.reason
+
+
+def test_a_goal_that_cannot_be_judged_is_rejected(client: Client) -> None:
+    client.arm("objection")
+    assert not client.send_goal().accepted
+    assert client.optimize(max_iterations=1).result.success
+
+
+def test_rclpys_own_services_answer_too(client: Client) -> None:
+    senseless = Parameter(name="solver.loss_scale_px", value=ParameterValue(type=42))
+    good = Parameter(name="solver.loss_scale_px", value=ParameterValue(type=3, double_value=1.5))
+    request = SetParameters.Request(parameters=[senseless])
+    (result,) = client.peer.call(SetParameters, "ba_node/set_parameters", request).results
+    assert not result.successful and "internal error" in result.reason
+    atomic = "ba_node/set_parameters_atomically"
+    kind = SetParametersAtomically
+    result = client.peer.call(kind, atomic, kind.Request(parameters=[good, senseless])).result
+    assert not result.successful and "internal error" in result.reason
+    client.arm("parameters")
+    result = client.peer.call(kind, atomic, kind.Request(parameters=[good])).result
+    assert not result.successful and "put in: parameters" in result.reason
+    assert client.peer.call(kind, atomic, kind.Request(parameters=[good])).result.successful
+    assert not client.change(99)
+
+
+def test_transitions_that_raise_are_answered(client: Client) -> None:
+    client.arm("cleanup")
+    assert client.change(Transition.TRANSITION_DEACTIVATE)
+    assert not client.change(Transition.TRANSITION_CLEANUP)
+    assert client.state() == "unconfigured"
+    client.arm("components")
+    assert not client.change(Transition.TRANSITION_CONFIGURE)
+    assert client.state() == "unconfigured"
+    assert client.change(Transition.TRANSITION_CONFIGURE)
+    assert client.change(Transition.TRANSITION_ACTIVATE)
+
+
+def test_twenty_faults_in_a_row_do_not_end_the_node(client: Client) -> None:
+    for _ in range(25):
+        client.arm("path")
+        assert not client.call("save_map").success
+
+
+@pytest.fixture
+def start_alone(
+    start_node: Callable[..., Any], make_peer: Callable[..., Any], folder: Path, scene: SyntheticData
+) -> Callable[[str], Client]:
+    """Return a function that starts a node of its own with a script, and returns a client of it."""
+
+    def start(script: str) -> Client:
+        node = start_node(*ALONE, "-p", f"node.map_folder:={folder}", python=script)
+        peer = make_peer(namespace="alone")
+        peer.advertise()
+        peer.play(scene)
+        return Client(node, peer, folder)
+
+    return start
+
+
+def test_the_solvers_thread_dies(start_alone: Callable[[str], Client], script: str, scene: SyntheticData) -> None:
+    """Whoever waits then is answered, and whoever comes later too."""
+    alone = start_alone(script)
+    peer = alone.peer
+    alone.arm("solver")
+    assert alone.call("reset").message == "the solver's thread has ended: start the node anew"
+    assert not alone.call("save_map").success
+    response = alone.optimize()
+    assert (response.status, response.result.success) == (GoalStatus.STATUS_ABORTED, False)
+    assert response.result.reason == "the solver's thread has ended: start the node anew"
+    assert alone.call("pause").success
+    peer.publish(scene.keyframes[0])
+    assert alone.node.stop() == 0
+
+
+@pytest.mark.parametrize("number", [2, 15])
+def test_who_waits_when_a_signal_comes_is_answered(
+    number: int, start_alone: Callable[[str], Client], gates: Any, folder: Path
+) -> None:
+    alone = start_alone(gates.script)
+    node, peer = alone.node, alone.peer
+    gates.shut("optimize")
+    handle = alone.send_goal()
+    result = handle.get_result_async()
+    peer.until(lambda: gates.waits("optimize"), "the solve")
+    gates.shut("map file")
+    saving = peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path="late"))
+    peer.until(lambda: gates.waits("map file"), "the file")
+    node.process.send_signal(number)
+    peer.until(lambda: saving.done() and result.done(), "answers")
+    assert saving.result().message == result.result().result.reason == "the node was cleaned up meanwhile"
+    gates.open("optimize")
+    gates.open("map file")
+    assert node.wait() == 0, node.err
+    assert (folder / "late.npz").exists(), "a file is written to the end"
+    (folder / "late.npz").unlink()
