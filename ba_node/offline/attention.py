@@ -29,8 +29,8 @@ def attention(report: Mapping[str, Any]) -> list[str]:
     for session in (*report["older_sessions"], report):
         lines += session["warnings"].values()
         of = f"session {session['session_id']}: " if report["older_sessions"] else ""
-        lines += [of + line for line in (*_not_taken(session), *_worse(session), *_turned_away(session["rejected"]))]
-    return lines + _turned_away(report["bag_rejected"])
+        lines += [of + line for line in (*_not_taken(session), *_worse(session), *turned_away(session["rejected"]))]
+    return lines + turned_away(report["bag_rejected"])
 
 
 def _not_taken(session: Mapping[str, Any]) -> list[str]:
@@ -59,6 +59,7 @@ def _worse(session: Mapping[str, Any]) -> list[str]:
     return [f"the result explains the observations worse than what came in: {', '.join(found)}"]
 
 
-def _turned_away(rejected: Mapping[str, int]) -> list[str]:
+def turned_away(rejected: Mapping[str, int]) -> list[str]:
+    """Return how many messages were turned away, by reason, but for those that do no harm."""
     counts = {reason: count for reason, count in rejected.items() if reason not in HARMLESS}
     return [f"turned away: {', '.join(f'{n} {reason}' for reason, n in counts.items())}"] if counts else []
