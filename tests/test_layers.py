@@ -22,7 +22,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "window": ("window", "check"),
     "backend": ("backend",),
     "services": ("messages", "io", "evaluation", "synthetic"),
-    "tools": ("ros", "offline", "thesis", "cli"),
+    "tools": ("ros", "offline", "cli"),
 }
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
@@ -30,8 +30,7 @@ SAME = {
     "scene": {"measurements"},
     "io": {"messages"},
     "offline": {"ros"},
-    "thesis": {"offline"},
-    "cli": {"offline", "ros", "thesis"},
+    "cli": {"offline", "ros"},
 }
 ROS_ONLY = (
     "rclpy",
@@ -72,6 +71,12 @@ def imports(path: Path) -> list[str]:
     return names
 
 
+def test_nothing_installed_imports_what_is_not() -> None:
+    outside = {"experiments", "tests", "tools"}
+    found = {(path.name, name) for path in MODULES for name in imports(path) if name.split(".")[0] in outside}
+    assert not found
+
+
 def test_every_module_has_a_layer() -> None:
     units = {unit(path) for path in MODULES} - {"__init__"}
     assert units == set(RANK)
@@ -86,7 +91,7 @@ def test_imports_go_down(path: Path) -> None:
             assert here == "ros", f"{path} imports {name}"
         if parts[0] != "ba_node" or here == "__init__" or parts[1] in (here, "__version__"):
             continue
-        if RANK[here] > RANK["backend"] and here != "thesis":
+        if RANK[here] > RANK["backend"]:
             assert parts[1] not in BEHIND_THE_FACE, f"{path} reaches below the back-end: {name}"
             if parts[1] == "core" and str(path.relative_to(PACKAGE)) not in WITHOUT_BACKEND:
                 assert parts[2] in NUMERICS_FOR_ALL, f"{path} reaches into the core: {name}"
@@ -97,7 +102,7 @@ def test_imports_go_down(path: Path) -> None:
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_nothing_reaches_through_the_face(path: Path) -> None:
     """The tables of a map are its back-end's own: nothing above takes them by ``backend.scene``."""
-    if RANK.get(unit(path), 0) <= RANK["backend"] or unit(path) == "thesis":
+    if RANK.get(unit(path), 0) <= RANK["backend"]:
         return
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Attribute) and node.attr == "scene":

@@ -22,11 +22,11 @@ from ba_node.io.parameters import parameters_markdown, parameters_yaml
 from ba_node.messages.commands import ACTION_TYPES, SERVICE_TYPES
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
-from ba_node.offline.robustness.page import page as robustness_page
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
-from ba_node.thesis.open_page import open_page
-from ba_node.thesis.page import claims_page
+from experiments.robustness.page import page as robustness_page
+from experiments.thesis.open_page import open_page
+from experiments.thesis.page import claims_page
 
 # A page that is written by hand holds what is generated between these lines.
 BEGIN, END = "<!-- begin: written by `{made_by}` -->\n", "<!-- end -->\n"

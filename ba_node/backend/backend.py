@@ -37,9 +37,6 @@ from ba_node.backend.completion import Completion
 from ba_node.backend.current_map import CurrentMap
 from ba_node.backend.optimization import Optimization
 from ba_node.backend.replay import MapEnded, replay
-from ba_node.backend.summary import MapSummary, summary_of
-from ba_node.check.examine import examine
-from ba_node.check.tracks import tracks_of
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.estimate import Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
@@ -53,7 +50,6 @@ from ba_node.window import full, guard, quality
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from ba_node.check.diagnosis import Diagnosis
     from ba_node.config import Config
     from ba_node.core.problem import Cameras
     from ba_node.estimate import Iteration
@@ -116,12 +112,12 @@ class Backend:
     @property
     def rejected(self) -> Counter[str]:
         """Return what was turned away in this session, by reason (``rejections.REASONS``)."""
-        return self.scene.log.rejected
+        return self.map.rejected
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what somebody has to know or mend, in words."""
-        return tuple(self.scene.log.warnings.values())
+        return self.map.warnings
 
     @property
     def report(self) -> SolveReport:
@@ -262,19 +258,6 @@ class Backend:
             return None
         self.map.hold_all(self.solve_count, self.setup.reason(self.scene))
         return self.estimate()
-
-    def examine(self) -> Diagnosis | None:
-        """Return what the tracks of the map tell about the set-up; None if there is nothing to look at.
-
-        Raises:
-            ImportError: OpenCV is missing.
-        """
-        tracks = tracks_of(self.scene)
-        return None if tracks is None else examine(tracks)
-
-    def summary(self, scene: Scene | None = None) -> MapSummary:
-        """Return what there is to tell of the map, or of one that it has taken the place of."""
-        return summary_of(scene or self.scene, self.config)
 
     def estimate(self) -> Estimate:
         """Return all that is known, with the report of the last solve."""

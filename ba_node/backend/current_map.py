@@ -11,6 +11,10 @@ import numpy as np
 
 from ba_node import window
 from ba_node.backend.completion import Completion, end_of_solve, reached
+from ba_node.backend.summary import MapSummary, summary_of
+from ba_node.check import two_view
+from ba_node.check.examine import examine
+from ba_node.check.tracks import tracks_of
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Estimate, Extras, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
@@ -21,8 +25,10 @@ from ba_node.window.known import cloud_of, poses_of, taking_part_of
 from ba_node.window.trust import Trust
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Callable
 
+    from ba_node.check.diagnosis import Diagnosis
     from ba_node.config import Config
     from ba_node.core.problem import State
     from ba_node.estimate import Iteration
@@ -31,6 +37,11 @@ if TYPE_CHECKING:
 
 # The front-end's frame where neither it nor the parameters name one.
 _ODOM_FRAME = "odom"
+
+
+def can_examine() -> bool:
+    """Return True where OpenCV is installed, which :meth:`CurrentMap.examine` needs."""
+    return two_view.available()
 
 
 class CurrentMap:
@@ -69,6 +80,16 @@ class CurrentMap:
         return int(np.count_nonzero(self.scene.keyframes.solved))
 
     @property
+    def rejected(self) -> Counter[str]:
+        """Return what was turned away, by reason (``rejections.REASONS``)."""
+        return self.scene.log.rejected
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what somebody has to know or mend, in words."""
+        return tuple(self.scene.log.warnings.values())
+
+    @property
     def stamp_ns(self) -> int:
         """Return the stamp of the newest keyframe, 0 before the first."""
         return int(self.scene.keyframes.stamp_ns[self.scene.order[-1]]) if len(self.scene.order) else 0
@@ -97,6 +118,19 @@ class CurrentMap:
             Keyframe(self.session_id, key, stamp_ns, self.scene.frame_id, position, quaternion)
             for key, stamp_ns, position, quaternion in rows
         ]
+
+    def summary(self) -> MapSummary:
+        """Return what there is to tell of the map."""
+        return summary_of(self.scene, self.config)
+
+    def examine(self) -> Diagnosis | None:
+        """Return what the tracks tell about the set-up; None if there is nothing to look at.
+
+        Raises:
+            ImportError: OpenCV is missing.
+        """
+        tracks = tracks_of(self.scene)
+        return None if tracks is None else examine(tracks)
 
     def due(self) -> IntArray:
         """Return the rows of complete keyframes that were not solved and that the next solve refines, oldest first."""
@@ -208,8 +242,8 @@ class CurrentMap:
             solve_count=solve_count,
             newest_keyframe_id=int(self.scene.keyframes.keyframe_id[newest]),
             method=self.config.solver.method,
-            rejected=dict(sorted(self.scene.log.rejected.items())),
-            warnings=tuple(self.scene.log.warnings.values()),
+            rejected=dict(sorted(self.rejected.items())),
+            warnings=self.warnings,
         )
 
     def rms_px(self, state: str = "refined") -> float:

@@ -1,22 +1,51 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from a recording whether the set-up is what it is said to be."""
+"""Test calibration and conventions of a recording against its tracks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from ba_node.backend import Backend, Diagnosis, can_examine
+import numpy as np
+
+from ba_node.backend import Backend, CurrentMap, Diagnosis, can_examine
 from ba_node.config import Config
 from ba_node.io.mcap import BagReader
+from ba_node.offline.attention import turned_away
 
 
 class CheckError(ValueError):
     """A recording that has nothing to check, or no means to check it."""
 
 
-def check_recording(bag: Path, config: Config) -> list[tuple[int, Diagnosis]]:
-    """Return what the tracks of each session tell about the set-up, with its id.
+@dataclass(frozen=True)
+class CheckedSession:
+    """What a session of a recording tells.
+
+    Attributes:
+        session_id: the session; several may have the same.
+        keyframe_ids: of the first and the last keyframe, by time.
+        stamps_ns: of the same, ns.
+        found: what the tracks tell.
+        warnings: what else somebody has to know: stamps that jump, messages that were turned away.
+    """
+
+    session_id: int
+    keyframe_ids: tuple[int, int]
+    stamps_ns: tuple[int, int]
+    found: Diagnosis
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a JSON file."""
+        facts = {"session_id": self.session_id, "keyframe_ids": self.keyframe_ids, "stamps_ns": self.stamps_ns}
+        return {**facts, **self.found.as_dict(), "warnings": self.warnings}
+
+
+def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
+    """Return what the tracks of each session tell about the set-up.
 
     Raises:
         BagError: the recording cannot be read.
@@ -25,22 +54,26 @@ def check_recording(bag: Path, config: Config) -> list[tuple[int, Diagnosis]]:
     if not can_examine():
         raise CheckError("OpenCV is missing: install opencv-python-headless (rosdep key python3-opencv)")
     backend = Backend(config)
-    found: list[tuple[int, Diagnosis]] = []
-
-    def examine() -> None:
-        diagnosis = backend.examine()
-        if diagnosis is not None:
-            found.append((backend.map.session_id, diagnosis))
-
+    maps = [backend.map]
     with BagReader(bag) as reader:
         for _, _, measurement in reader.measurements():
-            for admitted in backend.admit(measurement):
-                if admitted.begins is not None:
-                    examine()
-                backend.take(admitted)
+            backend.add(measurement)
+            if backend.map is not maps[-1]:
+                maps.append(backend.map)
         backend.flush(final=True)
-        examine()
+        maps += [backend.map] if backend.map is not maps[-1] else []
         notes = [*reader.rejection_notes, *backend.rejection_notes]
+    found = [checked for one in maps if (checked := _checked(one)) is not None]
     if not found:
         raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + notes[-1] if notes else ''}")
     return found
+
+
+def _checked(one: CurrentMap) -> CheckedSession | None:
+    found = one.examine()
+    if found is None:
+        return None
+    poses = one.estimate().trajectory[np.array([0, -1])]
+    ids, stamps = poses.keyframe_id.tolist(), poses.stamp_ns.tolist()
+    warnings = (*one.warnings, *turned_away(one.rejected))
+    return CheckedSession(one.session_id, (ids[0], ids[1]), (stamps[0], stamps[1]), found, warnings)

@@ -190,7 +190,7 @@ class _Run:
         if not self.sessions and self.backend.map.keyframe_count:
             # A loaded map to which the recording added nothing.
             self._begin(self.backend.estimate())
-        self._close(self.backend.summary())
+        self._close(self.backend.map.summary())
 
     def _map_ended(self, ended: MapEnded) -> None:
         self._close(ended.summary)

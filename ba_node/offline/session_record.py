@@ -9,10 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node.backend import MapSummary
 from ba_node.estimate import Estimate, Poses
 from ba_node.measurements import Keyframe
+
+_IDS_SHOWN = 6
 
 
 @dataclass
@@ -29,7 +32,8 @@ class SessionRecord:
         solver_time_s: in all, s.
         slowest: time and keyframe of the slowest solve.
         iterations: outer iterations in all.
-        unrefined: why no keyframe was refined, empty if one was; see :meth:`close`.
+        reasons: why a solve gave nothing, by its newest keyframe.
+        unrefined: which keyframes were not refined and why, empty if all were; see :meth:`close`.
         closed: summary of the map at its end, None before :meth:`close`.
     """
 
@@ -42,6 +46,7 @@ class SessionRecord:
     solver_time_s: float = 0.0
     slowest: tuple[float, int] = (0.0, 0)
     iterations: int = 0
+    reasons: dict[int, str] = field(default_factory=dict)
     unrefined: str = ""
     closed: MapSummary | None = None
 
@@ -68,6 +73,8 @@ class SessionRecord:
         self.iterations += report.iterations
         self.solver_time_s += report.solve_time_s
         self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
+        if not report.status.usable:
+            self.reasons[report.newest_keyframe_id] = report.reason
         self.refined.update(refined.intersection(estimate.refined.keyframe_id.tolist()))
         # What a check of the set-up has taken back.
         self.refined.difference_update(set(estimate.trajectory.keyframe_id.tolist()) - refined)
@@ -75,7 +82,20 @@ class SessionRecord:
     def close(self, summary: MapSummary) -> None:
         """Take what there is to tell of the map at its end."""
         self.closed = summary
-        self.unrefined = "" if self.refined else _why_unrefined(summary, self.statuses, self.last)
+        self.unrefined = self._some_unrefined() if self.refined else _why_unrefined(summary, self.statuses, self.last)
+
+    def _some_unrefined(self) -> str:
+        """Return which keyframes were not refined though others were, and the usual reason; empty if all were."""
+        poses = self.input_trajectory
+        left = ~np.isin(poses.keyframe_id, np.array(list(self.refined), dtype=np.uint64))
+        ids = poses.keyframe_id[left].tolist()
+        if not ids:
+            return ""
+        reasons = Counter(self.reasons[key] for key in ids if key in self.reasons)
+        reason = reasons.most_common(1)[0][0] if reasons else "solves of their windows left them out"
+        moved = np.linalg.norm(np.diff(poses.position[left], axis=0), axis=1).sum()
+        by = f" (the front-end's poses move {moved:.3g} m over them)" if _adjacent(left) else ""
+        return f"{_listed(ids, together=_adjacent(left))}{by}: {reason}"
 
     @property
     def trajectory(self) -> Poses:
@@ -137,6 +157,20 @@ def _why_unrefined(summary: MapSummary, statuses: Counter[str], last: Estimate) 
     if not summary.observations:
         return f"all {empty} tracks messages are empty" if empty else "no tracks came that could be used"
     return last.report.reason
+
+
+def _adjacent(chosen: NDArray[np.bool_]) -> bool:
+    """Return True if all that is chosen of a row of things lies side by side, and is more than one."""
+    rows = np.flatnonzero(chosen)
+    return len(rows) > 1 and int(rows[-1] - rows[0]) == len(rows) - 1
+
+
+def _listed(ids: list[int], *, together: bool) -> str:
+    """Return ids in words, the first few where there are many."""
+    if together:
+        return f"keyframes {ids[0]} to {ids[-1]}"
+    shown = ", ".join(map(str, ids[:_IDS_SHOWN])) + (", ..." if len(ids) > _IDS_SHOWN else "")
+    return f"keyframe{'s' if len(ids) > 1 else ''} {shown}"
 
 
 def _joined(parts: list[Poses]) -> Poses:

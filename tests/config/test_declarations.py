@@ -41,7 +41,6 @@ def test_each_option_is_declared_exactly_once() -> None:
         "config/solver.py": len(declared(SolverOptions)),
         "config": len(declarations()) - len(declared(SolverConfig)),
         "synthetic/options.py": len(synthetic.declarations()),
-        "synthetic/sphere_options.py": len(synthetic.sphere_declarations()),
     }
     counted = {
         "config": declared_in.pop("config/estimation.py") + declared_in.pop("config/node.py"),

@@ -10,9 +10,10 @@ import pytest
 import scipy.linalg
 
 from ba_node.config import SolverOptions
-from ba_node.core import covariance, geometry, matrix_forms, methods, objective, solver
+from ba_node.core import covariance, geometry, methods, objective, solver
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Observations, Problem, State
+from experiments.thesis import matrix_forms
 
 MakeProblem = Callable[..., tuple[Problem, State]]
 

@@ -14,10 +14,10 @@ import scipy.sparse
 from ba_node.config import SolverOptions
 from ba_node.core import blocks, linear, native_kernels, reduced, scaling
 from ba_node.core.kernels import System
-from ba_node.core.matrix_forms import FORMS
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
+from experiments.thesis.matrix_forms import FORMS
 
 Make = Callable[..., tuple[Problem, State]]
 SHAPES: list[dict[str, object]] = [
