@@ -123,17 +123,17 @@ def read_messages(
     Raises:
         BagError: so many blocks overlap in time that they do not fit into memory.
     """
-    wanted, held = frozenset(channels), 0
+    wanted, open_bytes = frozenset(channels), 0
 
     def opened(block: Block) -> Iterator[Message]:
-        nonlocal held
+        nonlocal open_bytes
         messages = _sorted_messages(stream, index, block, wanted, report)
         size = sum(len(message.data) for message in messages)
-        held += size
-        if held > MAX_WAITING_BYTES:
+        open_bytes += size
+        if open_bytes > MAX_WAITING_BYTES:
             raise BagError(f"chunks of more than {MAX_WAITING_BYTES >> 20} MB overlap in time: split or sort it")
         yield from messages
-        held -= size
+        open_bytes -= size
 
     blocks = (block for block in index.blocks if block.channels is None or block.channels & wanted)
     return merge_by_time((block.start_ns, block.offset, opened(block)) for block in blocks)

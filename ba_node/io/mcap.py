@@ -148,7 +148,7 @@ class BagReader:
             cameras_known: the recording may come without cameras.
 
         Raises:
-            BagError: keyframes, tracks or cameras are missing, it cannot be told which of several are meant, or a
+            BagError: keyframes, tracks or cameras are missing, several are possible, or a
                 definition lacks a field.
         """
         chosen = self._choose(cameras_known)

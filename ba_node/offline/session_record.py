@@ -33,7 +33,7 @@ class SessionRecord:
         slowest: time and keyframe of the slowest solve.
         iterations: outer iterations in all.
         unrefined: why no keyframe was refined, empty if one was; see :meth:`close`.
-        figures: what is known only while the session's scene exists, see :meth:`close`.
+        summary: what is known only while the session's scene exists, see :meth:`close`.
     """
 
     session_id: int
@@ -47,7 +47,7 @@ class SessionRecord:
     slowest: tuple[float, int] = (0.0, 0)
     iterations: int = 0
     unrefined: str = ""
-    figures: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
 
     def add(self, estimate: Estimate, scene: Scene) -> None:
         """Take in the next estimate."""
@@ -69,10 +69,10 @@ class SessionRecord:
         self.refined.difference_update(table.keyframe_id[~table.refined].tolist())
 
     def close(self, scene: Scene, config: Config) -> None:
-        """Take the figures of the whole map from a scene that is about to go."""
+        """Summarise the whole map of a scene that is about to be dropped."""
         self.unrefined = "" if self.refined else _why_unrefined(scene, self.statuses, self.last)
         of = {state: quality.summary(scene, config, state) for state in quality.STATES}
-        self.figures = {
+        self.summary = {
             **{name: {state: of[state][name] for state in of} for name in of["input"]},
             "observations": len(scene.sightings),
             "outliers": int(np.count_nonzero(scene.sightings.outlier)),
@@ -101,7 +101,7 @@ class SessionRecord:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for report.json."""
+        """Return the entries of report.json."""
         assert self.last is not None
         return {
             "session_id": self.session_id,
@@ -110,7 +110,7 @@ class SessionRecord:
             "keyframes_refined": len(self.refined),
             "unrefined": self.unrefined,
             "landmarks": len(self.last.cloud),
-            **self.figures,
+            **self.summary,
             "solves": sum(self.statuses.values()),
             "solves_by_status": dict(sorted(self.statuses.items())),
             "iterations": self.iterations,
