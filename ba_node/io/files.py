@@ -3,7 +3,7 @@
 """Write files that are either whole or not there, each by one process at a time, and read none but regular ones.
 
 While it is written a file is ``.NAME.<random>.partial`` beside its place: made anew, so that no link that someone has
-planted is written through, and locked, so that what a killed process has left is told from what another one writes.
+planted is written through, and locked, so that what a killed process has left is not taken for one that is written.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from a recording whether the set-up is what it is said to be."""
+"""Test calibration and conventions of a recording against its tracks."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class SessionRecord:
         iterations: outer iterations in all.
         reasons: why a solve gave nothing, by its newest keyframe.
         unrefined: which keyframes were not refined and why, empty if all were; see :meth:`close`.
-        figures: what is known only while the session's scene exists, see :meth:`close`.
+        summary: what is known only while the session's scene exists, see :meth:`close`.
     """
 
     session_id: int
@@ -52,7 +52,7 @@ class SessionRecord:
     iterations: int = 0
     reasons: dict[int, str] = field(default_factory=dict)
     unrefined: str = ""
-    figures: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
 
     def add(self, estimate: Estimate, scene: Scene) -> None:
         """Take in the next estimate."""
@@ -76,10 +76,10 @@ class SessionRecord:
         self.refined.difference_update(table.keyframe_id[~table.refined].tolist())
 
     def close(self, scene: Scene, config: Config) -> None:
-        """Take the figures of the whole map from a scene that is about to go."""
+        """Summarise the whole map of a scene that is about to be dropped."""
         self.unrefined = self._some_unrefined() if self.refined else _why_unrefined(scene, self.statuses, self.last)
         of = {state: quality.summary(scene, config, state) for state in quality.STATES}
-        self.figures = {
+        self.summary = {
             **{name: {state: of[state][name] for state in of} for name in of["input"]},
             "observations": len(scene.sightings),
             "outliers": int(np.count_nonzero(scene.sightings.outlier)),
@@ -121,7 +121,7 @@ class SessionRecord:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for report.json."""
+        """Return the entries of report.json."""
         assert self.last is not None
         return {
             "session_id": self.session_id,
@@ -130,7 +130,7 @@ class SessionRecord:
             "keyframes_refined": len(self.refined),
             "unrefined": self.unrefined,
             "landmarks": len(self.last.cloud),
-            **self.figures,
+            **self.summary,
             "solves": sum(self.statuses.values()),
             "solves_by_status": dict(sorted(self.statuses.items())),
             "iterations": self.iterations,

@@ -12,11 +12,11 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.io.files import locked_folder
 from ba_node.io.map_file import is_map
-from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import Keyframe
 from ba_node.offline.recording import record
 from ba_node.synthetic import SyntheticOptions, generate
+from tests.ply import read_ply
 
 
 def replay(bag: Path, out: Path, *options: str) -> int:
