@@ -28,7 +28,7 @@ def main(recording):
         tell(backend.solve())
     estimate = backend.estimate()
     for number, position in zip(estimate.trajectory.keyframe_id, estimate.trajectory.position, strict=True):
-        print(f"keyframe {number}: from {odometry[number].round(3)} to {position.round(3)}")
+        print(f"keyframe {number}: from {odometry[number].round(3).tolist()} to {position.round(3).tolist()}")
     print(f"{len(estimate.trajectory)} keyframes, {len(estimate.cloud)} points, rms {backend.rms_px():.3f} px")
 
 
