@@ -29,7 +29,7 @@ class Publisher {
 class Node {
  public:
   explicit Node(const std::string&) {}
-  builtin_interfaces::msg::Time now() { return {}; }  // there: a Time that converts to it
+  builtin_interfaces::msg::Time now() { return builtin_interfaces::msg::Time(); }  // there: a Time that converts to it
 
   template <typename Message>
   typename Publisher<Message>::SharedPtr create_publisher(const std::string&, const QoS&) {
