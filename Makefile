@@ -7,9 +7,9 @@ PYTHON ?=
 ARGS ?=
 
 RUN := .venv/bin/python
-CHECKED := ba_node benchmarks tests tools setup.py $(wildcard launch/*.py)
+CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 
-.PHONY: help setup demo test fuzz soak sanitize bench lint format clean
+.PHONY: help setup demo test fuzz soak sanitize bench thesis robustness lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
@@ -33,7 +33,13 @@ sanitize: setup ## run the tests of the C++ kernels under AddressSanitizer and U
 	@sh tools/sanitize.sh $(ARGS)
 
 bench: setup ## compare with the solvers that are installed, see docs/performance.md (ARGS="--quick": two windows)
-	@$(RUN) -m benchmarks $(ARGS)
+	@$(RUN) -m experiments.benchmarks $(ARGS)
+
+thesis: setup ## repeat experiments of the thesis (ARGS="3.8 5.1", ARGS="--all", ARGS="--list")
+	@$(RUN) -m ba_node.cli.main thesis $(ARGS)
+
+robustness: setup ## replay recordings gone wrong, and see that no harm is done (ARGS="--only camera_turned")
+	@$(RUN) -m ba_node.cli.main robustness $(ARGS)
 
 lint: setup ## check style and types
 	@$(RUN) -m ruff check $(CHECKED)
@@ -46,4 +52,4 @@ format: setup ## put all Python files into the agreed style
 
 clean: ## remove .venv and everything else that commands have made
 	@rm -rf .venv build install log out *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	@find ba_node benchmarks tests tools launch -name __pycache__ -prune -exec rm -rf {} +
+	@find ba_node experiments tests tools launch -name __pycache__ -prune -exec rm -rf {} +

@@ -381,7 +381,7 @@ class Backend:
             self._hold(tried.held)
             state = None
         elif state is not None:
-            norms = window.put(self.scene, selection, state, norms, self.config.tracks, self.config.solver.backend)
+            norms = window.put(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
         figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:

@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.linter
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = [str(ROOT / name) for name in ("ba_node", "benchmarks", "launch", "tests", "tools")]
+FOLDERS = [str(ROOT / name) for name in ("ba_node", "experiments", "launch", "tests", "tools")]
 # Files that ament_copyright looks at where a folder is under version control.
 LICENCE = [str(ROOT / name) for name in ("CONTRIBUTING.md", "LICENSE")]
 MANIFESTS = [str(ROOT / name) for name in ("package.xml", "msg_defs/package.xml", "config")]

@@ -22,7 +22,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "window": ("window", "check"),
     "backend": ("archive", "backend"),
     "services": ("messages", "io", "evaluation", "synthetic"),
-    "tools": ("ros", "offline", "thesis", "cli"),
+    "tools": ("ros", "offline", "cli"),
 }
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
@@ -31,8 +31,7 @@ SAME = {
     "backend": {"archive"},
     "io": {"messages"},
     "offline": {"ros"},
-    "thesis": {"offline"},
-    "cli": {"offline", "ros", "thesis"},
+    "cli": {"offline", "ros"},
 }
 ROS_ONLY = (
     "rclpy",
@@ -66,6 +65,12 @@ def imports(path: Path) -> list[str]:
             assert node.level == 0, f"{path}: relative import"
             names += [f"{node.module}.{alias.name}" for alias in node.names]
     return names
+
+
+def test_nothing_installed_imports_what_is_not() -> None:
+    outside = {"experiments", "tests", "tools"}
+    found = {(path.name, name) for path in MODULES for name in imports(path) if name.split(".")[0] in outside}
+    assert not found
 
 
 def test_every_module_has_a_layer() -> None:

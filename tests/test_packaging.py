@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 from xml.etree import ElementTree
@@ -135,10 +136,13 @@ def test_make_help_lists_every_command() -> None:
 def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
     pytest.importorskip("wheel")
     source = tmp_path / "source"
-    for name in ("ba_node", "config", "launch", "msg_defs", "resource"):
+    for name in ("ba_node", "config", "experiments", "launch", "msg_defs", "resource"):
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("LICENSE", "package.xml", "setup.cfg", "setup.py"):
         shutil.copy(ROOT / name, source)
+    subprocess.run([sys.executable, "setup.py", "-q", "sdist"], cwd=source, capture_output=True, check=True)
+    with tarfile.open(next((source / "dist").glob("*.tar.gz"))) as archive:
+        assert not [name for name in archive.getnames() if "experiments/" in name]
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", ".", "."]
     built = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
@@ -150,6 +154,7 @@ def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
     shared = {f"share/ba_node/{name}" for name in ("package.xml", "config/ba_node.yaml", "launch/ba_node.launch.py")}
     shared.add("share/ament_index/resource_index/packages/ba_node")
     data = f"ba_node-{ba_node.__version__}.data/data/"
+    assert not [name for name in names if "experiments/" in name]
     assert messages == {Path(name).name for name in names if name.startswith("ba_node/io/ba_msgs/")}
     assert modules <= set(names), f"not in the wheel: {modules - set(names)}"
     assert shared <= {name.removeprefix(data) for name in names}

@@ -10,7 +10,7 @@ python=$(pwd)/${PYTHON:-.venv/bin/python}
 case ${PYTHON:-} in /*) python=$PYTHON ;; esac
 rm -rf out/sanitize
 mkdir -p out/sanitize
-cp -r ba_node tests setup.py setup.cfg package.xml pyproject.toml resource launch config bags out/sanitize/
+cp -r ba_node experiments tests setup.py setup.cfg package.xml pyproject.toml resource launch config bags out/sanitize/
 cd out/sanitize
 rm -f ba_node/native/*.so
 CFLAGS="-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g" \

@@ -26,15 +26,13 @@ from ba_node.cli import (
     params,
     play,
     replay,
-    robustness,
     solve,
-    steps,
     synth,
-    thesis,
 )
 from ba_node.cli import map as map_command
+from ba_node.cli.checkout import CheckoutCommand
 
-COMMANDS: dict[str, ModuleType] = {
+COMMANDS: dict[str, ModuleType | CheckoutCommand] = {
     module.__name__.rsplit(".", 1)[1]: module
     for module in (
         replay,
@@ -47,9 +45,14 @@ COMMANDS: dict[str, ModuleType] = {
         synth,
         demo,
         params,
-        steps,
-        robustness,
-        thesis,
+    )
+}
+COMMANDS |= {
+    command.name: command
+    for command in (
+        CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
+        CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
+        CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
     )
 }
 USAGE_ERROR = 2
@@ -83,8 +86,8 @@ class Overview(argparse.HelpFormatter):
         self._action_max_length = 2 + max(map(len, COMMANDS)) + 2
 
 
-def build_parser(command: str | None) -> argparse.ArgumentParser:
-    """Return the parser, with the options of one command (all if None)."""
+def build_parser(command: str) -> argparse.ArgumentParser:
+    """Return the parser, with the options of one command."""
     parser = Parser(
         prog="ba",
         description="Offline tools of ba_node, the bundle-adjustment back-end for ROS 2.",
@@ -93,17 +96,20 @@ def build_parser(command: str | None) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"ba_node {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for name, module in COMMANDS.items():
+    for name, entry in COMMANDS.items():
+        if name != command:
+            subparsers.add_parser(name, help=entry.SUMMARY)
+            continue
+        module = entry.load() if isinstance(entry, CheckoutCommand) else entry
         sub = subparsers.add_parser(
             name,
-            help=module.SUMMARY,
+            help=entry.SUMMARY,
             description=module.__doc__,
             epilog=f"example:\n  {module.EXAMPLE}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        if command in (None, name):
-            module.add_arguments(sub)
+        module.add_arguments(sub)
     return parser
 
 
@@ -135,8 +141,8 @@ def _discard_files() -> None:
 def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = next((word for word in arguments if not word.startswith("-")), "")
-    args = build_parser(command).parse_args(arguments)
     try:
+        args = build_parser(command).parse_args(arguments)
         code: int = COMMANDS[args.command].run(args)
         sys.stdout.flush()
         return code
@@ -155,7 +161,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return _end(USAGE_ERROR, f"error: {where}{error.strerror or error}")
     except ValueError as error:
         # The errors of this package that speak of its input are all ValueErrors of its own.
-        if not type(error).__module__.startswith("ba_node."):
+        if type(error).__module__.partition(".")[0] not in ("ba_node", "experiments"):
             raise
         return _end(USAGE_ERROR, f"error: {' '.join(str(error).split())}")
 

@@ -86,6 +86,10 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         *(("left aside", f"{topic}: {reason}") for topic, reason in report["topics_left"].items()),
         *(("adjusted", note) for note in report["cameras_adjusted"]),
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
+        *(
+            ("not refined", report["unrefined"])
+            for _ in range(bool(report["unrefined"] and report["keyframes_refined"]))
+        ),
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
         *((label, _change(report[key])) for label, key in _ERRORS),
         *_behind(report["observations_behind"]),

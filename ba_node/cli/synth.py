@@ -7,7 +7,8 @@ front-end's poses drift, its pixels are noisy and some are wrong, as the options
 ground_truth/pose.
 
 A sphere (--kind sphere, OUT.txt, .bz2 or .gz) is the synthetic problem of section 5.1 of the thesis: --preset has the
-sizes measured there. The truth is written beside it in the same format, as OUT.truth.txt.
+sizes measured there. The truth is written beside it in the same format, as OUT.truth.txt. Only a checkout of the
+repository makes spheres.
 
 The same options give the same bytes.
 """
@@ -16,8 +17,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from ba_node.cli import checkout
 from ba_node.cli.console import TargetError, require_folder, require_mcap
 
 if TYPE_CHECKING:
@@ -37,15 +40,13 @@ class OptionError(ValueError):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: one for each field of SyntheticOptions and SphereOptions."""
-    from ba_node.synthetic import PRESETS  # noqa: PLC0415
-
     parser.add_argument("target", type=Path, metavar="OUT")
     parser.add_argument(
         "--kind", choices=(_RECORDING, _SPHERE), default=_RECORDING, help="what to make (default: recording)"
     )
-    parser.add_argument(
-        "--preset", choices=tuple(PRESETS), help="sphere: images-points of the thesis; options change it"
-    )
+    if checkout.present():
+        presets = tuple(_spheres().PRESETS)
+        parser.add_argument("--preset", choices=presets, help="sphere: images-points of the thesis; options change it")
     for name, declared in _declared().items():
         option = next(iter(declared.values()))
         flag = f"--{name.replace('_', '-')}"
@@ -63,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Generate."""
+    if args.kind == _SPHERE:
+        _spheres()
     given: dict[str, Any] = {}
     for name, declared in _declared().items():
         value = getattr(args, name)
@@ -71,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         if args.kind not in declared:
             raise OptionError(f"--{name.replace('_', '-')} is an option of --kind {next(iter(declared))} alone")
         given[name] = value
-    if args.kind == _RECORDING and args.preset:
+    if args.kind == _RECORDING and getattr(args, "preset", None):
         raise OptionError("--preset is an option of --kind sphere alone")
     return _sphere(args, given) if args.kind == _SPHERE else _recording(args, given)
 
@@ -92,30 +95,26 @@ def _recording(args: argparse.Namespace, given: dict[str, Any]) -> int:
 
 
 def _sphere(args: argparse.Namespace, given: dict[str, Any]) -> int:
-    import dataclasses  # noqa: PLC0415
-
-    from ba_node.offline.sphere_file import write_sphere  # noqa: PLC0415
-    from ba_node.synthetic import SphereOptions, generate_sphere, preset  # noqa: PLC0415
-
     require_folder(args.target)
     if args.target.suffix not in _BAL:
         raise TargetError(f"{args.target}: BAL problems are written as {', '.join(_BAL)}: give a name that ends so")
-    base = preset(args.preset) if args.preset else SphereOptions()
-    data = generate_sphere(dataclasses.replace(base, **given))
-    truth = write_sphere(args.target, data)
-    print(
-        f"{args.target}: {len(data.cameras)} images, {len(data.points)} points, {len(data.uv)} observations,"
-        f" {int(data.outlier.sum())} of them outliers\n{truth}: the truth"
-    )
+    print(_spheres().make(args.target, args.preset, given))
     return 0
+
+
+def _spheres() -> ModuleType:
+    return checkout.load("thesis.sphere_file", "--kind sphere")
 
 
 def _declared() -> dict[str, dict[str, Parameter]]:
     """Return, by name of the option, its declaration for each kind that has it."""
-    from ba_node.synthetic import declarations, sphere_declarations  # noqa: PLC0415
+    from ba_node.synthetic import declarations  # noqa: PLC0415
 
+    kinds = {_RECORDING: declarations()}
+    if checkout.present():
+        kinds[_SPHERE] = _spheres().sphere_declarations()
     found: dict[str, dict[str, Parameter]] = {}
-    for kind, options in ((_RECORDING, declarations()), (_SPHERE, sphere_declarations())):
+    for kind, options in kinds.items():
         for option in options:
             found.setdefault(option.name, {})[kind] = option
     return found

@@ -12,13 +12,14 @@ import scipy
 from numpy.typing import NDArray
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import scaling
-from ba_node.core.kernels import Demands, Kernels, Moved, System
+from ba_node.core.kernels import Kernels, Moved, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.native_factors import NativeFactorSum
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Rules, reprojection_errors
+from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Problem, State
 
 FloatArray = NDArray[np.float64]
@@ -33,29 +34,28 @@ class KernelsError(ValueError):
     """Kernels that were asked for by name and cannot be had."""
 
 
-_POINTS = Demands()
 _NO_PAIRS = (np.empty(0, np.int64), np.empty(0, np.int64))
 
 
-def make(problem: Problem, rules: Rules, backend: str = "auto", demands: Demands = _POINTS) -> Kernels:
+def make(problem: Problem, options: SolverOptions) -> Kernels:
     """Return the kernels of a problem.
 
     Raises:
         KernelsError: native is asked for and is not built, or does not have what else is asked for.
     """
-    reason = missing(rules, demands)
-    if backend == "native" and reason:
-        raise KernelsError(f"backend native: {reason}; take numpy or auto")
-    if backend == "numpy" or reason:
-        return NumpyKernels(problem, rules, demands)
-    return NativeKernels(problem, rules, demands.threads)
+    reason = missing(options)
+    if options.kernels == "native" and reason:
+        raise KernelsError(f"kernels native: {reason}; take numpy or auto")
+    if options.kernels == "numpy" or reason:
+        return NumpyKernels(problem, options)
+    return NativeKernels(problem, options)
 
 
-def missing(rules: Rules, demands: Demands) -> str:
+def missing(options: SolverOptions) -> str:
     """Return why the C++ kernels cannot be used, or an empty string if they can."""
-    reason = native.missing(rules.parameterisation, rules.loss)
-    if not reason and demands.schur != "points":
-        return f"the C++ kernels eliminate points only, not schur = {demands.schur}"
+    reason = native.missing(options.parameterisation, options.loss)
+    if not reason and options.schur != "points":
+        return f"the C++ kernels eliminate points only, not schur = {options.schur}"
     return reason
 
 
@@ -83,8 +83,8 @@ def residual_norms(problem: Problem, state: State, backend: str = "auto") -> Flo
 class NativeKernels:
     """The kernels in C++."""
 
-    def __init__(self, problem: Problem, rules: Rules, threads: int = 1) -> None:
-        """Hand the problem over; it is copied and sorted once. threads: 0 for one a core."""
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
+        """Hand the problem over; it is copied and sorted once."""
         obs, cams = problem.observations, problem.cameras
         self.size = 9 if problem.free_intrinsics else 6
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
@@ -102,11 +102,11 @@ class NativeKernels:
             camera_model=cams.model,
             camera_params=cams.params,
             fixed=problem.fixed,
-            loss=_LOSSES.index(rules.loss),
-            loss_scale=rules.loss_scale,
-            cheirality=_CHEIRALITY.index(rules.cheirality),
+            loss=_LOSSES.index(options.loss),
+            loss_scale=options.loss_scale_px,
+            cheirality=_CHEIRALITY.index(options.cheirality),
             factor_pairs=_NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns),
-            threads=threads or len(os.sched_getaffinity(0)),
+            threads=options.threads or len(os.sched_getaffinity(0)),
             start=_arrays(problem.start),
         )
         self.n_free: int = self._kernel.n_free

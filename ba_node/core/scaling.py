@@ -3,7 +3,7 @@
 """Diagonal matrices D for damping (H + mu D) and for the scaled trust region (|D p| <= radius).
 
 ``inc`` (3.38, 3.94-3.99): D = diag(1/step), with the steps that make forward differences of the reprojection error
-agree best with the analytic Jacobian. The search of step_search.py (``ba steps``) gives 1e-8 on Ladybug-49 for
+agree best with the analytic Jacobian. The search of ``ba steps`` gives 1e-8 on Ladybug-49 for
 rotation, translation and points, in both parameterisations. The residual is linear in f, k1 and k2, where the search
 determines nothing; their values are those of nine tried that brought ``local_dinm`` to the smallest gradient there in
 50 iterations.

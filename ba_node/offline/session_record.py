@@ -14,7 +14,10 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate, Poses
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
+from ba_node.scene.tables import BoolArray
 from ba_node.window import quality
+
+_IDS_SHOWN = 6
 
 
 @dataclass
@@ -32,7 +35,8 @@ class SessionRecord:
         solver_time_s: in all, s.
         slowest: time and keyframe of the slowest solve.
         iterations: outer iterations in all.
-        unrefined: why no keyframe was refined, empty if one was; see :meth:`close`.
+        reasons: why a solve gave nothing, by its newest keyframe.
+        unrefined: which keyframes were not refined and why, empty if all were; see :meth:`close`.
         figures: what is known only while the session's scene exists, see :meth:`close`.
     """
 
@@ -46,6 +50,7 @@ class SessionRecord:
     solver_time_s: float = 0.0
     slowest: tuple[float, int] = (0.0, 0)
     iterations: int = 0
+    reasons: dict[int, str] = field(default_factory=dict)
     unrefined: str = ""
     figures: dict[str, Any] = field(default_factory=dict)
 
@@ -62,6 +67,8 @@ class SessionRecord:
         self.iterations += report.iterations
         self.solver_time_s += report.solve_time_s
         self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
+        if not report.status.usable:
+            self.reasons[report.newest_keyframe_id] = report.reason
         rows = ((key, scene.find_keyframe(key)) for key in estimate.refined.keyframe_id.tolist())
         self.refined.update(key for key, row in rows if row is not None and scene.keyframes.refined[row])
         # What a check of the set-up has taken back.
@@ -70,7 +77,7 @@ class SessionRecord:
 
     def close(self, scene: Scene, config: Config) -> None:
         """Take the figures of the whole map from a scene that is about to go."""
-        self.unrefined = "" if self.refined else _why_unrefined(scene, self.statuses, self.last)
+        self.unrefined = self._some_unrefined() if self.refined else _why_unrefined(scene, self.statuses, self.last)
         of = {state: quality.summary(scene, config, state) for state in quality.STATES}
         self.figures = {
             **{name: {state: of[state][name] for state in of} for name in of["input"]},
@@ -81,6 +88,19 @@ class SessionRecord:
             "rejection_notes": list(scene.log.notes),
             "warnings": dict(scene.log.warnings),
         }
+
+    def _some_unrefined(self) -> str:
+        """Return which keyframes were not refined though others were, and the usual reason; empty if all were."""
+        poses = self.input_trajectory
+        left = ~np.isin(poses.keyframe_id, np.array(list(self.refined), dtype=np.uint64))
+        ids = poses.keyframe_id[left].tolist()
+        if not ids:
+            return ""
+        reasons = Counter(self.reasons[key] for key in ids if key in self.reasons)
+        reason = reasons.most_common(1)[0][0] if reasons else "solves of their windows left them out"
+        moved = np.linalg.norm(np.diff(poses.position[left], axis=0), axis=1).sum()
+        by = f" (the front-end's poses move {moved:.3g} m over them)" if _adjacent(left) else ""
+        return f"{_listed(ids, together=_adjacent(left))}{by}: {reason}"
 
     @property
     def trajectory(self) -> Poses:
@@ -130,6 +150,20 @@ def _why_unrefined(scene: Scene, statuses: Counter[str], last: Estimate | None) 
     if not len(scene.sightings):
         return f"all {empty} tracks messages are empty" if empty else "no tracks came that could be used"
     return last.report.reason if last is not None else ""
+
+
+def _adjacent(chosen: BoolArray) -> bool:
+    """Return True if all that is chosen of a row of things lies side by side, and is more than one."""
+    rows = np.flatnonzero(chosen)
+    return len(rows) > 1 and int(rows[-1] - rows[0]) == len(rows) - 1
+
+
+def _listed(ids: list[int], *, together: bool) -> str:
+    """Return ids in words, the first few where there are many."""
+    if together:
+        return f"keyframes {ids[0]} to {ids[-1]}"
+    shown = ", ".join(map(str, ids[:_IDS_SHOWN])) + (", ..." if len(ids) > _IDS_SHOWN else "")
+    return f"keyframe{'s' if len(ids) > 1 else ''} {shown}"
 
 
 def _joined(parts: list[Poses]) -> Poses:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.options import SolverOptions
+from ba_node.config import SolverOptions
 from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
 from ba_node.core.solver import solve

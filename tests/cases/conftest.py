@@ -15,7 +15,7 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.estimate import Poses
-from ba_node.offline.harm import SessionError, said, session_errors
+from experiments.robustness.harm import SessionError, said, session_errors
 
 Replay = Callable[..., "Outcome"]
 

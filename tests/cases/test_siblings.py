@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from ba_node.offline.recording import record
-from ba_node.synthetic.faults import FAULTS, Recording, spoiled
+from experiments.robustness.faults import FAULTS, Recording, spoiled
 from tests.cases.conftest import Replay, harmless
 
 # Faults that are not mended yet; a name goes as soon as its tests pass.
-PENDING = {"outliers_moving", "stands_still", "pure_rotation", "hardly_moves", "rectified_with_distortion"}
+PENDING = {"outliers_moving", "stands_still", "pure_rotation", "hardly_moves"}
 
 
 def siblings() -> list[Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ba_node.cli.main import main
-from ba_node.synthetic.faults import RIGS, SOUND, spoiled
+from experiments.robustness.faults import RIGS, SOUND, spoiled
 from tests.cases.conftest import Outcome, Replay, harmless
 from tests.cases.test_siblings import write
 

@@ -14,7 +14,7 @@ from ba_node.check.examine import examine
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
-from ba_node.synthetic.faults import spoiled
+from experiments.robustness.faults import spoiled
 from tests.check.set_ups import recording, seen
 
 # Mistake -> modes in which it shows, and what the likely mistake says.

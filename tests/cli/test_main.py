@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ba_node.cli import checkout
 from ba_node.cli.main import COMMANDS, main
 
 
@@ -19,6 +20,26 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
     text = capsys.readouterr().out
     assert stop.value.code == 0
     assert f"example:\n  ba {command}" in text
+
+
+@pytest.mark.parametrize("command", ["steps", "robustness", "thesis"])
+def test_commands_of_a_checkout_say_so_elsewhere(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(checkout, "ROOT", tmp_path)
+    for arguments in ([command], [command, "--help"]):
+        assert refused(capsys, *arguments) == (
+            f"ba: error: {command} needs a checkout of the repository: experiments are not installed with ba_node\n"
+        )
+
+
+def test_an_installed_package_makes_recordings_and_no_spheres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(checkout, "ROOT", tmp_path)
+    assert "--kind sphere needs a checkout" in refused(capsys, "synth", str(tmp_path / "ball.txt"), "--kind", "sphere")
+    assert main(["synth", str(tmp_path / "short.mcap"), "--keyframes", "3"]) == 0
+    assert (tmp_path / "short.mcap").stat().st_size > 1000
 
 
 def test_overview_names_every_command_and_is_fast() -> None:

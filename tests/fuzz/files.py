@@ -31,7 +31,7 @@ from ba_node.io.parameters import configure, parameters_yaml
 from ba_node.io.ply import read_ply, write_ply
 from ba_node.io.trajectory import read_tum, write_tum
 from ba_node.offline.recording import read_truth, record
-from ba_node.synthetic.faults import MONO, SOUND, spoiled
+from experiments.robustness.faults import MONO, SOUND, spoiled
 
 Reader = Callable[[Path], object]
 _TINY: dict[str, Any] = {"keyframes": 3, "length_m": 10.0, "landmarks": 200, "tracks": 12}

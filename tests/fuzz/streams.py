@@ -25,7 +25,7 @@ from ba_node.messages.conversion import (
     rig_message,
     tracks_message,
 )
-from ba_node.synthetic.faults import RIGS, SOUND, spoiled
+from experiments.robustness.faults import RIGS, SOUND, spoiled
 
 _SETTINGS = {"solver.max_iterations": 3, "window.max_keyframes": 3, "scene.max_pending": 5, "scene.max_landmarks": 100}
 _TINY: dict[str, Any] = {

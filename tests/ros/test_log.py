@@ -81,7 +81,7 @@ def test_the_walk_finds_nothing_else(source: str) -> None:
 
 
 def test_no_source_has_such_a_site() -> None:
-    paths = [path for folder in ("ba_node", "launch", "benchmarks") for path in sorted((ROOT / folder).rglob("*.py"))]
+    paths = [path for folder in ("ba_node", "launch", "experiments") for path in sorted((ROOT / folder).rglob("*.py"))]
     assert len(paths) > 150
     found = [f"{path.relative_to(ROOT)}:{line}" for path in paths for line in changing_sites(path.read_text())]
     assert not found, found

@@ -13,7 +13,7 @@ import numpy as np
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
-from ba_node.synthetic.faults.motion import stands_still
+from experiments.robustness.faults.motion import stands_still
 
 # Between keyframes: the default of SyntheticOptions.keyframe_rate_hz.
 _STEP_NS = 250_000_000

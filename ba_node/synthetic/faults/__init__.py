@@ -1,8 +1,0 @@
-# Copyright 2026 The ba_node Authors
-# SPDX-License-Identifier: Apache-2.0
-"""Recordings as they go wrong in practice, with the truth: one function a fault, in one line, the same by seed."""
-
-from ba_node.synthetic.faults.catalogue import FAULTS, MONO, RGBD, RIGS, SOUND, STEREO, Fault, spoiled
-from ba_node.synthetic.faults.recording import Recording, without_outliers
-
-__all__ = ["FAULTS", "MONO", "RGBD", "RIGS", "SOUND", "STEREO", "Fault", "Recording", "spoiled", "without_outliers"]

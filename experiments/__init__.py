@@ -1,0 +1,7 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Experiments on ba_node, which a checkout of the repository has and an installed package has not.
+
+``thesis`` repeats the experiments of the thesis behind the methods (``ba thesis``), ``benchmarks`` compares with other
+solvers (``make bench``), ``robustness`` replays recordings gone wrong (``ba robustness``).
+"""

@@ -1,0 +1,93 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run one solver on one problem in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from ba_node.config import SolverOptions
+from ba_node.core.objective import Objective
+from experiments.benchmarks.problem_file import Case, case_problem, read_state
+from experiments.benchmarks.solvers import ROOT, Solver
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a solver stops: iterations, relative decrease of an accepted step, seconds until it is ended."""
+
+    iterations: int = 100
+    tolerance: float = 1e-8
+    seconds: float = 60.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run gave.
+
+    Attributes:
+        trace: (seconds since the start of the set-up, objective); empty on failure.
+        total_s: until the solver returned.
+        start_mb: memory of the process with the problem loaded.
+        peak_mb: the most memory it had.
+        checked: objective of its solution, recomputed by ba_node's numpy kernels; NaN on failure.
+        version: of the solver.
+        reason: why it stopped, or why it failed.
+    """
+
+    trace: tuple[tuple[float, float], ...] = ()
+    total_s: float = math.nan
+    start_mb: float = math.nan
+    peak_mb: float = math.nan
+    checked: float = math.nan
+    version: str = ""
+    reason: str = ""
+
+
+def run(solver: Solver, file: Path, case: Case, loss: str, limits: Limits) -> Run:
+    """Run and check."""
+    with tempfile.TemporaryDirectory(prefix="ba_bench_") as name:
+        folder = Path(name)
+        trace, state = folder / "trace.json", folder / "state.bin"
+        command = [*solver.command, "--problem", str(file.resolve()), "--trace", str(trace), "--state", str(state)]
+        command += ["--config", solver.config, "--loss", loss, "--threads", str(solver.threads)]
+        command += ["--iterations", str(limits.iterations), "--tolerance", repr(limits.tolerance)]
+        error = _execute(command, solver.threads, limits.seconds)
+        if error:
+            return Run(reason=error)
+        row = json.loads(trace.read_text())
+        solved = read_state(state, case)
+    row["trace"] = tuple((float(time), float(value)) for time, value in row["trace"])
+    known = {key: row[key] for key in ("trace", "total_s", "start_mb", "peak_mb", "version", "reason")}
+    return Run(**known, checked=objective(solved, loss))
+
+
+def objective(case: Case, loss: str) -> float:
+    """Return the objective at the start of a case; points behind a camera keep their residual."""
+    problem = case_problem(case)
+    return Objective(problem, SolverOptions(loss=loss, cheirality="keep")).value(problem.start)
+
+
+def _execute(command: list[str], threads: int, seconds: float) -> str:
+    """Return an empty string, or why it failed."""
+    count = str(threads)
+    environment = {
+        **os.environ,
+        **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS"), count),
+    }
+    try:
+        done = subprocess.run(
+            command, cwd=ROOT, env=environment, timeout=seconds, capture_output=True, text=True, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"ended after {seconds:.0f} s"
+    if done.returncode:
+        words = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        return f"failed with {done.returncode}: {words}"
+    return ""

@@ -1,0 +1,266 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Declare every way in which a recording goes wrong once: what it is, how much of it, and what a user must be told.
+
+One line makes a recording with a fault and its truth::
+
+    recording = spoiled("camera_turned", amount=2.0, seed=3)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ba_node.synthetic.generate import generate
+from ba_node.synthetic.options import SyntheticOptions
+from ba_node.synthetic.world import Path, World
+from experiments.robustness.faults import motion, setup, stamps, tracks
+from experiments.robustness.faults.recording import Recording
+
+Edit = Callable[[Recording, float, np.random.Generator], Recording]
+Motion = Callable[[World, Path, float], tuple[World, Path]]
+
+STEREO, MONO, RGBD = "stereo", "mono", "rgbd"
+RIGS: dict[str, dict[str, Any]] = {
+    STEREO: {"baseline_m": 0.12},
+    MONO: {"baseline_m": 0.0},
+    RGBD: {"baseline_m": 0.0, "depth_share": 0.9},
+}
+# A short drive with odometry that is good, so that harm shows, and yet worse than what the tracks tell.
+_BASE: dict[str, Any] = {
+    "keyframes": 40,
+    "landmarks": 2500,
+    "path": "line",
+    "length_m": 20.0,
+    "tracks": 150,
+    "outlier_share": 0.01,
+    "drift_rotation_deg": 0.3,
+    "drift_translation": 0.02,
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One way in which a recording goes wrong.
+
+    Attributes:
+        about: what is wrong, for tables.
+        edit: what it does to the messages.
+        motion: what it does to the world and the path.
+        amounts: how much of it, the usual first.
+        rigs: the rigs that can have it, the usual first.
+        told: patterns (re, any case), each of which a user must find in what is said; none where the result is to be as
+            good as ever.
+        codes: exit codes of a replay that are right: 3 where there is something to look at, 2 where it may be refused.
+        least: share of the keyframe messages that have to be published.
+        changes: options of the recording that it needs.
+    """
+
+    about: str
+    edit: Edit | None = None
+    motion: Motion | None = None
+    amounts: tuple[float, ...] = (1.0,)
+    rigs: tuple[str, ...] = (STEREO, MONO)
+    told: tuple[str, ...] = ()
+    codes: tuple[int, ...] = (0, 3)
+    least: float = 1.0
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+_TWO = (STEREO,)
+_ALL = (STEREO, MONO, RGBD)
+# Exit codes: something to look at; the same, or refused.
+_LOOK, _REFUSED = (3,), (2, 3)
+FAULTS: dict[str, Fault] = {
+    # What is said about cameras, frames and units.
+    "baseline_reversed": Fault(
+        "second camera on the wrong side", setup.baseline_reversed, rigs=_TWO, told=("baseline|swapped",), codes=_LOOK
+    ),
+    "cameras_swapped": Fault(
+        "cameras swapped", setup.cameras_swapped, rigs=_TWO, told=("swapped|baseline",), codes=_LOOK
+    ),
+    "extrinsics_inverted": Fault(
+        "extrinsics inverted",
+        setup.extrinsics_inverted,
+        rigs=_ALL,
+        told=("invert|camera.from.body|axes|body_from_camera",),
+        codes=_LOOK,
+    ),
+    "axes_confused": Fault(
+        "body axes given as optical",
+        setup.axes_confused,
+        rigs=_ALL,
+        told=("axes|optical|body_from_camera",),
+        codes=_LOOK,
+    ),
+    "camera_turned": Fault(
+        "second camera turned, deg",
+        setup.camera_turned,
+        amounts=(1.0, 0.5, 3.0, 10.0),
+        rigs=_TWO,
+        told=(r"camera \S+ .*(degree|\bdeg\b|turned|does not fit)",),
+        codes=_LOOK,
+    ),
+    "depth_in_mm": Fault(
+        "depth, times",
+        setup.depth_in_mm,
+        amounts=(1000.0, 0.001, 100.0),
+        rigs=(RGBD,),
+        told=("depth",),
+        codes=_LOOK,
+    ),
+    "poses_inverted": Fault(
+        "poses inverted", setup.poses_inverted, rigs=_ALL, told=("pose.*invert|invert.*pose",), codes=_LOOK
+    ),
+    "focal_off": Fault(
+        "focal length, times",
+        setup.focal_off,
+        amounts=(1.2, 0.8, 1.5),
+        rigs=_ALL,
+        told=("focal",),
+        codes=_LOOK,
+    ),
+    "roi_ignored": Fault(
+        "region of interest not said, px",
+        setup.roi_ignored,
+        amounts=(120.0, 60.0),
+        rigs=_ALL,
+        told=(r"region|\broi\b|principal",),
+        codes=_LOOK,
+    ),
+    "roi_given": Fault("region of interest said, px", setup.roi_given, amounts=(120.0, 60.0), codes=(0,)),
+    "binning_ignored": Fault(
+        "binning not said",
+        setup.binning_ignored,
+        amounts=(2.0, 4.0),
+        told=("binning|focal|intrinsics",),
+        codes=_LOOK,
+    ),
+    "binning_given": Fault("binning said", setup.binning_given, amounts=(2.0,), codes=(0,)),
+    "rectified_with_distortion": Fault(
+        "rectified, distortion given", setup.rectified_with_distortion, told=("rectif|distortion",), codes=_LOOK
+    ),
+    # Stamps, sessions, frames.
+    "clock_set_back": Fault(
+        "clock set back, s",
+        stamps.clock_set_back,
+        amounts=(3600.0, 60.0),
+        told=("stamp|clock|session",),
+        least=0.95,
+    ),
+    "one_stamp_zero": Fault("one stamp is zero", stamps.one_stamp_zero, told=("stamp",), codes=_LOOK, least=0.97),
+    "one_stamp_future": Fault(
+        "one stamp ahead, s",
+        stamps.one_stamp_future,
+        amounts=(4e8, 86400.0),
+        told=("stamp",),
+        codes=_LOOK,
+        least=0.97,
+    ),
+    "stamps_in_another_unit": Fault("stamps, divided by", stamps.stamps_in_another_unit, amounts=(1e3, 1e6)),
+    "begins_anew": Fault(
+        "recording begins anew", stamps.begins_anew, told=("session|stamp|again|duplicate",), least=0.5
+    ),
+    "session_lowered": Fault(
+        "session id lowered by", stamps.session_lowered, amounts=(10.0, 1.0), told=("session",), least=0.95
+    ),
+    "useless_messages": Fault("useless messages of a higher session", stamps.useless_messages, amounts=(3.0,)),
+    "duplicates": Fault(
+        "keyframes again, stamps off by, s", stamps.duplicates, amounts=(-3600.0, 0.05, 3600.0), least=0.85
+    ),
+    "frame_slash": Fault("frame /odom", stamps.frame_slash, told=("frame",), codes=_REFUSED, least=0.0),
+    "frame_empty": Fault("frame without a name", stamps.frame_empty, told=("frame",), codes=_REFUSED, least=0.0),
+    "frame_changes": Fault("frame renamed midway", stamps.frame_changes, told=("frame",), codes=_LOOK, least=0.5),
+    # The front-end errs.
+    "ids_reused": Fault("ids reused as places", tracks.ids_reused, told=(r"reuse|\bids?\b",), codes=_LOOK),
+    "wrong_ids": Fault("keyframes with wrong ids", tracks.wrong_ids, amounts=(5.0, 1.0, 2.0)),
+    "outliers_uniform": Fault("outliers anywhere, share", tracks.outliers_uniform, amounts=(0.3, 0.5, 0.1), rigs=_ALL),
+    "outliers_jumping": Fault("tracks jump, share", tracks.outliers_jumping, amounts=(0.3, 0.5, 0.1), rigs=_ALL),
+    "outliers_moving": Fault("moving objects, share", tracks.outliers_moving, amounts=(0.3, 0.4, 0.1), rigs=_ALL),
+    "one_keyframe_far": Fault(
+        "one keyframe off, m",
+        tracks.one_keyframe_far,
+        amounts=(60.0, 5.0, 1000.0),
+        rigs=_ALL,
+    ),
+    # Little is determined.
+    "few_points": Fault("points a keyframe", tracks.few_points, amounts=(2.0, 4.0, 8.0), changes={"track_loss": 0.01}),
+    "few_observations": Fault(
+        "20 tracks a keyframe on a long path",
+        changes={"tracks": 20, "keyframes": 150, "length_m": 100.0, "reobserve": False},
+    ),
+    "stands_still": Fault(
+        "stands still at first, keyframes", motion=motion.stands_still, amounts=(20.0, 30.0), rigs=(MONO, STEREO, RGBD)
+    ),
+    "stands_still_mismatched": Fault(
+        "the same with 2 % mismatches",
+        motion=motion.stands_still,
+        amounts=(30.0,),
+        rigs=_ALL,
+        changes={"outlier_share": 0.02},
+    ),
+    "stops_midway": Fault(
+        "stops midway, keyframes", motion=motion.stops_midway, amounts=(20.0,), rigs=(MONO, STEREO, RGBD)
+    ),
+    "pure_rotation": Fault(
+        "turns on the spot, deg a keyframe", motion=motion.pure_rotation, amounts=(3.0, 1.0, 8.0), rigs=(MONO, STEREO)
+    ),
+    "hardly_moves": Fault(
+        "1 mm a keyframe at first, times",
+        motion=motion.hardly_moves,
+        rigs=(MONO,),
+        changes={"guesses": True, "guess_noise": 0.0},
+    ),
+    "far_points": Fault(
+        "all points far, km",
+        motion=motion.far_points,
+        amounts=(5.0, 1.0),
+        changes={"max_range_m": 10_000.0},
+    ),
+    "optimal_map": Fault(
+        "poses and guesses at the truth",
+        rigs=(MONO, STEREO),
+        changes={
+            "guesses": True,
+            "guess_noise": 0.0,
+            "drift_rotation_deg": 0.0,
+            "drift_translation": 0.0,
+            "outlier_share": 0.0,
+            "noise_px": 0.02,
+            "keyframes": 12,
+            "length_m": 10.0,
+        },
+    ),
+}
+
+
+def spoiled(name: str, rig: str | None = None, amount: float | None = None, seed: int = 0, **changes: Any) -> Recording:
+    """Return a recording with a fault. The same arguments give the same numbers.
+
+    Args:
+        name: one of FAULTS, or ``sound`` for none.
+        rig: one of RIGS; None for the usual one of the fault.
+        amount: how much of the fault; None for the usual.
+        seed: of world, noise and fault.
+        changes: SyntheticOptions other than those of a short drive with good odometry.
+
+    Raises:
+        KeyError: no such fault or rig.
+        ConfigError: an option out of range.
+    """
+    fault = Fault("nothing") if name == SOUND else FAULTS[name]
+    much = fault.amounts[0] if amount is None else amount
+    options = SyntheticOptions(**{**_BASE, **RIGS[rig or fault.rigs[0]], **fault.changes, **changes}, seed=seed)
+    move = fault.motion
+    data = generate(options, None if move is None else lambda world, path: move(world, path, much))
+    recording = Recording(data, tuple(data.timeline()))
+    if fault.edit is None:
+        return recording
+    return fault.edit(recording, much, np.random.default_rng([seed, *name.encode()]))
+
+
+SOUND = "sound"

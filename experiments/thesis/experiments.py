@@ -1,0 +1,70 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What an experiment is: cases to run, what is shown of them, and what the thesis has in the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from experiments.thesis.tasks import Task
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of a table, a curve of a picture.
+
+    Attributes:
+        label: as in the thesis where it has the same.
+        task: what is run.
+        thesis: its figures, by quantity (quantities.py).
+        note: what departs from the thesis.
+        versus: label of the case that its times are compared with; empty for the first.
+    """
+
+    label: str
+    task: Task
+    thesis: Mapping[str, float | str] = field(default_factory=dict)
+    note: str = ""
+    versus: str = ""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A table of the thesis with the figures that belong to it, or figures alone.
+
+    Attributes:
+        name: ``3.8`` for a table, ``fig-3.1`` for figures alone, a word for what the thesis does not have.
+        title: what is compared.
+        cases: rows.
+        columns: quantities of the table.
+        figures: of the thesis that it repeats.
+        plots: names in plots.PLOTS.
+        note: what is to be known.
+    """
+
+    name: str
+    title: str
+    cases: tuple[Case, ...]
+    columns: tuple[str, ...]
+    figures: tuple[str, ...] = ()
+    plots: tuple[str, ...] = ()
+    note: str = ""
+
+    def case(self, label: str) -> Case:
+        """Return the case of a label, the first one for an empty label."""
+        return next(case for case in self.cases if label in ("", case.label))
+
+    @property
+    def is_table(self) -> bool:
+        """Return True if the thesis has a table of this name."""
+        return self.name.replace(".", "").isdigit()
+
+    @property
+    def heading(self) -> str:
+        """Return what it repeats and its title."""
+        repeated = [f"Table {self.name}"] if self.is_table else []
+        if self.figures:
+            repeated.append(f"Figure{'s' if len(self.figures) > 1 else ''} {', '.join(self.figures)}")
+        name = f"Open problem ({self.name})" if self.name.startswith("open-") else self.name.capitalize()
+        return f"{', '.join(repeated) or name}: {self.title}"
