@@ -63,7 +63,7 @@ def write_map(path: Path | str, content: MapContent) -> None:
 
 
 def read_map(path: Path | str) -> MapContent:
-    """Read a file as it is; whether its parts fit together is for the back-end to judge, see :func:`load_map`.
+    """Read a file as it is; whether its parts fit together is checked by :func:`load_map`.
 
     Raises:
         MapFileError: it cannot be opened, is no map or damaged, or has a newer format.

@@ -73,7 +73,7 @@ class MapOptions:
         load: map to begin with; the recording must go on in its session.
         optimize: refine everything of the newest session at the end.
         save: file for the map of the newest session.
-        topics: which topics of the recording are taken, where it cannot be told.
+        topics: which topics of the recording are taken, where several are possible.
     """
 
     load: Path | None = None
@@ -240,19 +240,19 @@ class _AllTopics:
 
 
 def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dict[str, Any]:
-    """Write the files of every session; return the figures of the newest, with those of the older ones in it."""
+    """Write the files of every session; return the summary of the newest, with those of the older ones in it."""
     folders = [*(out / name for name in _folder_names(sessions[:-1])), out]
     for folder, record in zip(folders, sessions, strict=True):
         folder.mkdir(exist_ok=True)
         write_tum(folder / "trajectory.tum", record.trajectory)
         write_tum(folder / "trajectory_input.tum", record.input_trajectory)
         write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
-    figures = [record.as_dict() | _against(truth, record) for record in sessions]
-    for folder, entry in zip(folders[:-1], figures, strict=False):
+    summaries = [record.as_dict() | _against(truth, record) for record in sessions]
+    for folder, entry in zip(folders[:-1], summaries, strict=False):
         entry["folder"] = folder.name
     if truth is not None:
         write_tum(out / "ground_truth.tum", truth)
-    return {**figures[-1], "older_sessions": figures[:-1]}
+    return {**summaries[-1], "older_sessions": summaries[:-1]}
 
 
 def _against(truth: Poses | None, record: SessionRecord) -> dict[str, Any]:
@@ -281,8 +281,8 @@ def _folder_names(sessions: list[SessionRecord]) -> Iterator[str]:
 def _nothing_to_use(run: _Run) -> str:
     """Say what there was of each kind of message, as no keyframe could be used."""
     counts = [run.counted[kind] for kind in (Keyframe, FeatureTracks, CameraRig)]
-    told = "none of {} keyframes can be used" if counts[0] else "it holds no keyframes"
-    return f"{told.format(counts[0])} (tracks messages: {counts[1]}, camera rigs: {counts[2]})"
+    reason = f"none of {counts[0]} keyframes can be used" if counts[0] else "it holds no keyframes"
+    return f"{reason} (tracks messages: {counts[1]}, camera rigs: {counts[2]})"
 
 
 def _why(reader: BagReader, run: _Run) -> str:

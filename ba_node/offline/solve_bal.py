@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve a BAL problem as a whole, and tell everything about how it went."""
+"""Solve a BAL problem as a whole, and report how it went."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Solution:
 
     Attributes:
         source: the file.
-        bal: what it held, moved by minus the origin.
+        bal: its content, moved by minus the origin.
         problem: the same in our terms.
         origin: (3,) of the coordinates in which it was solved, in those of the file; zeros if they are the same.
         result: state and trace.
@@ -88,7 +88,7 @@ class Solution:
         return lines, grave
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON; an infinite radius becomes null there."""
+        """Return statistics, options and trace for JSON; an infinite radius becomes null there."""
         result = self.result
         with np.errstate(all="ignore"):  # infinite where the solve failed
             rms_before, rms_after = rms_px(self.problem, self.problem.start, result.state)
