@@ -274,7 +274,7 @@ class Backend:
 
     def begin_optimization(self) -> Optimization | str:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
-        taken = full.copy(self.scene, self.config)
+        taken = full.take_snapshot(self.scene, self.config)
         return taken if isinstance(taken, str) else Optimization(taken)
 
     def is_current(self, optimization: Optimization) -> bool:
@@ -292,13 +292,13 @@ class Backend:
         if not result.status.usable or not result.state.is_finite():
             return None
         found = taken.outcome(result.state, self.config)
-        verdict = guard.judge(self.config, taken.selection, found)
+        verdict = guard.decide(self.config, taken.selection, found)
         self.refusal = self.setup.reason(self.scene) or ("" if verdict.odd else verdict.reason)
         if self.refusal:
             self.map.hold(f"a solve of everything: {self.refusal}")
             return None
         assert found.state is not None
-        followed = full.put(self.scene, self.config, taken, found.state)
+        followed = full.merge_snapshot(self.scene, self.config, taken, found.state)
         if followed is None:
             return None
         self.solve_count += 1
@@ -318,7 +318,7 @@ class Backend:
     def snapshot(self) -> MapContent:
         """Return a copy of all that is known, for a file; see docs/map_format.md."""
         return archive.pack(
-            archive.Known(
+            archive.MapState(
                 self.scene,
                 self.finished,
                 self.map.report,
@@ -330,7 +330,7 @@ class Backend:
             )
         )
 
-    def take_over(self, known: archive.Known) -> None:
+    def take_over(self, known: archive.MapState) -> None:
         """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
 
         Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Improve points alone, keyframes held: the inner iterations after a step of the keyframes.
+"""Improve points alone, keyframes fixed: the inner iterations after a step of the keyframes.
 
 Each point has its own 3 x 3 damped normal equations (Marquardt) and its own objective. A point whose step does not
 lower its objective goes back to where it was, and stays: no point can make the whole worse. Only observations of points
@@ -68,7 +68,7 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         better = cost < best_cost[ids]
         if step:
             taken = np.flatnonzero(np.repeat(better, count))
-            kept.put(rows[taken], seen, taken)
+            kept.update(rows[taken], seen, taken)
         with np.errstate(invalid="ignore"):
             active = better & ~(best_cost[ids] - cost < _MIN_GAIN * cost)
         best[ids[better]], best_cost[ids[better]] = points[ids[better]], cost[better]

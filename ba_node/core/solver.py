@@ -3,7 +3,7 @@
 """One loop for every method: damped, trust-region, inexact Newton steps on the reduced system (Algorithms 5, 8 to 11).
 
 Each outer iteration linearises, damps (``H + mu D``), eliminates the points (or the keyframes, or nothing), solves
-what is left by Cholesky or by PCG inside ``|D x| <= radius``, substitutes back, and judges the step by the gain ratio
+what is left by Cholesky or by PCG inside ``|D x| <= radius``, substitutes back, and accepts the step by the gain ratio
 
     rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2)                   gain_model = undamped
     rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2 - mu/2 p'D p)      gain_model = damped    (3.90, 3.102, 3.104)
@@ -178,7 +178,7 @@ class _Run:
         self.side = system.side
         solution = self.reduced.solve(system, self.kernels.diagonals, self.radius)
         if solution.x is None:
-            return self._judge(-1.0, solution), solution
+            return self._accept_step(-1.0, solution), solution
         moved = self.kernels.move(self.state, system, solution.x, self.options.inner_iterations)
         rho = -1.0
         predicted = moved.predicted - (moved.damping if self.options.gain_model == "damped" else 0.0)
@@ -186,12 +186,12 @@ class _Run:
             rho = (self.value - moved.unpolished) / predicted
         if moved.objective < min(moved.unpolished, self.value):
             rho = max(rho, (self.value - moved.objective) / predicted) if rho > 0 else _SAVED_RHO
-        accepted = self._judge(rho, solution)
+        accepted = self._accept_step(rho, solution)
         if accepted:
             self.state, self.value = moved.state, moved.objective
         return accepted, solution
 
-    def _judge(self, rho: float, solution: linear.Solution) -> bool:
+    def _accept_step(self, rho: float, solution: linear.Solution) -> bool:
         """Update damping and radius from the gain ratio; return whether the step is taken."""
         accepted = rho > 0.0
         if accepted:

@@ -20,7 +20,7 @@ from ba_node.core import geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.frame_names import plain
-from ba_node.scene.records import Block, Keyframes, Landmarks, Sightings
+from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
 from ba_node.scene.rejections import WARNINGS, RejectionLog
 from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IdIndex, IntArray
 
@@ -43,8 +43,8 @@ class Scene:
         refused_rig: why the last rig that was refused was, empty if none was.
         keyframes: table, in order of arrival; see ``order``.
         landmarks: table, in order of arrival.
-        sightings: table, in order of arrival.
-        blocks: per keyframe row, its rows in ``sightings``.
+        observations: table, in order of arrival.
+        blocks: per keyframe row, its rows in ``observations``.
         log: what was turned away.
     """
 
@@ -58,7 +58,7 @@ class Scene:
         self.refused_rig = ""
         self.keyframes = Keyframes()
         self.landmarks = Landmarks()
-        self.sightings = Sightings()
+        self.observations = ObservationTable()
         self.blocks: list[list[Block]] = []
         self.log = RejectionLog()
         self.pending: list[FeatureTracks] = []
@@ -108,7 +108,7 @@ class Scene:
         front = front[front >= 0]
         while len(front) and (newest is None or len(found) < newest):
             found.append(front)
-            front = self.sightings.previous[front]
+            front = self.observations.previous[front]
             front = front[front >= 0]
         return np.concatenate(found) if found else np.empty(0, np.intp)
 
@@ -177,19 +177,19 @@ class Scene:
         Returns:
             (n,) rows of the landmarks of the older views.
         """
-        table, sightings = self.landmarks, self.sightings
+        table, observations = self.landmarks, self.observations
         number = np.full(len(table), -1)
         number[landmarks] = np.arange(len(landmarks))
         rows = np.sort(self.views_of(landmarks))
-        of = number[sightings.landmark[rows]]
-        old = self.places()[sightings.keyframe[rows]] < since[of]
+        of = number[observations.landmark[rows]]
+        old = self.places()[observations.keyframe[rows]] < since[of]
         known = {name: getattr(table, name)[landmarks] for name in ("position", "guess", "has_position", "has_guess")}
         ids = self._unknown_ids(len(landmarks))
         added = table.append(len(landmarks), track_id=ids, last_seen=table.last_seen[landmarks], **known)
         self._landmark_rows.insert(ids, added)
         table.position[landmarks] = table.guess[landmarks] = np.nan
         table.has_position[landmarks] = table.has_guess[landmarks] = False
-        sightings.landmark[rows[old]] = added[of[old]]
+        observations.landmark[rows[old]] = added[of[old]]
         self._link_rows(rows, np.concatenate([landmarks, added]))
         return added
 
@@ -199,7 +199,7 @@ class Scene:
             self._reject_waiting(tracks)
         self.pending = []
 
-    def settle_poses(self) -> None:
+    def propagate_corrections(self) -> None:
         """Move keyframes that took part in no solve by the correction of their predecessor.
 
         So the relative motion comes from the front-end and the anchor from the refined map (before the first refined
@@ -223,7 +223,7 @@ class Scene:
         table.rotation[:], table.position[:] = table.input_rotation, table.input_position
         table.refined[:] = False
         self.landmarks.has_position[:] = False
-        self.sightings.outlier[:] = False
+        self.observations.outlier[:] = False
 
     def corrections(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the transform from the front-end's fixed frame to the refined map, as it is at some keyframes."""
@@ -245,7 +245,7 @@ class Scene:
             return
         if self.cameras is not None and _same(cameras, self.cameras):
             return
-        if len(self.sightings):
+        if len(self.observations):
             # The rig has no session of its own: it may belong to a session that is about to begin.
             self.next_cameras = cameras
             self.log.reject("rig_changed", f"another camera rig ({len(rig)} cameras) in session {self.session_id}")
@@ -279,7 +279,7 @@ class Scene:
         self._order = None
         if len(self.keyframes) > self.config.max_keyframes:
             self._forget_keyframes()
-        self.settle_poses()
+        self.propagate_corrections()
         self._place_pending()
 
     def _reject_known(self, keyframe: Keyframe, row: int) -> None:
@@ -329,7 +329,7 @@ class Scene:
         landmarks = self._rows_of(tracks.track_id)
         new = self._unseen(row, tracks, landmarks)
         landmarks = landmarks[new]
-        added = self.sightings.append(
+        added = self.observations.append(
             len(landmarks),
             keyframe=row,
             camera=tracks.camera_index,
@@ -340,7 +340,7 @@ class Scene:
             depth_m=tracks.depth_m[new],
         )
         if len(added) or tracks.camera_index not in self.cameras_of(row):
-            begin = len(self.sightings) - len(added)
+            begin = len(self.observations) - len(added)
             self.blocks[row].append(Block(tracks.camera_index, begin, begin + len(added)))
         if len(added) and not self.keyframes.refined[row]:
             # It was held out of earlier solves for want of observations.
@@ -380,7 +380,7 @@ class Scene:
         seen = np.zeros(len(self.landmarks), bool)
         for block in self.blocks[row]:
             if block.camera == tracks.camera_index:
-                seen[self.sightings.landmark[block.begin : block.end]] = True
+                seen[self.observations.landmark[block.begin : block.end]] = True
         repeated = np.flatnonzero(seen[landmarks])
         if len(repeated):
             where = f"keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
@@ -394,9 +394,9 @@ class Scene:
         n_drop = len(table) - self.config.max_keyframes + self.config.max_keyframes // 10
         keep = np.ones(len(table), bool)
         keep[self.order[:n_drop]] = False
-        self._drop_sightings(keep[self.sightings.keyframe])
+        self._drop_observations(keep[self.observations.keyframe])
         renumbered = table.keep(keep)
-        self.sightings.keyframe[:] = renumbered[self.sightings.keyframe]
+        self.observations.keyframe[:] = renumbered[self.observations.keyframe]
         self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
         self._index_keyframes()
 
@@ -408,18 +408,18 @@ class Scene:
         n_drop = len(table) - limit + limit // 10
         keep = np.ones(len(table), bool)
         keep[np.argsort(table.last_seen, kind="stable")[:n_drop]] = False
-        self._drop_sightings(keep[self.sightings.landmark])
+        self._drop_observations(keep[self.observations.landmark])
         renumbered = table.keep(keep)
         self._landmark_rows.renumber(renumbered)
-        self.sightings.landmark[:] = renumbered[self.sightings.landmark]
+        self.observations.landmark[:] = renumbered[self.observations.landmark]
 
-    def _drop_sightings(self, keep: BoolArray) -> None:
+    def _drop_observations(self, keep: BoolArray) -> None:
         """Forget observations and link the others anew. Landmark numbers are still the old ones."""
         before = np.concatenate([[0], np.cumsum(keep)])
         self.blocks = [
             [Block(b.camera, int(before[b.begin]), int(before[b.end])) for b in blocks] for blocks in self.blocks
         ]
-        self.sightings.keep(keep)
+        self.observations.keep(keep)
         self._link()
 
     def _index_keyframes(self) -> None:
@@ -437,16 +437,16 @@ class Scene:
         return ids[:n]
 
     def _link(self) -> None:
-        self._link_rows(np.arange(len(self.sightings)), np.arange(len(self.landmarks)))
+        self._link_rows(np.arange(len(self.observations)), np.arange(len(self.landmarks)))
 
     def _link_rows(self, rows: IntArray, landmarks: IntArray) -> None:
         """Find anew which observations belong to some landmarks: ``rows``, ascending, are all that they have."""
-        landmark = self.sightings.landmark[rows]
+        landmark = self.observations.landmark[rows]
         order = rows[np.argsort(landmark, kind="stable")]
-        landmark = self.sightings.landmark[order]
+        landmark = self.observations.landmark[order]
         same = landmark[1:] == landmark[:-1]
-        self.sightings.previous[rows] = -1
-        self.sightings.previous[order[1:][same]] = order[:-1][same]
+        self.observations.previous[rows] = -1
+        self.observations.previous[order[1:][same]] = order[:-1][same]
         self.landmarks.last[landmarks] = -1
         # Rows ascend within a landmark, so the last write is its newest row.
         self.landmarks.last[landmark] = order
