@@ -29,8 +29,8 @@ _MIN_PROMISE = 1e-8
 
 
 @dataclass(frozen=True)
-class Polished:
-    """What polishing did.
+class InnerIterations:
+    """What the inner iterations did.
 
     Attributes:
         state: of which only the points differ.
@@ -45,7 +45,7 @@ class Polished:
     rows: PointRows
 
 
-def polish_points(objective: Objective, structure: Structure, state: State, steps: int) -> Polished:
+def iterate_points(objective: Objective, structure: Structure, state: State, steps: int) -> InnerIterations:
     """Take up to ``steps`` damped Newton steps a point.
 
     Args:
@@ -88,4 +88,4 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         seen = objective.point_rows(dataclasses.replace(state, points=points), rows)
         damping *= 0.1
     after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)])) + factors
-    return Polished(dataclasses.replace(state, points=best), before, after, kept)
+    return InnerIterations(dataclasses.replace(state, points=best), before, after, kept)

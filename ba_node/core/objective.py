@@ -235,12 +235,24 @@ class Objective:
         residual *= root_weight
         return PointRows(costs, residual, columns.product(d_cam, rotation)), d_intrinsics
 
-    def retract(self, state: State, step_keyframes: FloatArray, step_points: FloatArray) -> State:
-        """Return the state after a step: (n_kf, 6 or 9) and (n_pt, 3)."""
-        rotation, translation = parameterisation.retract(
-            self.cost_model.parameterisation, state.rotation, state.translation, step_keyframes[:, :6]
+    def retract(
+        self, state: State, step_keyframes: FloatArray, step_points: FloatArray, of: IntArray | slice = slice(None)
+    ) -> State:
+        """Return the state after a step.
+
+        Args:
+            state: before it.
+            step_keyframes: (n, 6 or 9) of some keyframes, or of all.
+            step_points: (n_pt, 3).
+            of: (n,) which keyframes.
+        """
+        rotation, translation, intrinsics = state.rotation.copy(), state.translation.copy(), state.intrinsics
+        rotation[of], translation[of] = parameterisation.retract(
+            self.cost_model.parameterisation, rotation[of], translation[of], step_keyframes[:, :6]
         )
-        intrinsics = state.intrinsics + step_keyframes[:, 6:] if len(state.intrinsics) else state.intrinsics
+        if len(intrinsics):
+            intrinsics = intrinsics.copy()
+            intrinsics[of] += step_keyframes[:, 6:]
         return State(rotation, translation, state.points + step_points, intrinsics)
 
     def _in_camera(self, state: State, of: _Observed) -> tuple[FloatArray, FloatArray]:
