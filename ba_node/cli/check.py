@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from the tracks of a recording whether rig, poses, depths and intrinsics are what they are said to be.
+"""Test rig, poses, depths and intrinsics of a recording against its tracks.
 
 Prints how well the usual mistakes explain the tracks, the likely one, and what to change. Changes nothing. In the table
 stand the share of the tracks that agree with a hypothesis, and by how much it is off what the tracks say by themselves.
@@ -20,12 +20,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import require_folder, table
+from ba_node.cli.console import add_parameter_options, parameters, require_folder, table
 
 if TYPE_CHECKING:
-    from ba_node.check.diagnosis import Diagnosis, Row
+    from ba_node.backend import Diagnosis, Row
 
-SUMMARY = "find out from the tracks whether the set-up is what it is said to be"
+SUMMARY = "test calibration and conventions of a recording against its tracks"
 EXAMPLE = "ba check bags/stereo_loop.mcap"
 TOO_LITTLE, MISTAKE = 2, 3
 
@@ -38,24 +38,17 @@ _SHOWN = {"free": "best fit to the tracks, whatever is given"}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", type=Path, metavar="RECORDING")
-    parser.add_argument(
-        "--params", type=Path, metavar="YAML", help="parameters, in the form of ROS or plain (ba params)"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
-    )
+    add_parameter_options(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all of it as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    from ba_node.config import parse_assignment  # noqa: PLC0415
     from ba_node.io.json_file import write_json  # noqa: PLC0415
-    from ba_node.io.parameters import configure  # noqa: PLC0415
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
     require_folder(args.json)
-    config = configure(args.params, dict(parse_assignment(text) for text in args.set))
+    config = parameters(args)
     sessions = check_recording(args.bag, config)
     for number, session in enumerate(sessions, start=1):
         if len(sessions) > 1:
