@@ -60,11 +60,11 @@ def require_folder(path: Path | None) -> None:
         raise TargetError(f"{path}: there is no folder {path.parent}: make it first")
 
 
-def require_mcap(path: Path) -> None:
-    """Raise TargetError unless a recording may have this name."""
+def require_mcap(path: Path, otherwise: str = "") -> None:
+    """Raise TargetError unless a recording may have this name; ``otherwise`` says what else may be meant."""
     require_folder(path)
     if path.suffix != ".mcap":
-        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so")
+        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so{otherwise}")
 
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:

@@ -168,7 +168,17 @@ def split_assignment(text: str, example: str) -> tuple[str, str]:
     return name, value
 
 
+# Likeness of two names, 0 to 1, from which on the one may be meant by the other.
+_ALIKE = 0.75
+
+
 def unknown(name: str, known: Iterable[str]) -> str:
-    """Return what to say of a parameter that does not exist: the one it is most like."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)
-    return f"parameter {name!r} does not exist; did you mean {near[0]!r}?"
+    """Return what to say of a parameter that does not exist: which others are like it, if any."""
+    names, key = list(known), name.rpartition(".")[2]
+    near = [other for other in names if "." not in name and other.rpartition(".")[2] == key]
+    near = near or difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
+    if not near:
+        keys = {other.rpartition(".")[2]: other for other in names}
+        near = [keys[other] for other in difflib.get_close_matches(key, keys, n=1, cutoff=_ALIKE)]
+    what = f"did you mean {' or '.join(map(repr, near))}?" if near else "ba params lists all"
+    return f"parameter {name!r} does not exist; {what}"

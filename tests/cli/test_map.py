@@ -134,5 +134,6 @@ def test_a_map_that_cannot_be_loaded_ends_the_replay(
 ) -> None:
     assert replay(bag, tmp_path / "out", "--load-map", str(tmp_path / "none.npz")) == 2
     assert "none.npz: cannot be read" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
     assert replay(bag, tmp_path / "out", "--save-map", str(tmp_path / "none" / "a.npz")) == 2
     assert "there is no folder" in capsys.readouterr().err
