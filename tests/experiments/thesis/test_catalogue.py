@@ -99,6 +99,7 @@ class TestCommand:
         assert main(["thesis", "3.8", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
         assert "grail.cs.washington.edu" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_a_small_one(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         arguments = ["thesis", "5.1", "fig-5.5", "--quick", "--out", str(tmp_path / "a" / "b")]
         assert main(arguments) == 0

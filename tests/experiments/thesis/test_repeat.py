@@ -77,6 +77,7 @@ def test_what_was_interrupted_goes_on_where_it_stopped(
     assert repetition(tiny, tmp_path).missing() == []
 
 
+@pytest.mark.slow
 def test_a_second_run_solves_nothing_and_says_the_same(
     tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
