@@ -7,12 +7,15 @@ BA_NODE_PORTABLE=1 builds kernels that run on other processors than this one.
 """
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.develop import develop
+from setuptools.command.install import install
 
-NAME = "ba_node"
+NAME, MESSAGES = "ba_node", "ba_msgs"
 
 
 def extensions() -> list[Extension]:
@@ -50,8 +53,53 @@ def shared(folder: str) -> list[tuple[str, list[str]]]:
     return [(f"share/{NAME}/{parent}", [str(path) for path in files if path.parent == parent]) for parent in folders]
 
 
+def install_messages(prefix: Path, build: Path) -> None:
+    """Build ba_msgs and install it, unless it is in the workspace or below it as a package of its own.
+
+    colcon looks into no folder below a package, so that it finds ba_node alone; what ba_node cannot do without comes
+    with it then.
+
+    Args:
+        prefix: where ba_node is installed.
+        build: where it is built.
+    """
+    found = [Path(path) for path in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if path]
+    # colcon leaves this file for a package that it has built. One of the last build here is to be built anew.
+    apart = Path("share", "colcon-core", "packages", MESSAGES)
+    others = [path for path in found if path.resolve() != prefix.resolve() and (path / "share" / MESSAGES).is_dir()]
+    if not found or others or any((path / apart).is_file() for path in (prefix, prefix.parent / MESSAGES)):
+        return
+    settings = {"BUILD_TESTING": "OFF", "CMAKE_BUILD_TYPE": "Release", "CMAKE_INSTALL_PREFIX": prefix}
+    settings["Python3_EXECUTABLE"] = sys.executable
+    source = Path(__file__).resolve().parent / "msg_defs"
+    defines = [f"-D{name}={value}" for name, value in settings.items()]
+    subprocess.run(["cmake", "-S", source, "-B", build / MESSAGES, *defines], check=True)
+    subprocess.run(["cmake", "--build", build / MESSAGES, "--target", "install", "--parallel"], check=True)
+
+
+class Install(install):
+    """As colcon installs; for a wheel or a Debian package, which have a root of their own, without ba_msgs."""
+
+    def run(self) -> None:
+        """Install."""
+        super().run()
+        if self.root is None:
+            install_messages(Path(self.install_data), Path(self.get_finalized_command("build").build_base))
+
+
+class Develop(develop):
+    """As `colcon build --symlink-install` installs."""
+
+    def run(self) -> None:
+        """Install."""
+        super().run()
+        install, build = (self.get_finalized_command(name) for name in ("install", "build"))
+        install_messages(Path(install.install_data), Path(build.build_base))
+
+
 setup(
     name=NAME,
+    cmdclass={"develop": Develop, "install": Install},
     version="0.1.0",
     description="Bundle-adjustment back-end for ROS 2",
     maintainer="The ba_node Authors",

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 from ba_node.cli.console import add_parameter_options, parameters, require_folder, table
 
 if TYPE_CHECKING:
-    from ba_node.check.diagnosis import Diagnosis, Row
+    from ba_node.backend import Diagnosis, Row
 
 SUMMARY = "test calibration and conventions of a recording against its tracks"
 EXAMPLE = "ba check bags/stereo_loop.mcap"

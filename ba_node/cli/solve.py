@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from ba_node.cli.console import require_folder
 
 if TYPE_CHECKING:
-    from ba_node.core.result import Iteration
+    from ba_node.estimate import Iteration
 
 SUMMARY = "solve a BAL file as a whole"
 EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json"

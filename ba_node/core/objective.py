@@ -340,3 +340,11 @@ def _lenses(problem: Problem, used: IntArray) -> tuple[NDArray[np.uint8], FloatA
 def reprojection_errors(problem: Problem, state: State) -> FloatArray:
     """Return predicted minus measured, (n_obs, 2) px, NaN for points that their camera cannot see."""
     return Objective(problem, SolverOptions()).errors(state)
+
+
+def rms_px(problem: Problem, *states: State) -> list[float]:
+    """Return for each state the rms over the observations whose point is in front of the camera, px; 0 without any."""
+    measure = Objective(problem, SolverOptions())
+    errors = (measure.errors(state) for state in states)
+    seen = [error[~np.isnan(error[:, 0])] for error in errors]
+    return [float(np.sqrt(np.mean(error * error))) if len(error) else 0.0 for error in seen]

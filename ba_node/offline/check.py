@@ -8,15 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ba_node.backend import Backend
-from ba_node.check import two_view
-from ba_node.check.diagnosis import Diagnosis
-from ba_node.check.examine import examine
-from ba_node.check.tracks import tracks_of
+from ba_node.backend import Backend, Diagnosis, can_examine
 from ba_node.config import Config
 from ba_node.io.mcap import BagReader
 from ba_node.offline.attention import turned_away
-from ba_node.scene.scene import Scene
 
 
 class CheckError(ValueError):
@@ -54,29 +49,40 @@ def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
         BagError: the recording cannot be read.
         CheckError: it holds no keyframes with tracks and a rig, or OpenCV is missing.
     """
-    if not two_view.available():
+    if not can_examine():
         raise CheckError("OpenCV is missing: install opencv-python-headless (rosdep key python3-opencv)")
     backend = Backend(config)
-    scenes: list[Scene] = [backend.scene]
+    found: list[CheckedSession] = []
+
+    def examine() -> None:
+        checked = _checked(backend)
+        if checked is not None:
+            found.append(checked)
+
     with BagReader(bag) as reader:
         for _, _, measurement in reader.measurements():
-            backend.add(measurement)
-            if backend.scene is not scenes[-1]:
-                scenes.append(backend.scene)
+            for admitted in backend.admit(measurement):
+                if admitted.begins is not None:
+                    examine()
+                backend.take(admitted)
         backend.flush(final=True)
-        scenes += [backend.scene] if backend.scene is not scenes[-1] else []
+        examine()
         notes = [*reader.rejection_notes, *backend.rejection_notes]
-    found = [checked for scene in scenes if (checked := _checked(scene)) is not None]
     if not found:
         raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + notes[-1] if notes else ''}")
     return found
 
 
-def _checked(scene: Scene) -> CheckedSession | None:
-    tracks = tracks_of(scene)
-    if tracks is None:
+def _checked(backend: Backend) -> CheckedSession | None:
+    diagnosis = backend.examine()
+    if diagnosis is None:
         return None
-    table, ends = scene.keyframes, scene.order[[0, -1]]
-    ids, stamps = (tuple(column[ends].tolist()) for column in (table.keyframe_id, table.stamp_ns))
-    warnings = (*scene.log.warnings.values(), *turned_away(scene.log.rejected))
-    return CheckedSession(scene.session_id or 0, ids, stamps, examine(tracks), warnings)
+    keyframes = sorted(backend.map.input_keyframes(), key=lambda keyframe: keyframe.stamp_ns)
+    ends = (keyframes[0], keyframes[-1])
+    return CheckedSession(
+        backend.map.session_id,
+        (ends[0].keyframe_id, ends[1].keyframe_id),
+        (ends[0].stamp_ns, ends[1].stamp_ns),
+        diagnosis,
+        (*backend.warnings, *turned_away(backend.rejected)),
+    )

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.config import SolverOptions
+from ba_node.core.objective import rms_px
 from ba_node.core.problem import Problem
-from ba_node.core.result import Iteration, Result
+from ba_node.core.result import Result
 from ba_node.core.solver import solve
+from ba_node.estimate import Iteration
 from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated
 from ba_node.offline.solver_settings import describe
-from ba_node.window.quality import problem_rms_px
 
 # Points that lie so many times their own extent from the origin are moved there: coordinates of a whole country, as UTM
 # has them, leave too few digits to the steps of a solver.
@@ -90,7 +91,7 @@ class Solution:
         """Return statistics, options and trace for JSON; an infinite radius becomes null there."""
         result = self.result
         with np.errstate(all="ignore"):  # infinite where the solve failed
-            rms_before, rms_after = problem_rms_px(self.problem, self.problem.start, result.state)
+            rms_before, rms_after = rms_px(self.problem, self.problem.start, result.state)
         return {
             "problem": {
                 "file": Path(self.source).name,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ba_node.config import SolverOptions
 from ba_node.core import geometry, objective, triangulation
 from ba_node.core.problem import Problem, State
 from ba_node.window.problems import problem_of
@@ -26,13 +25,6 @@ STATES = ("input", "refined")
 BOUND_PX = 1000.0
 # And this, where two states are compared: outliers are as far off in the one as in the other.
 _COMPARED_PX = 20.0
-
-
-def problem_rms_px(problem: Problem, *states: State) -> list[float]:
-    """Return for each state the rms over the observations whose point is in front of the camera; 0 without any."""
-    measure = objective.Objective(problem, SolverOptions())
-    errors = (_in_front(measure.errors(state)) for state in states)
-    return [float(np.sqrt(np.mean(error * error))) if len(error) else 0.0 for error in errors]
 
 
 def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from ba_node.check import two_view
 from ba_node.cli.main import main
 from ba_node.measurements import Keyframe
+from ba_node.offline import check
 from ba_node.offline.recording import record
 from tests.check.set_ups import recording
 
@@ -81,6 +81,6 @@ def test_too_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path / "none.mcap")]) == 2
-    monkeypatch.setattr(two_view, "available", lambda: False)
+    monkeypatch.setattr(check, "can_examine", lambda: False)
     assert main(["check", str(BAGS / "mono_loop.mcap")]) == 2
     assert "python3-opencv" in capsys.readouterr().err
