@@ -156,5 +156,6 @@ def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
     data = f"ba_node-{ba_node.__version__}.data/data/"
     assert not [name for name in names if "experiments/" in name]
     assert messages == {Path(name).name for name in names if name.startswith("ba_node/io/ba_msgs/")}
+    assert "ba_node/py.typed" in names
     assert modules <= set(names), f"not in the wheel: {modules - set(names)}"
     assert shared <= {name.removeprefix(data) for name in names}
