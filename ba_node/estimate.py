@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ba_node.core import geometry
 from ba_node.core.result import Iteration, Status
+from ba_node.measurements import Keyframe
 
 __all__ = [
     "Cloud",
@@ -45,6 +46,16 @@ class Poses:
     stamp_ns: NDArray[np.int64]
     position: FloatArray
     orientation: FloatArray
+
+    @classmethod
+    def of(cls, keyframes: Sequence[Keyframe]) -> Poses:
+        """Return the poses of keyframes as a front-end has sent them, in their order."""
+        return cls(
+            np.array([keyframe.keyframe_id for keyframe in keyframes], dtype=np.uint64),
+            np.array([keyframe.stamp_ns for keyframe in keyframes], dtype=np.int64),
+            np.array([keyframe.position for keyframe in keyframes]).reshape(-1, 3),
+            np.array([keyframe.orientation for keyframe in keyframes]).reshape(-1, 4),
+        )
 
     def __len__(self) -> int:
         """Return the number of poses."""

@@ -27,6 +27,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
 SAME = {
+    "estimate": {"measurements"},
     "scene": {"measurements"},
     "io": {"messages"},
     "offline": {"ros"},

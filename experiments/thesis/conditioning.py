@@ -30,10 +30,10 @@ _WORST_OF = ("condition_c", "condition_b", "condition_s", "lone_points")
 
 
 class Watched(NumpyKernels):
-    """The kernels in numpy, and a row of figures for every linear system.
+    """The kernels in numpy, and a row of metrics for every linear system.
 
     Attributes:
-        rows: the figures, by name.
+        rows: the metrics, by name.
     """
 
     rows: list[dict[str, float]]
@@ -84,7 +84,7 @@ def worst(blocks: FloatArray) -> float:
 
 
 def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float]) -> dict[str, Any]:
-    """Return figures and curves of one solve.
+    """Return metrics and curves of one solve.
 
     Args:
         posed: the problem.
@@ -98,8 +98,8 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
     rows = kernels.rows
     broken = [index for index, row in enumerate(rows, start=1) if not row["plain"]]
     # A solve that ends where it begins has no system to look at.
-    figures: dict[str, Any] = {name: max((row[name] for row in rows), default=None) for name in _WORST_OF}
-    figures |= {
+    found: dict[str, Any] = {name: max((row[name] for row in rows), default=None) for name in _WORST_OF}
+    found |= {
         "first_break": float(broken[0]) if broken else None,
         "breaks": float(len(broken)),
         "solves": float(len(rows)),
@@ -107,4 +107,4 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
         "gradient": result.gradient_norm,
     }
     columns = {name: [row[name] for row in rows] for name in (*_WORST_OF, "active", "plain")}
-    return {"figures": figures, "data": {"conditions": columns}}
+    return {"figures": found, "data": {"conditions": columns}}
