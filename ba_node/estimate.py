@@ -180,7 +180,7 @@ class WindowView:
     """What there is to see of a solve; rows as in ``Estimate.refined``.
 
     Attributes:
-        free: (n,) True where the pose was free, False where it was held.
+        free: (n,) True where the pose was free, False where it was fixed.
         rms_px: (n,) root mean square residual per coordinate of each keyframe, px; NaN without observations.
         links: (m, 2) pairs of keyframes that see common points.
         shared: (m,) number of their common points.
@@ -216,7 +216,7 @@ class Estimate:
         arrived_s: when its newest keyframe came in, by the clock of the node; None offline.
         correction: of the front-end's fixed frame; None before the first usable solve of a session.
         covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
-            0 for poses that were held. None if it was not asked for, or the solve is not usable.
+            0 for poses that were fixed. None if it was not asked for, or the solve is not usable.
         view: what there is to see; None likewise.
         map_index: number of the map; another one has another, whatever the session ids.
     """

@@ -29,7 +29,7 @@ def open_map(path: Path) -> Backend:
 
 def facts(backend: Backend) -> list[tuple[str, str]]:
     """Return name and value of what is in a map."""
-    estimate, summary = backend.estimate(), backend.summary()
+    estimate, summary = backend.estimate(), backend.map.summary()
     report, poses = estimate.report, estimate.trajectory
     span = (poses.stamp_ns[-1] - poses.stamp_ns[0]) / _NS_PER_S if len(poses) else 0.0
     way = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.kernels import System
-from ba_node.core.numpy_kernels import NumpyKernels
+from ba_node.core.numpy_kernels import NumpyKernels, NumpySystem
 from ba_node.core.schur import block_diagonal
 from ba_node.core.solver import solve
 from ba_node.offline.solver_settings import solver_options
@@ -39,7 +38,7 @@ class Watched(NumpyKernels):
 
     rows: list[dict[str, float]]
 
-    def damp(self, kind: str, mu: float) -> System:
+    def damp(self, kind: str, mu: float) -> NumpySystem:
         """Add damping and eliminate, as ever; look at what is inverted."""
         system = super().damp(kind, mu)
         (d_c, d_p), equations = self._damping, self._equations
