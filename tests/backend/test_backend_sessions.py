@@ -155,7 +155,7 @@ ABSURD: dict[str, Callable[[list[Measurement]], list[Measurement]]] = {
 }
 
 
-@pytest.mark.parametrize("at", [1, 2, 7, N - 2, N - 1])
+@pytest.mark.parametrize("at", [1, 7, N - 1])
 @pytest.mark.parametrize("name", ABSURD)
 def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
     parts = groups()
@@ -172,7 +172,7 @@ def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
     assert after < 0.6 * before, f"{before:.4f} -> {after:.4f} m"
 
 
-@pytest.mark.parametrize("name", set(ABSURD) - {"12 s ahead", "zero", "negative", "the least"})
+@pytest.mark.parametrize("name", sorted(set(ABSURD) - {"12 s ahead", "zero", "negative", "the least"}))
 def test_a_first_keyframe_with_an_absurd_stamp_costs_itself_alone(name: str) -> None:
     parts = groups()
     parts[0] = ABSURD[name](parts[0])
@@ -377,7 +377,7 @@ def test_one_message_of_a_higher_session_does_not_end_the_map(what: str, session
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
-@pytest.mark.parametrize("what", set(USELESS) - {"a keyframe without a pose", "a sound keyframe"})
+@pytest.mark.parametrize("what", sorted(set(USELESS) - {"a keyframe without a pose", "a sound keyframe"}))
 def test_one_message_of_a_higher_session_does_not_open_the_first_one(what: str) -> None:
     stray = changed([USELESS[what]()], session_id=7)
     played = Played([data().rig, *stray, *messages()[1:]])
