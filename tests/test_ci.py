@@ -57,12 +57,14 @@ def test_every_command_of_make_is_there() -> None:
         for word in line.split()
         if "=" not in word
     }
-    assert {"lint", "test", "sanitize"} <= called <= targets, f"no such target: {called - targets}"
+    assert {"lint", "test-all", "sanitize"} <= called <= targets, f"no such target: {called - targets}"
 
 
 def test_hooks_call_tools_of_the_environment() -> None:
+    pinned = (ROOT / "requirements" / "dev.txt").read_text()
     for hook in hooks():
-        python, flag, _, *arguments = hook["entry"].split()
+        python, flag, module, *arguments = hook["entry"].split()
         assert (python, flag, hook["language"]) == (".venv/bin/python", "-m", "system"), hook
+        assert re.search(rf"^{module.replace('_', '.')}==", pinned, re.MULTILINE), f"{module} is not pinned"
         paths = [argument for argument in arguments if "/" in argument]
         assert all((ROOT / path).exists() for path in paths), hook

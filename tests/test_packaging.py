@@ -129,7 +129,7 @@ def test_cmake_lists_every_message() -> None:
 def test_make_help_lists_every_command() -> None:
     text = (ROOT / "Makefile").read_text()
     commands = set(re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE)[1].split())  # type: ignore[index]
-    assert set(re.findall(r"^(\w+):.*## ", text, re.MULTILINE)) == commands
+    assert set(re.findall(r"^([\w-]+):.*## ", text, re.MULTILINE)) == commands
 
 
 @pytest.mark.slow

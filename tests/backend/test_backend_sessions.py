@@ -58,7 +58,7 @@ ABSURD: dict[str, Callable[[list[Measurement]], list[Measurement]]] = {
 }
 
 
-@pytest.mark.parametrize("at", [1, 2, 7, N - 2, N - 1])
+@pytest.mark.parametrize("at", [1, 7, N - 1])
 @pytest.mark.parametrize("name", ABSURD)
 def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
     parts = groups()
@@ -75,7 +75,7 @@ def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
     assert after < 0.6 * before, f"{before:.4f} -> {after:.4f} m"
 
 
-@pytest.mark.parametrize("name", set(ABSURD) - {"12 s ahead", "zero", "negative", "the least"})
+@pytest.mark.parametrize("name", sorted(set(ABSURD) - {"12 s ahead", "zero", "negative", "the least"}))
 def test_a_first_keyframe_with_an_absurd_stamp_costs_itself_alone(name: str) -> None:
     parts = groups()
     parts[0] = ABSURD[name](parts[0])
