@@ -3,16 +3,108 @@
 """Install ba_node with colcon (ament_python) or pip.
 
 The C++ kernels are built where pybind11 and a C++17 compiler are found; the package works without them, more slowly.
-BA_NODE_PORTABLE=1 builds kernels that run on other processors than this one.
+On x86-64 they are built for several processors and the one that runs them is asked when they are imported; see TARGETS.
+BA_NODE_TARGETS=baseline,avx2 builds some of them, BA_NODE_WERROR=1 makes the compiler's warnings errors.
 """
 
 import os
+import platform
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.modified import newer_group
 
 NAME = "ba_node"
+SOURCES = Path(NAME) / "native" / "src"
+# Without -ffast-math, which would remove the tests for numbers that are not finite.
+FLAGS = [
+    "-std=c++17",
+    "-O3",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-ffp-contract=fast",
+    "-fvisibility=hidden",
+    "-fvisibility-inlines-hidden",
+    "-Wall",
+    "-Wextra",
+    "-Wno-psabi",
+]
+# What is compiled once, and what once for each target.
+COMMON = (
+    "bindings/module",
+    "targets/target",
+    "adjustment/layout",
+    "linalg/block_fill",
+    "parallel/memory",
+    "parallel/pool",
+)
+KERNELS = ("targets/kernel6", "targets/kernel9", "targets/functions")
+# The narrowest first, in which order they have to be linked: simd/target.hpp says why. bindings/module.cpp asks the
+# processor for these sets of instructions. Tuned for one that has them all, as compilers fuse fewer additions into chains
+# of multiply-add for it than in general.
+_AVX2 = ["-mavx2", "-mfma", "-mbmi", "-mbmi2", "-mtune=znver3"]
+TARGETS = {
+    "baseline": [],
+    "avx2": _AVX2,
+    "avx512": [*_AVX2, "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw"],
+}
+
+
+class Unit(NamedTuple):
+    """A source, the folder of its object, and the flags that it is compiled with."""
+
+    source: str
+    folder: str
+    flags: tuple[str, ...]
+
+
+def wanted_targets() -> list[str]:
+    """Return the targets to build."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return ["baseline"]
+    wanted = os.environ.get("BA_NODE_TARGETS", "").split(",")
+    return [name for name in TARGETS if wanted == [""] or name in wanted or name == "baseline"]
+
+
+def units() -> list[Unit]:
+    """Return what to compile, in the order to link it."""
+    targets = wanted_targets()
+    has = [f"-DBA_HAS_{name.upper()}" for name in targets]
+    listed = [Unit(f"{name}.cpp", "common", tuple(has)) for name in COMMON]
+    for target in targets:
+        flags = [f"-DBA_TARGET={target}", *TARGETS[target]]
+        listed += [Unit(f"{name}.cpp", target, tuple(flags)) for name in KERNELS]
+    return listed
+
+
+class BuildKernels(build_ext):  # type: ignore[misc]  # setuptools comes without types
+    """Compiles each unit with flags of its own, on all cores."""
+
+    def build_extension(self, ext: Extension) -> None:
+        """Compile and link the kernels."""
+        # Python's own flags ask for debug information, which is most of the size.
+        debug = [] if "-g" in os.environ.get("CFLAGS", "") else ["-g0"]
+        strict = ["-Werror"] if os.environ.get("BA_NODE_WERROR", "0") not in ("", "0") else []
+
+        def compiled(unit: Unit) -> str:
+            source, folder = str(SOURCES / unit.source), str(Path(self.build_temp) / unit.folder)
+            (result,) = self.compiler.object_filenames([source], output_dir=folder)
+            if self.force or newer_group([source, __file__, *ext.depends], result):
+                flags = [*debug, *FLAGS, *unit.flags, *strict]
+                self.compiler.compile([source], folder, include_dirs=ext.include_dirs, extra_postargs=flags)
+            return str(result)
+
+        listed = units()
+        # The slowest ones, which are the widest targets' kernels, first.
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            jobs = {unit: pool.submit(compiled, unit) for unit in reversed(listed)}
+        ext.extra_objects = [jobs[unit].result() for unit in listed]
+        ext.sources, ext.depends = [], ext.extra_objects
+        super().build_extension(ext)
 
 
 def extensions() -> list[Extension]:
@@ -25,17 +117,11 @@ def extensions() -> list[Extension]:
             file=sys.stderr,
         )
         return []
-    sources = Path(NAME) / "native" / "src"
-    # Without -ffast-math, which would remove the tests for numbers that are not finite.
-    flags = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-Wno-psabi"]
-    if os.environ.get("BA_NODE_PORTABLE", "0") in ("", "0"):
-        flags.append("-march=native")
     kernels = Extension(
         f"{NAME}.native._kernels",
-        sources=[str(sources / "bindings" / "module.cpp")],
-        depends=[str(path) for path in sorted(sources.rglob("*.hpp"))],
-        include_dirs=[str(sources), pybind11.get_include()],
-        extra_compile_args=flags,
+        sources=[str(SOURCES / unit.source) for unit in units()],
+        depends=[str(path) for path in sorted(SOURCES.rglob("*.hpp"))],
+        include_dirs=[str(SOURCES), pybind11.get_include()],
         language="c++",
         # A compiler that fails leaves a package without kernels.
         optional=True,
@@ -61,6 +147,7 @@ setup(
     # The definitions of ba_msgs, with which bags are read and written where ROS is not installed.
     package_data={f"{NAME}.io": ["ba_msgs/*.msg"]},
     ext_modules=extensions(),
+    cmdclass={"build_ext": BuildKernels},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -23,11 +23,6 @@ from ba_node.core.problem import Problem, State
 
 FloatArray = NDArray[np.float64]
 
-# As in the enums of kernel.hpp.
-_LOSSES = ("squared", "huber", "cauchy")
-_CHEIRALITY = ("keep", "constant", "drop")
-_PRECONDITIONERS = ("none", "schur_block", "schur_diag", "b_block", "b_diag")
-
 
 class KernelsError(ValueError):
     """Kernels that were asked for by name and cannot be had."""
@@ -62,19 +57,7 @@ def missing(rules: Rules, demands: Demands) -> str:
 def residual_norms(problem: Problem, state: State, backend: str = "auto") -> FloatArray:
     """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see."""
     if backend != "numpy" and native.kernels is not None and not problem.free_intrinsics:
-        obs, cams = problem.observations, problem.cameras
-        norms: FloatArray = native.kernels.residual_norms(
-            keyframe=obs.keyframe,
-            camera=obs.camera,
-            point=obs.point,
-            uv=obs.uv,
-            sigma_px=obs.sigma_px,
-            camera_rotation=cams.rotation,
-            camera_translation=cams.translation,
-            camera_model=cams.model,
-            camera_params=cams.params,
-            state=_arrays(state),
-        )
+        norms: FloatArray = native.kernels.residual_norms(problem, state)
         return norms
     error = reprojection_errors(problem, state)
     return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
@@ -85,30 +68,10 @@ class NativeKernels:
 
     def __init__(self, problem: Problem, rules: Rules, threads: int = 1) -> None:
         """Hand the problem over; it is copied and sorted once. threads: 0 for one a core."""
-        obs, cams = problem.observations, problem.cameras
         self.size = 9 if problem.free_intrinsics else 6
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
-        make_kernel = native.kernels.Kernel9 if problem.free_intrinsics else native.kernels.Kernel6
-        self._kernel: Any = make_kernel(
-            keyframe=obs.keyframe,
-            camera=obs.camera,
-            point=obs.point,
-            uv=obs.uv,
-            sigma_px=obs.sigma_px,
-            depth_m=obs.depth_m,
-            depth_sigma_m=obs.depth_sigma_m,
-            camera_rotation=cams.rotation,
-            camera_translation=cams.translation,
-            camera_model=cams.model,
-            camera_params=cams.params,
-            fixed=problem.fixed,
-            loss=_LOSSES.index(rules.loss),
-            loss_scale=rules.loss_scale,
-            cheirality=_CHEIRALITY.index(rules.cheirality),
-            factor_pairs=_NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns),
-            threads=threads or len(os.sched_getaffinity(0)),
-            start=_arrays(problem.start),
-        )
+        pairs = _NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns)
+        self._kernel: Any = native.kernels.Kernel(problem, rules, pairs, threads or len(os.sched_getaffinity(0)))
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
         self._system = _NativeSystem(self._kernel, self.size)
@@ -123,10 +86,10 @@ class NativeKernels:
         """Linearise at a state and keep the normal equations; return the objective there."""
         moved, self._moved = self._moved, None
         # Polishing has seen all of it where it ended.
-        if moved is not None and state is moved.state and self._kernel.linearise_polished():
+        if moved is not None and state is moved.state and self._kernel.linearise_ahead():
             value = moved.objective
         else:
-            moved, value = None, self._kernel.linearise(_arrays(state))
+            moved, value = None, self._kernel.linearise(state)
         if self._factors is not None:
             terms = self._factors.linearise(state)
             self._kernel.add_factors(terms.diagonal, terms.gradient, terms.pairs.blocks)
@@ -155,7 +118,7 @@ class NativeKernels:
     def move(self, state: State, _system: System, x: FloatArray, polish_steps: int) -> Moved:
         """Take the step whose part in the system is x, and polish the points after it; see Kernels."""
         target = self._states[self._states[0] is state]
-        predicted, damping, value, polished = self._kernel.move(_arrays(state), x, polish_steps, _arrays(target))
+        predicted, damping, value, polished = self._kernel.step(state, x, polish_steps, target)
         if self._factors is not None and np.isfinite(value):
             factors = self._factors.value(target)
             value, polished = value + factors, polished + factors
@@ -165,13 +128,13 @@ class NativeKernels:
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
-        value: float = self._kernel.objective(_arrays(state))
+        value: float = self._kernel.objective(state)
         return value + self._value_of_factors(state)
 
     def polish_points(self, state: State, steps: int) -> tuple[float, State]:
         """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
         self._moved = None
-        _before, value, points = self._kernel.polish_points(_arrays(state), steps)
+        _before, value, points = self._kernel.inner_iterations(state, steps)
         value += self._value_of_factors(state)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
 
@@ -179,13 +142,10 @@ class NativeKernels:
         return 0.0 if self._factors is None else self._factors.value(state)
 
 
-def _arrays(state: State) -> tuple[FloatArray, ...]:
-    return state.rotation, state.translation, state.points, state.intrinsics
-
-
 def _like(state: State) -> State:
     """Return room for a state of the same size."""
-    return State(*(np.empty(array.shape) for array in _arrays(state)))
+    arrays = (state.rotation, state.translation, state.points, state.intrinsics)
+    return State(*(np.empty(array.shape) for array in arrays))
 
 
 class _NativeSystem:
@@ -246,8 +206,7 @@ class _NativeSystem:
 
     def pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
-        bounds = (limits.t_eps, limits.max_iterations, limits.radius, limits.q_eps)
-        found, steps, on_boundary = self._kernel.pcg(scale, _PRECONDITIONERS.index(kind), bounds, formed, self._x)
+        found, steps, on_boundary = self._kernel.pcg(scale, kind, limits, formed, self._x)
         return Solution(self._x if found else None, steps, on_boundary)
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:

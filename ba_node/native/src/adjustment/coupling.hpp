@@ -13,7 +13,7 @@
 #include "adjustment/layout.hpp"
 #include "adjustment/rows.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 template <int D>
 class Coupling {
@@ -233,4 +233,4 @@ class Coupling {
   Buffer<Column<D>> step_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

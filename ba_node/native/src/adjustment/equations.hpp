@@ -15,7 +15,7 @@
 #include "parallel/pool.hpp"
 #include "adjustment/rows.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // C (packed), g and cost of a batch of points.
 struct PointSums {
@@ -83,7 +83,7 @@ class Equations : public AtPoints {
 
   double linearise(Rows& rows, const StateView& s, Pool& pool) {
     rows.load_images(s);
-    rows.with_kind([&](auto lens, auto depth) {
+    rows.with_kind<D>([&](auto lens, auto depth) {
       pool.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
         part_[chunk] = linearise_chunk<decltype(lens)::value, decltype(depth)::value>(rows, s, chunk);
       });
@@ -104,7 +104,7 @@ class Equations : public AtPoints {
     find_gradient_norm();
   }
 
-  // Polishing ends with what a linearisation at its end begins with; that is kept if it is small.
+  // Inner iterations end with what a linearisation there begins with; that is kept if it is small.
   bool looks_ahead() const { return ahead_.record.size() == this->record.size(); }
   // Registers a record, and those that hold() needs for a slot.
   static constexpr int lines_with(bool depth) { return (D == 9 ? 2 : 1) + (depth ? 1 : 0); }
@@ -136,7 +136,7 @@ class Equations : public AtPoints {
     put(batch, x, sums, ahead_);
   }
 
-  // Linearise where the last polishing ended.
+  // Linearise where the last inner iterations ended.
   void go_ahead(Pool& pool) {
     std::swap(static_cast<AtPoints&>(*this), ahead_);
     sum_keyframes(pool);
@@ -323,4 +323,4 @@ class Equations : public AtPoints {
   AtPoints ahead_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

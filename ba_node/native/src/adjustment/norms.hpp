@@ -13,7 +13,7 @@
 #include "adjustment/project.hpp"
 #include "adjustment/rows.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // x in the camera frame of one observation, m: Rc (R x + t) + tc.
 inline void in_camera(const ProblemView& p, const StateView& s, std::int64_t o, double* out) {
@@ -61,4 +61,4 @@ inline void residual_norms(const ProblemView& p, const StateView& s, double* out
     residual_norms_as<Lens::kRational>(p, s, out);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

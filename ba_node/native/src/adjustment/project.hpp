@@ -7,16 +7,13 @@
 #include <cmath>
 #include <cstdint>
 
+#include "adjustment/layout.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
-constexpr int kParams = 12;
 // As in core/cameras.py: nearest depth, m; cosine of the largest angle to the axis of an equidistant camera.
 constexpr double kMinDepth = 1e-6, kLeastCosine = -0.8660254037844387;
-
-// What a whole problem needs; a lane with less distortion has zeros in the rest.
-enum class Lens : std::uint8_t { kPinhole, kRadial, kRational, kMixed };
 
 // Parameters of the cameras of eight observations, as far as the lens needs them.
 struct Cameras {
@@ -162,4 +159,4 @@ template <Lens kLens, bool kDerivatives>
   if constexpr (kLens == Lens::kMixed) project_fisheye<kDerivatives>(x, c, out);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

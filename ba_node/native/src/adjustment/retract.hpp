@@ -10,12 +10,7 @@
 
 #include "adjustment/layout.hpp"
 
-namespace ba {
-
-// Where a state is written: as StateView.
-struct StateSpan {
-  double *rotation, *translation, *points, *intrinsics;
-};
+namespace ba::BA_TARGET {
 
 // The rotation of a rotation vector, by Rodrigues' formula, row by row.
 inline void so3_exp(const double* phi, double* out) {
@@ -56,4 +51,4 @@ inline bool all_finite(const double* first, std::int64_t count) {
   return std::all_of(first, first + count, [](double x) { return std::isfinite(x); });
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -15,14 +15,7 @@
 #include "adjustment/layout.hpp"
 #include "parallel/pool.hpp"
 
-namespace ba {
-
-// Pairs (i, j > i) of free keyframes, sorted, that factors couple.
-struct CoupledPairs {
-  std::vector<std::int32_t> row, column;
-
-  std::size_t size() const { return row.size(); }
-};
+namespace ba::BA_TARGET {
 
 // Pairs (i, j >= i) of free keyframes that share a point or a factor, the diagonal first in each row.
 inline Rows32 coupled(const Layout& l, const CoupledPairs& factors) {
@@ -226,4 +219,4 @@ class SparseSchur {
   std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j], or kSearched
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

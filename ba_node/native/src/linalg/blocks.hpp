@@ -10,7 +10,7 @@
 #include "parallel/memory.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // A column of d = 6 or 9 numbers: a register, and for 9 one more number.
 template <int D>
@@ -241,4 +241,4 @@ inline void write_block(const Block<D>& s, double* out, std::int64_t stride) {
     for (int r = 0; r < D; ++r) out[r * stride + c] = entry(s, r, c);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

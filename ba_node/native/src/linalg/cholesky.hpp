@@ -18,7 +18,7 @@
 #include "parallel/pool.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 class DenseCholesky {
  public:
@@ -186,4 +186,4 @@ class DenseCholesky {
   Buffer<double> inverse_, y_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -9,24 +9,11 @@
 #include <cmath>
 #include <cstdint>
 
+#include "adjustment/types.hpp"
 #include "linalg/blocks.hpp"
 #include "parallel/memory.hpp"
 
-namespace ba {
-
-// M: none, or the diagonal blocks or the diagonal of S or of damped B.
-enum class Preconditioner : std::uint8_t { kNone, kSchurBlock, kSchurDiagonal, kOwnBlock, kOwnDiagonal };
-
-struct PcgLimits {
-  double t_eps;
-  std::int64_t max_iterations;
-  double radius, q_eps;
-};
-
-struct PcgEnd {
-  bool found = false, on_boundary = false;
-  std::int64_t iterations = 0;
-};
+namespace ba::BA_TARGET {
 
 // M^-1 of diagonal blocks, or of the diagonal, scaled.
 template <int D>
@@ -186,4 +173,4 @@ class Pcg {
   Buffer<double> x_, r_, z_, d_, ad_, t_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -17,7 +17,7 @@
 #include "linalg/blocks.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 template <int D>
 class SparseCholesky {
@@ -206,4 +206,4 @@ class SparseCholesky {
   Buffer<double> x_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -11,9 +11,9 @@
 #include <cmath>
 #include <cstring>
 
-namespace ba {
+#include "simd/target.hpp"
 
-constexpr int kLanes = 8;
+namespace ba::BA_TARGET {
 
 using Native2 = double __attribute__((vector_size(16)));
 using Native4 = double __attribute__((vector_size(32)));
@@ -303,4 +303,4 @@ BA_INLINE void transpose(Twice<H, M> (&r)[N]) {
     for (int j = 0; j < kHalf; ++j) r[i * kHalf + j] = {quarter[0][i][j], quarter[1][i][j]};
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -1,7 +1,7 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// The polishing of points, eight at once; core/polish.py says what it does and is this file's oracle.
+// Inner iterations: points alone, eight at once; core/polish.py says what they do and is this file's oracle.
 #pragma once
 
 #include <cstdint>
@@ -10,19 +10,14 @@
 #include "adjustment/equations.hpp"
 #include "adjustment/rows.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
-constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4, kMinPromise = 1e-8;
-
-// Objectives at the start and at the end.
-struct Polished {
-  double before = 0, after = 0;
-};
+constexpr double kFirstDamping = 1e-4, kMinGain = 1e-4, kMinPromise = 1e-8;
 
 // Improve the points of a batch, keyframes held. images: room for those of all its slots, filled here. keep(slot, seen):
 // called for all slots, the last time at the x that is returned; sums: of the same.
 template <Lens kLens, bool kDepth, class Keep>
-inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, Keep keep,
+inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, Keep keep,
                          V8 (&x)[3], PointSums& sums, V8& before, V8& best_cost) {
   V8 best[3] = {x[0], x[1], x[2]};
   Mask active = ~Mask{}, worse{};
@@ -65,4 +60,4 @@ inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end,
   if (any(worse)) see(true);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET
