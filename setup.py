@@ -3,7 +3,7 @@
 """Install ba_node with colcon (ament_python) or pip.
 
 The C++ kernels are built where pybind11 and a C++17 compiler are found; the package works without them, more slowly.
-On x86-64 they are built for several processors and the one that runs them is asked when they are imported; see TARGETS.
+On x86-64 they are built for several processors; which one it is, is asked when they are imported (ba_node/native).
 BA_NODE_TARGETS=baseline,avx2 builds some of them, BA_NODE_WERROR=1 makes the compiler's warnings errors.
 """
 
@@ -20,19 +20,6 @@ from setuptools.modified import newer_group
 
 NAME = "ba_node"
 SOURCES = Path(NAME) / "native" / "src"
-# Without -ffast-math, which would remove the tests for numbers that are not finite.
-FLAGS = [
-    "-std=c++17",
-    "-O3",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-ffp-contract=fast",
-    "-fvisibility=hidden",
-    "-fvisibility-inlines-hidden",
-    "-Wall",
-    "-Wextra",
-    "-Wno-psabi",
-]
 # What is compiled once, and what once for each target.
 COMMON = (
     "bindings/module",
@@ -44,14 +31,8 @@ COMMON = (
 )
 KERNELS = ("targets/kernel6", "targets/kernel9", "targets/functions")
 # The narrowest first, in which order they have to be linked: simd/target.hpp says why. bindings/module.cpp asks the
-# processor for these sets of instructions. Tuned for one that has them all, as compilers fuse fewer additions into chains
-# of multiply-add for it than in general.
-_AVX2 = ["-mavx2", "-mfma", "-mbmi", "-mbmi2", "-mtune=znver3"]
-TARGETS = {
-    "baseline": [],
-    "avx2": _AVX2,
-    "avx512": [*_AVX2, "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw"],
-}
+# processor for what their flags take for granted.
+TARGETS = ("baseline", "avx2", "avx512")
 
 
 class Unit(NamedTuple):
@@ -70,14 +51,20 @@ def wanted_targets() -> list[str]:
     return [name for name in TARGETS if wanted == [""] or name in wanted or name == "baseline"]
 
 
+def flags_of(target: str) -> list[str]:
+    """Return the compiler's flags for a target, or those for all of them (common)."""
+    path = SOURCES / "targets" / f"{target}.flags"
+    return path.read_text().split() if path.exists() else []
+
+
 def units() -> list[Unit]:
     """Return what to compile, in the order to link it."""
     targets = wanted_targets()
     has = [f"-DBA_HAS_{name.upper()}" for name in targets]
     listed = [Unit(f"{name}.cpp", "common", tuple(has)) for name in COMMON]
     for target in targets:
-        flags = [f"-DBA_TARGET={target}", *TARGETS[target]]
-        listed += [Unit(f"{name}.cpp", target, tuple(flags)) for name in KERNELS]
+        flags = (f"-DBA_TARGET={target}", *flags_of(target))
+        listed += [Unit(f"{name}.cpp", target, flags) for name in KERNELS]
     return listed
 
 
@@ -94,7 +81,7 @@ class BuildKernels(build_ext):  # type: ignore[misc]  # setuptools comes without
             source, folder = str(SOURCES / unit.source), str(Path(self.build_temp) / unit.folder)
             (result,) = self.compiler.object_filenames([source], output_dir=folder)
             if self.force or newer_group([source, __file__, *ext.depends], result):
-                flags = [*debug, *FLAGS, *unit.flags, *strict]
+                flags = [*debug, *flags_of("common"), *unit.flags, *strict]
                 self.compiler.compile([source], folder, include_dirs=ext.include_dirs, extra_postargs=flags)
             return str(result)
 
@@ -120,7 +107,7 @@ def extensions() -> list[Extension]:
     kernels = Extension(
         f"{NAME}.native._kernels",
         sources=[str(SOURCES / unit.source) for unit in units()],
-        depends=[str(path) for path in sorted(SOURCES.rglob("*.hpp"))],
+        depends=[str(path) for path in sorted([*SOURCES.rglob("*.hpp"), *SOURCES.rglob("*.flags")])],
         include_dirs=[str(SOURCES), pybind11.get_include()],
         language="c++",
         # A compiler that fails leaves a package without kernels.
@@ -145,7 +132,7 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     # The definitions of ba_msgs, with which bags are read and written where ROS is not installed.
-    package_data={f"{NAME}.io": ["ba_msgs/*.msg"]},
+    package_data={f"{NAME}.io": ["ba_msgs/*.msg"], f"{NAME}.native": ["*.pyi"]},
     ext_modules=extensions(),
     cmdclass={"build_ext": BuildKernels},
     data_files=[

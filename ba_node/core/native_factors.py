@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,8 @@ from ba_node import native
 from ba_node.core.factors import FactorSum, FactorTerms, KeyframeFactors, RelativePoses
 from ba_node.core.problem import State
 
-# As in native/src/bindings/arrays.hpp.
-_LOSSES = ("squared", "huber", "cauchy")
+if TYPE_CHECKING:
+    from ba_node.native._kernels import RelativePoses as CompiledPoses
 
 
 class NativeFactorSum(FactorSum):
@@ -37,10 +37,10 @@ class NativeFactorSum(FactorSum):
         kernel = self._kernels[number]
         if kernel is None:
             return super()._add(kind, number, state, terms)
-        value: float = kernel.linearise(state, terms.gradient, terms.diagonal, terms.pairs.blocks)
-        return value
+        return kernel.linearise(state, terms.gradient, terms.diagonal, terms.pairs.blocks)
 
-    def _kernel(self, kind: KeyframeFactors, number: int) -> Any:
-        if not isinstance(kind, RelativePoses) or kind.loss not in _LOSSES:
+    def _kernel(self, kind: KeyframeFactors, number: int) -> CompiledPoses | None:
+        if not isinstance(kind, RelativePoses) or kind.loss not in native.LOSSES:
             return None
-        return native.kernels.RelativePoses(kind, self._column, self._pair[number][:, 0])
+        kernel: CompiledPoses = native.kernels.RelativePoses(kind, self._column, self._pair[number][:, 0])
+        return kernel

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -20,6 +20,9 @@ from ba_node.core.native_factors import NativeFactorSum
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Rules, reprojection_errors
 from ba_node.core.problem import Problem, State
+
+if TYPE_CHECKING:
+    from ba_node.native._kernels import Kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -71,7 +74,7 @@ class NativeKernels:
         self.size = 9 if problem.free_intrinsics else 6
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
         pairs = _NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns)
-        self._kernel: Any = native.kernels.Kernel(problem, rules, pairs, threads or len(os.sched_getaffinity(0)))
+        self._kernel: Kernel = native.kernels.Kernel(problem, rules, pairs, threads or len(os.sched_getaffinity(0)))
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
         self._system = _NativeSystem(self._kernel, self.size)
@@ -86,7 +89,7 @@ class NativeKernels:
         """Linearise at a state and keep the normal equations; return the objective there."""
         moved, self._moved = self._moved, None
         # Polishing has seen all of it where it ended.
-        if moved is not None and state is moved.state and self._kernel.linearise_ahead():
+        if moved is not None and state is moved.state and self._kernel.linearise_prepared():
             value = moved.objective
         else:
             moved, value = None, self._kernel.linearise(state)
@@ -154,7 +157,7 @@ class _NativeSystem:
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, kernel: Any, size: int) -> None:
+    def __init__(self, kernel: Kernel, size: int) -> None:
         self._kernel, self._size = kernel, size
         n = kernel.n_free * size
         self.rhs: FloatArray = np.empty(n)

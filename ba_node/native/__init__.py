@@ -23,6 +23,8 @@ except ImportError:
 
 VARIABLE = "BA_NODE_SIMD"
 _TARGETS = ("baseline", "avx2", "avx512")
+# That the kernels have; as in src/bindings/arrays.hpp.
+LOSSES = ("squared", "huber", "cauchy")
 
 
 def choose_target(wanted: str) -> str:
@@ -52,12 +54,10 @@ def missing(parameterisation: str, loss: str) -> str:
         return "the C++ kernels are not built: install a C++17 compiler and install ba_node again"
     if parameterisation != "local":
         return f"the C++ kernels have no {parameterisation} parameterisation"
-    if loss not in _LOSSES:
+    if loss not in LOSSES:
         return f"the C++ kernels have no {loss} loss"
     return ""
 
-
-_LOSSES = ("squared", "huber", "cauchy")
 
 if kernels is not None:
     choose_target(os.environ.get(VARIABLE, ""))

@@ -160,10 +160,10 @@ def test_native_knows_once_where_polishing_ended(make_problem: Make) -> None:
     kernels = native_kernels.make(make_problem()[0], Rules(), "native")
     assert isinstance(kernels, native_kernels.NativeKernels)
     polished = kernels.polish_points(make_problem()[0].start, 2)[1]
-    assert kernels._kernel.linearise_ahead()
-    assert not kernels._kernel.linearise_ahead()
+    assert kernels._kernel.linearise_prepared()
+    assert not kernels._kernel.linearise_prepared()
     kernels.linearise(polished)
-    assert not kernels._kernel.linearise_ahead()
+    assert not kernels._kernel.linearise_prepared()
 
 
 @built

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
@@ -181,3 +182,16 @@ def test_wide_instructions_stay_in_the_functions_of_their_target() -> None:
             found.add(name)
     assert counted > 500, f"{counted} functions read"
     assert not found
+
+
+def test_the_stub_has_what_the_module_has() -> None:
+    def public(names: list[str]) -> set[str]:
+        return {name for name in names if not name.startswith("_")}
+
+    tree = ast.parse((Path(native.__file__).parent / "_kernels.pyi").read_text())
+    functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef) and not node.bases}
+    assert public(dir(native.kernels)) == functions | set(classes)
+    for name, node in classes.items():
+        stubbed = [each.name for each in node.body if isinstance(each, ast.FunctionDef)]
+        assert public(dir(getattr(native.kernels, name))) == public(stubbed), name

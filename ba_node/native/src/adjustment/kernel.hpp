@@ -31,15 +31,15 @@ class KernelOf final : public Kernel {
         pool_(arguments.threads),
         equations_(l_),
         reduced_(l_, rows_, equations_, std::move(arguments.factors), pool_) {
-    part_.resize(l_.n_chunks());
+    partial_.resize(l_.n_chunks());
     const std::int64_t most = l_.n_batches ? l_.slot_begin[1] : 0;
-    const std::int64_t held = equations_.looks_ahead() ? most * equations_.held_with(l_.has_depth) : 0;
+    const std::int64_t staged = equations_.can_prepare() ? most * equations_.staged_with(l_.has_depth) : 0;
     for (int i = 0; i < pool_.threads(); ++i) {
       images_.emplace_back(most);
-      held_.emplace_back(held);
+      staged_.emplace_back(staged);
     }
   }
-  // The parts refer to one another.
+  // The members refer to one another.
   KernelOf(const KernelOf&) = delete;
   KernelOf& operator=(const KernelOf&) = delete;
 
@@ -55,34 +55,34 @@ class KernelOf final : public Kernel {
     rows_.load_images(s);
     rows_.with_kind<D>([&](auto lens, auto depth) {
       pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-        part_[chunk].after = rows_.template objective<decltype(lens)::value, decltype(depth)::value>(chunk, s);
+        partial_[chunk].after = rows_.template objective<decltype(lens)::value, decltype(depth)::value>(chunk, s);
       });
     });
-    return total_of(part_).after;
+    return total_of(partial_).after;
   }
 
   Objectives inner_iterations(const StateView& s, double* points, int steps) override {
     rows_.load_images(s);
-    is_ahead_ = equations_.looks_ahead();
+    is_prepared_ = equations_.can_prepare();
     rows_.with_kind<D>([&](auto lens, auto depth) {
       pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int thread) {
         constexpr Lens kLens = decltype(lens)::value;
         constexpr bool kDepth = decltype(depth)::value;
-        part_[chunk] = iterate_chunk<kLens, kDepth>(chunk, thread, s, points, steps);
+        partial_[chunk] = iterate_chunk<kLens, kDepth>(chunk, thread, s, points, steps);
       });
     });
-    return total_of(part_);
+    return total_of(partial_);
   }
 
   double linearise(const StateView& s) override {
-    is_ahead_ = false;
+    is_prepared_ = false;
     return equations_.linearise(rows_, s, pool_);
   }
 
-  bool linearise_ahead() override {
-    if (!is_ahead_) return false;
-    is_ahead_ = false;
-    equations_.go_ahead(pool_);
+  bool linearise_prepared() override {
+    if (!is_prepared_) return false;
+    is_prepared_ = false;
+    equations_.take_prepared(pool_);
     return true;
   }
 
@@ -125,7 +125,7 @@ class KernelOf final : public Kernel {
 
   StepResult step(const StateView& from, const double* step_c, int steps, const StateSpan& to) override {
     StepResult out;
-    is_ahead_ = false;
+    is_prepared_ = false;
     out.predicted = reduced_.back_substitute(step_c, from.points, to.points);
     out.damping = reduced_.damping_cost();
     retract_keyframes(l_, from, step_c, D, to);
@@ -151,15 +151,16 @@ class KernelOf final : public Kernel {
       const std::int64_t slot_begin = l_.slot_begin[i];
       V8 x[3], first{}, best{};
       PointSums sums;
-      V8* held = held_[thread].data();
-      const auto keep = [&](std::int64_t slot, const Seen& seen) {
-        if (is_ahead_) Equations<D>::template hold<kDepth>(seen, held + (slot - slot_begin) * Equations<D>::held_with(kDepth));
+      V8* staged = staged_[thread].data();
+      const auto keep = [&](std::int64_t slot, const Evaluation& obs) {
+        if (is_prepared_)
+          Equations<D>::template stage<kDepth>(obs, staged + (slot - slot_begin) * Equations<D>::staged_with(kDepth));
       };
       rows_.load_points(i, s.points, x);
-      iterate_batch<kLens, kDepth>(rows_, slot_begin, l_.slot_begin[i + 1], steps, images_[thread].data(), keep, x, sums, first,
-                                  best);
+      iterate_batch<kLens, kDepth>(rows_, slot_begin, l_.slot_begin[i + 1], steps, images_[thread].data(), keep, x,
+                                   sums, first, best);
       rows_.store_points(i, x, points);
-      if (is_ahead_) equations_.template put_ahead<kDepth>(i, x, sums, held);
+      if (is_prepared_) equations_.template prepare<kDepth>(i, x, sums, staged);
       before += first;
       after += select(best < std::numeric_limits<double>::infinity(), best, V8{});
     }
@@ -171,10 +172,10 @@ class KernelOf final : public Kernel {
   Pool pool_;
   Equations<D> equations_;
   ReducedSystem<D> reduced_;
-  std::vector<Objectives> part_;
-  bool is_ahead_ = false;
+  std::vector<Objectives> partial_;
+  bool is_prepared_ = false;
   std::vector<Buffer<Images>> images_;  // of each thread
-  std::vector<Buffer<V8>> held_;        // the same: rows of a batch
+  std::vector<Buffer<V8>> staged_;      // the same: rows of a batch
 };
 
 }  // namespace ba::BA_TARGET

@@ -12,9 +12,9 @@ namespace {
 
 // Up to this many (keyframe, camera) pairs images are numbered by a table, beyond it by searching.
 constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
-constexpr std::int64_t kQuarters = 4, kMaxChunks = 32, kMinChunkSlots = 32;
-// Batches are dealt to quarters in so many runs of neighbours at most, which meet the same keyframes.
-constexpr std::int64_t kMaxRuns = 256;
+constexpr std::int64_t kSections = 4, kMaxChunks = 32, kMinChunkSlots = 32;
+// Batches are dealt to sections in so many deals of neighbours at most, which meet the same keyframes.
+constexpr std::int64_t kMaxDeals = 256;
 
 std::int64_t image_key(const ProblemView& p, std::int64_t o) { return p.keyframe[o] * p.n_cameras + p.camera[o]; }
 
@@ -75,7 +75,7 @@ Buffer<std::int64_t> Layout::sorted(const ProblemView& p) const {
   return order;
 }
 
-// Points by the first keyframe that sees them: neighbours in memory then meet the same keyframes.
+// Points by the first keyframe that observes them: neighbours in memory then meet the same keyframes.
 Buffer<std::int32_t> Layout::points_by_keyframe(const ProblemView& p) const {
   Buffer<std::int32_t> lowest(n_points, static_cast<std::int32_t>(n_keyframes));
   for (std::int64_t o = 0; o < n_obs; ++o)
@@ -113,22 +113,23 @@ Buffer<std::int64_t> Layout::number_points(const ProblemView& p) {
   return first;
 }
 
-// Cut the batches into quarters that have as many points of many observations as one another. The last batch, which may
+// Cut the batches into sections that have as many points of many observations as one another. The last batch, which may
 // be incomplete, stays the last.
 void Layout::deal_batches() {
-  quarters.push_back(0);
-  const std::int64_t whole = n_points / kLanes, run = std::max<std::int64_t>(1, whole / kMaxRuns);
-  if (n_obs >= kQuarters * kMinChunkSlots * kLanes) {
+  sections.push_back(0);
+  const std::int64_t whole = n_points / kLanes, deal = std::max<std::int64_t>(1, whole / kMaxDeals);
+  if (n_obs >= kSections * kMinChunkSlots * kLanes) {
     Buffer<std::int32_t> dealt;
     dealt.reserve(point.size());
-    for (std::int64_t quarter = 0; quarter < kQuarters; ++quarter) {
-      for (std::int64_t first = quarter * run; first < whole; first += kQuarters * run)
-        dealt.insert(dealt.end(), point.begin() + kLanes * first, point.begin() + kLanes * std::min(whole, first + run));
-      if (quarter + 1 < kQuarters) quarters.push_back(static_cast<std::int64_t>(dealt.size()) / kLanes);
+    for (std::int64_t section = 0; section < kSections; ++section) {
+      for (std::int64_t first = section * deal; first < whole; first += kSections * deal)
+        dealt.insert(dealt.end(), point.begin() + kLanes * first,
+                     point.begin() + kLanes * std::min(whole, first + deal));
+      if (section + 1 < kSections) sections.push_back(static_cast<std::int64_t>(dealt.size()) / kLanes);
     }
     std::copy(dealt.begin(), dealt.end(), point.begin());
   }
-  quarters.push_back(n_batches);
+  sections.push_back(n_batches);
 }
 
 void Layout::number_images(const ProblemView& p) {
@@ -219,45 +220,45 @@ void Layout::index_by_keyframe() {
       edge_end[e] = point_edge[p + 1];
     }
   }
-  list_seen();
+  list_observations();
 }
 
-void Layout::list_seen() {
-  const std::int64_t parts = n_seen_parts(), lists = parts * n_free;
+void Layout::list_observations() {
+  const std::int64_t partials = n_lists(), lists = partials * n_free;
   // take(list, observation, where its point is)
-  const auto each = [this, parts](auto take) {
-    for (std::int64_t part = 0; part < parts; ++part)
-      for (std::int64_t b = quarters[part]; b < (parts > 1 ? quarters[part + 1] : n_batches); ++b)
+  const auto each = [this, partials](auto take) {
+    for (std::int64_t partial = 0; partial < partials; ++partial)
+      for (std::int64_t b = sections[partial]; b < (partials > 1 ? sections[partial + 1] : n_batches); ++b)
         for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at) {
           if (inverse_sigma[at] == 0.0) continue;
           const std::int64_t k = column_[images[slot_image[at]] / n_cameras];
-          if (k >= 0) take(part * n_free + k, at, 3 * kLanes * b + at % kLanes);
+          if (k >= 0) take(partial * n_free + k, at, 3 * kLanes * b + at % kLanes);
         }
   };
-  keyframe_seen.assign(lists + 1, 0);
-  each([this](std::int64_t list, std::int64_t, std::int64_t) { ++keyframe_seen[list + 1]; });
+  list_begin.assign(lists + 1, 0);
+  each([this](std::int64_t list, std::int64_t, std::int64_t) { ++list_begin[list + 1]; });
   for (std::int64_t i = 0; i < lists; ++i)
-    keyframe_seen[i + 1] = keyframe_seen[i] + (keyframe_seen[i + 1] + kLanes - 1) / kLanes * kLanes;
-  seen.assign(keyframe_seen[lists], static_cast<std::int32_t>(kLanes * n_slots()));
-  seen_point.assign(seen.size(), 0);
-  Buffer<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
+    list_begin[i + 1] = list_begin[i] + (list_begin[i + 1] + kLanes - 1) / kLanes * kLanes;
+  listed.assign(list_begin[lists], static_cast<std::int32_t>(kLanes * n_slots()));
+  listed_point.assign(listed.size(), 0);
+  Buffer<std::int64_t> next(list_begin.begin(), list_begin.end());
   each([this, &next](std::int64_t list, std::int64_t at, std::int64_t x) {
-    seen[next[list]] = static_cast<std::int32_t>(at);
-    seen_point[next[list]++] = static_cast<std::int32_t>(x);
+    listed[next[list]] = static_cast<std::int32_t>(at);
+    listed_point[next[list]++] = static_cast<std::int32_t>(x);
   });
 }
 
 void Layout::cut_chunks() {
-  const std::int64_t most = kMaxChunks / n_quarters(), least = n_quarters() * kMinChunkSlots;
-  const std::int64_t count = n_quarters() == 1 ? 1 : std::clamp<std::int64_t>(n_slots() / least, 1, most);
+  const std::int64_t most = kMaxChunks / n_sections(), least = n_sections() * kMinChunkSlots;
+  const std::int64_t count = n_sections() == 1 ? 1 : std::clamp<std::int64_t>(n_slots() / least, 1, most);
   chunks.push_back(0);
-  for (std::int64_t quarter = 0; quarter < n_quarters(); ++quarter) {
-    const std::int64_t first = slot_begin[quarters[quarter]], slots = slot_begin[quarters[quarter + 1]] - first;
+  for (std::int64_t section = 0; section < n_sections(); ++section) {
+    const std::int64_t first = slot_begin[sections[section]], slots = slot_begin[sections[section + 1]] - first;
     for (std::int64_t i = 1; i <= count; ++i) {
       const auto end = std::lower_bound(slot_begin.begin(), slot_begin.end(), first + slots * i / count);
       chunks.push_back(std::max<std::int64_t>(chunks.back(), end - slot_begin.begin()));
     }
-    chunks.back() = quarters[quarter + 1];
+    chunks.back() = sections[section + 1];
   }
 }
 

@@ -22,8 +22,7 @@ inline void in_camera(const ProblemView& p, const StateView& s, std::int64_t o, 
   const double* x = s.points + 3 * p.point[o];
   double body[3];
   for (int i = 0; i < 3; ++i) body[i] = r[3 * i] * x[0] + r[3 * i + 1] * x[1] + r[3 * i + 2] * x[2] + t[i];
-  for (int i = 0; i < 3; ++i)
-    out[i] = q[3 * i] * body[0] + q[3 * i + 1] * body[1] + q[3 * i + 2] * body[2] + move[i];
+  for (int i = 0; i < 3; ++i) out[i] = q[3 * i] * body[0] + q[3 * i + 1] * body[1] + q[3 * i + 2] * body[2] + move[i];
 }
 
 template <Lens kLens>

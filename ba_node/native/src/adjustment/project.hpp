@@ -96,7 +96,8 @@ inline void project_fisheye(const V8 (&x)[3], const Cameras& c, Projected& out) 
   }
 }
 
-// Which lanes no camera of their model can see, cameras.behind of core/cameras.py; with keep, as far as a number is left.
+// Which lanes no camera of their model can see, cameras.behind of core/cameras.py; with keep, as far as a number is
+// left.
 template <Lens kLens>
 [[gnu::always_inline]] inline Mask behind(const V8 (&x)[3], const Cameras& c, bool keep) {
   const Mask plane = keep ? magnitude(x[2]) < kMinDepth * 1e-6 : x[2] <= kMinDepth;
@@ -118,7 +119,7 @@ template <Lens kLens, bool kDerivatives>
   const V8 iz = 1.0 / x[2];
   const V8 a = x[0] * iz, b = x[1] * iz;
   const V8 fx = c.param[0], fy = c.param[1];
-  V8 da = a, db = b;                                     // distorted ray
+  V8 da = a, db = b;                                    // distorted ray
   V8 jaa = splat(1.0), jab{}, jba{}, jbb = splat(1.0);  // its derivative by (a, b)
   Bend n{};
   if constexpr (kLens != Lens::kPinhole) {

@@ -26,11 +26,11 @@
 namespace ba::BA_TARGET {
 
 // Sum of what the chunks have.
-inline Objectives total_of(const std::vector<Objectives>& parts) {
+inline Objectives total_of(const std::vector<Objectives>& partials) {
   Objectives out;
-  for (const Objectives& part : parts) {
-    out.before += part.before;
-    out.after += part.after;
+  for (const Objectives& partial : partials) {
+    out.before += partial.before;
+    out.after += partial.after;
   }
   return out;
 }
@@ -52,7 +52,7 @@ class ReducedSystem {
     scaled_gradient_.resize(3 * l_.n_batches);
     damping_p_.resize(3 * l_.n_batches);
     damping_c_.resize(l_.n_free * D);
-    part_.resize(l_.n_chunks());
+    partial_.resize(l_.n_chunks());
   }
 
   // Blocks of B of the coupled pairs (n_pairs x 36).
@@ -90,7 +90,8 @@ class ReducedSystem {
     std::fill_n(out, n * n, 0.0);
     each_block([&](std::int64_t i, std::int64_t j, const Block<D>& block) {
       for (int r = 0; r < D; ++r)
-        for (int c = 0; c < D; ++c) out[(i * D + r) * n + j * D + c] = out[(j * D + c) * n + i * D + r] = entry(block, r, c);
+        for (int c = 0; c < D; ++c)
+          out[(i * D + r) * n + j * D + c] = out[(j * D + c) * n + i * D + r] = entry(block, r, c);
     });
   }
 
@@ -208,13 +209,14 @@ class ReducedSystem {
         for (int c = 0; c < 3; ++c) x[c] += p[c];
         rows_.store_points(i, x, out);
       }
-      part_[chunk] = {0.5 * sum(damping), -sum(slope) - 0.5 * sum(curvature)};
+      partial_[chunk] = {0.5 * sum(damping), -sum(slope) - 0.5 * sum(curvature)};
     });
-    double reduction = total_of(part_).after;
-    damping_cost_ = total_of(part_).before;
+    double reduction = total_of(partial_).after;
+    damping_cost_ = total_of(partial_).before;
     for (std::int64_t i = 0; i < l_.n_free * D; ++i) damping_cost_ += 0.5 * damping_c_[i] * step_c[i] * step_c[i];
     for (std::int64_t k = 0; k < l_.n_free; ++k)
-      reduction -= dot(equations_.gradient_c[k], coupling_.step(k)) + 0.5 * dot(multiply(equations_.b[k], coupling_.step(k)), coupling_.step(k));
+      reduction -= dot(equations_.gradient_c[k], coupling_.step(k)) +
+                   0.5 * dot(multiply(equations_.b[k], coupling_.step(k)), coupling_.step(k));
     for (std::size_t k = 0; k < factors_.size(); ++k) {
       double moved[D] = {};
       add_multiplied<1>(pairs_[k], step_c + factors_.column[k] * D, moved);
@@ -297,8 +299,8 @@ class ReducedSystem {
   // Call put(k, sum) for each free keyframe with the sum of what the chunks have for it in sums_.
   template <class Put>
   void each_sum(Put put) {
-    pool_.each(kSumPieces, [&](std::int64_t piece, int) {
-      for (std::int64_t k = l_.n_free * piece / kSumPieces; k < l_.n_free * (piece + 1) / kSumPieces; ++k) {
+    pool_.each(kSumTasks, [&](std::int64_t task, int) {
+      for (std::int64_t k = l_.n_free * task / kSumTasks; k < l_.n_free * (task + 1) / kSumTasks; ++k) {
         Column<D> sum = sums_[k];
         for (std::int64_t chunk = 1; chunk < l_.n_chunks(); ++chunk) add(sum, sums_[chunk * l_.n_free + k]);
         put(k, sum);
@@ -306,7 +308,7 @@ class ReducedSystem {
     });
   }
 
-  static constexpr std::int64_t kSumPieces = 8;
+  static constexpr std::int64_t kSumTasks = 8;
 
   const Layout& l_;
   const Rows& rows_;
@@ -324,7 +326,7 @@ class ReducedSystem {
   Buffer<V8> scaled_gradient_, damping_p_;
   std::vector<double> damping_c_;
   double damping_cost_ = 0;
-  std::vector<Objectives> part_;
+  std::vector<Objectives> partial_;
   std::unique_ptr<SparseSchur<D>> schur_;
   std::unique_ptr<SparseCholesky<D>> factor_;
 };

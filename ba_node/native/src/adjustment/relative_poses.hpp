@@ -172,9 +172,10 @@ class RelativePoses final : public RelativePoseFactors {
       const double half = 0.5 * std::sqrt(angle2);
       factor = (1.0 - half * std::cos(half) / std::sin(half)) / angle2;
     }
-    const double full[9] = {1.0 - factor * (y * y + z * z), factor * x * y - 0.5 * z,       factor * x * z + 0.5 * y,
-                            factor * x * y + 0.5 * z,       1.0 - factor * (x * x + z * z), factor * y * z - 0.5 * x,
-                            factor * x * z - 0.5 * y,       factor * y * z + 0.5 * x,       1.0 - factor * (x * x + y * y)};
+    const double full[9] = {
+        1.0 - factor * (y * y + z * z), factor * x * y - 0.5 * z,       factor * x * z + 0.5 * y,
+        factor * x * y + 0.5 * z,       1.0 - factor * (x * x + z * z), factor * y * z - 0.5 * x,
+        factor * x * z - 0.5 * y,       factor * y * z + 0.5 * x,       1.0 - factor * (x * x + y * y)};
     std::copy_n(full, 9, out);
   }
 

@@ -27,7 +27,8 @@ inline void so3_exp(const double* phi, double* out) {
 }
 
 // All poses, and intrinsics where they are free, after a step (n_free x size) of the free ones.
-inline void retract_keyframes(const Layout& l, const StateView& from, const double* step, int size, const StateSpan& to) {
+inline void retract_keyframes(const Layout& l, const StateView& from, const double* step, int size,
+                              const StateSpan& to) {
   std::copy_n(from.rotation, 9 * l.n_keyframes, to.rotation);
   std::copy_n(from.translation, 3 * l.n_keyframes, to.translation);
   if (l.own_intrinsics) std::copy_n(from.intrinsics, 3 * l.n_keyframes, to.intrinsics);

@@ -30,7 +30,7 @@ struct Images {
 };
 
 // Eight observations. Derivatives and residuals are whitened; rows u, v and depth.
-struct Seen {
+struct Evaluation {
   V8 residual[3];
   V8 d_point[3][3];
   V8 d_intrinsics[2][3];
@@ -77,13 +77,17 @@ inline void upper_times(const Packed& li, const V8 (&x)[3], V8 (&out)[3]) {
 class Rows {
  public:
   Rows(Layout& layout, const CostModel& cost_model, const StateView& start)
-      : l_(layout), cost_(cost_model), stride_(layout.lens == Lens::kPinhole ? 16 : layout.lens == Lens::kMixed ? 32 : 24) {
+      : l_(layout),
+        cost_(cost_model),
+        stride_(layout.lens == Lens::kPinhole ? 16
+                : layout.lens == Lens::kMixed ? 32
+                                              : 24) {
     image_.assign(stride_ * std::max<std::size_t>(l_.images.size(), 1), 0.0);
     if (cost_.cheirality == Cheirality::kDrop) drop_behind(layout, start);
   }
 
-  // Call f(lens, depth) with the lens that the problem needs and whether it measures depth, both as types. Where keyframes
-  // have intrinsics of their own (D = 9) the lens is radial at least.
+  // Call f(lens, depth) with the lens that the problem needs and whether it measures depth, both as types. Where
+  // keyframes have intrinsics of their own (D = 9) the lens is radial at least.
   template <int D, class F>
   void with_kind(F f) const {
     if (l_.lens == Lens::kMixed) {
@@ -145,11 +149,12 @@ class Rows {
 
   // Everything about the observations of a slot; without derivatives residual and cost alone.
   template <Lens kLens, bool kDepth, bool kDerivatives>
-  [[gnu::always_inline]] void see(std::int64_t slot, const Images& im, const V8 (&x)[3], Seen& out) const {
+  [[gnu::always_inline]] void evaluate(std::int64_t slot, const Images& im, const V8 (&x)[3], Evaluation& out) const {
     const std::int64_t at = kLanes * slot;
     V8 y[3];
     for (int i = 0; i < 3; ++i)
-      y[i] = im.rotation[3 * i] * x[0] + im.rotation[3 * i + 1] * x[1] + im.rotation[3 * i + 2] * x[2] + im.translation[i];
+      y[i] =
+          im.rotation[3 * i] * x[0] + im.rotation[3 * i + 1] * x[1] + im.rotation[3 * i + 2] * x[2] + im.translation[i];
     const V8 whiten = load(&l_.inverse_sigma[at]);
     const bool keep = cost_.cheirality == Cheirality::kKeep;
     const Mask hidden = behind<kLens>(y, im.cameras, keep), none = whiten == 0.0, off = hidden | none;
@@ -186,7 +191,8 @@ class Rows {
   // The points of a batch, from the caller's array.
   void load_points(std::int64_t batch, const double* points, V8 (&x)[3]) const {
     const std::int32_t* of_lane = &l_.point[kLanes * batch];
-    for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[3 * static_cast<std::int64_t>(of_lane[l]) + i]; });
+    for (int i = 0; i < 3; ++i)
+      x[i] = each([=](int l) { return points[3 * static_cast<std::int64_t>(of_lane[l]) + i]; });
   }
   void store_points(std::int64_t batch, const V8 (&x)[3], double* points) const {
     for (int l = 0; l < l_.lanes(batch); ++l) {
@@ -204,10 +210,10 @@ class Rows {
       load_points(b, s.points, x);
       for (std::int64_t slot = l_.slot_begin[b]; slot < l_.slot_begin[b + 1]; ++slot) {
         Images im;
-        Seen seen;
+        Evaluation obs;
         gather<kLens>(slot, im);
-        see<kLens, kDepth, false>(slot, im, x, seen);
-        total += seen.cost;
+        evaluate<kLens, kDepth, false>(slot, im, x, obs);
+        total += obs.cost;
       }
     }
     return 0.5 * sum(total);
@@ -266,7 +272,8 @@ class Rows {
         const double* r = &image_[stride_ * l_.slot_image[at]];
         const int l = static_cast<int>(at % kLanes);
         double y[3];
-        for (int i = 0; i < 3; ++i) y[i] = r[3 * i] * x[0][l] + r[3 * i + 1] * x[1][l] + r[3 * i + 2] * x[2][l] + r[9 + i];
+        for (int i = 0; i < 3; ++i)
+          y[i] = r[3 * i] * x[0][l] + r[3 * i + 1] * x[1][l] + r[3 * i + 2] * x[2][l] + r[9 + i];
         const bool fisheye = l_.lens == Lens::kMixed && r[12 + kParams] != 0.0;
         if (is_behind(y, fisheye)) layout.inverse_sigma[at] = 0.0;
       }

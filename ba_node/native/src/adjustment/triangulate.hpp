@@ -64,8 +64,7 @@ class Triangulator {
       measured[p] = measured_;
       midpoint(points + 3 * p);
       parallax[p] = largest_angle();
-      if (views_.size() < 2 && !measured_)
-        std::fill_n(points + 3 * p, 3, std::numeric_limits<double>::quiet_NaN());
+      if (views_.size() < 2 && !measured_) std::fill_n(points + 3 * p, 3, std::numeric_limits<double>::quiet_NaN());
     }
   }
 

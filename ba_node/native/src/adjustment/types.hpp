@@ -56,7 +56,8 @@ struct Objectives {
   double before = 0, after = 0;
 };
 
-// What a step did: by what the model said the objective would fall, and the objective before and after inner iterations.
+// What a step did: by what the model said the objective would fall, and the objective before and after inner
+// iterations.
 struct StepResult {
   double predicted = 0;
   double damping = 0;  // 1/2 p' D p

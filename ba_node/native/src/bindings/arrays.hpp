@@ -85,7 +85,8 @@ struct StateRoom {
 
 // core.problem.Problem, without its factors.
 struct ProblemArrays {
-  explicit ProblemArrays(const py::handle& problem) : fixed(array_of<bool>(problem, "fixed")), start(problem.attr("start")) {
+  explicit ProblemArrays(const py::handle& problem)
+      : fixed(array_of<bool>(problem, "fixed")), start(problem.attr("start")) {
     const py::object seen = problem.attr("observations"), cameras = problem.attr("cameras");
     keyframe = array_of<std::int64_t>(seen, "keyframe");
     camera = array_of<std::int64_t>(seen, "camera");

@@ -169,11 +169,9 @@ void bind_assembly(py::class_<Kernel>& kernel) {
              const StateArrays s(state);
              return without_gil([&] { return k.linearise(s.view()); });
            })
-      .def("linearise_ahead", [](Kernel& k) { return without_gil([&] { return k.linearise_ahead(); }); })
-      .def("add_factors",
-           [](Kernel& k, const Doubles& diagonal, const Doubles& gradient, const Doubles& pairs) {
-             k.add_factors(diagonal.data(), gradient.data(), pairs.data());
-           })
+      .def("linearise_prepared", [](Kernel& k) { return without_gil([&] { return k.linearise_prepared(); }); })
+      .def("add_factors", [](Kernel& k, const Doubles& diagonal, const Doubles& gradient,
+                             const Doubles& pairs) { k.add_factors(diagonal.data(), gradient.data(), pairs.data()); })
       .def("objective",
            [](Kernel& k, const py::object& state) {
              const StateArrays s(state);
@@ -236,7 +234,8 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
 
 RelativePoseFactors* make_relative_poses(const py::object& factors, const Ints& column, const Ints& pair) {
   const Ints keyframes = array_of<std::int64_t>(factors, "keyframes");
-  const Doubles rotation = array_of<double>(factors, "rotation"), translation = array_of<double>(factors, "translation"),
+  const Doubles rotation = array_of<double>(factors, "rotation"),
+                translation = array_of<double>(factors, "translation"),
                 root_information = array_of<double>(factors, "root_information");
   RelativePosesView view;
   view.n = pair.size();
@@ -255,7 +254,8 @@ RelativePoseFactors* make_relative_poses(const py::object& factors, const Ints& 
 void bind_relative_poses(py::module_& m) {
   py::class_<RelativePoseFactors>(m, "RelativePoses")
       .def(py::init(&make_relative_poses))
-      .def("value", [](const RelativePoseFactors& f, const py::object& state) { return f.value(StateArrays(state).view()); })
+      .def("value",
+           [](const RelativePoseFactors& f, const py::object& state) { return f.value(StateArrays(state).view()); })
       // Adds to gradient, diagonal and pairs.
       .def("linearise", [](const RelativePoseFactors& f, const py::object& state, OutDoubles gradient,
                            OutDoubles diagonal, OutDoubles pairs) {

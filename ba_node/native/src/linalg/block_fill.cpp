@@ -42,9 +42,9 @@ bool within(const Fill& fill, const FillLimits& limits) {
 }
 
 void finish_joined(const std::vector<std::int32_t>& given, std::int32_t step,
-                          std::vector<std::vector<std::int32_t>>& columns, Fill& fill) {
-  std::vector<std::int32_t> left = given.empty() ? columns[step - 1]
-                                                 : std::vector<std::int32_t>(given.begin() + step, given.end());
+                   std::vector<std::vector<std::int32_t>>& columns, Fill& fill) {
+  std::vector<std::int32_t> left =
+      given.empty() ? columns[step - 1] : std::vector<std::int32_t>(given.begin() + step, given.end());
   for (std::size_t i = 0; i < left.size(); ++i) {
     columns[step].assign(left.begin() + static_cast<std::ptrdiff_t>(i) + 1, left.end());
     fill.order.push_back(left[i]);

@@ -1,11 +1,11 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Which blocks of S, and of its Cholesky factor, are not zero: found once a solve from who sees what.
+// Which blocks of S, and of its Cholesky factor, are not zero: found once a solve from who observes what.
 //
-// Two orders of elimination are tried, the caller's (keyframes of a trajectory in turn: a band) and that of least degree
-// (George and Liu 1989), and the one whose factor takes fewer operations is taken. Elimination of a block joins all its
-// neighbours; what is left of them is the column of the factor.
+// Two orders of elimination are tried, the caller's (keyframes of a trajectory in turn: a band) and that of least
+// degree (George and Liu 1989), and the one whose factor takes fewer operations is taken. Elimination of a block joins
+// all its neighbours; what is left of them is the column of the factor.
 #pragma once
 
 #include "linalg/types.hpp"

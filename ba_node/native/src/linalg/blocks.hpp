@@ -132,8 +132,7 @@ BA_INLINE void subtract_product(Block<6>& s, const Left<6>& x, const Edge<6>& y)
 
 BA_INLINE void subtract_product(Block<9>& s, const Left<9>& x, const Edge<9>& y) {
 #pragma GCC unroll 8
-  for (int c = 0; c < 8; ++c)
-    s.col[c] = s.col[c] - x.a[0] * y.a[0][c] - x.a[1] * y.a[1][c] - x.a[2] * y.a[2][c];
+  for (int c = 0; c < 8; ++c) s.col[c] = s.col[c] - x.a[0] * y.a[0][c] - x.a[1] * y.a[1][c] - x.a[2] * y.a[2][c];
   s.col[8] = s.col[8] - x.a[0] * y.b[0] - x.a[1] * y.b[1] - x.a[2] * y.b[2];
   s.row = s.row - y.a[0] * x.b[0] - y.a[1] * x.b[1] - y.a[2] * x.b[2];
   s.corner -= x.b[0] * y.b[0] + x.b[1] * y.b[1] + x.b[2] * y.b[2];

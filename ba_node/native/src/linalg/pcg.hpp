@@ -96,8 +96,8 @@ class Pcg {
 
   // Solve S x = rhs. product(in, out): S in; precondition(r, z): z = M^-1 r; scale: 1/D; x: out.
   template <class Product, class Precondition>
-  PcgEnd solve(Product product, Precondition precondition, const double* rhs, const double* scale, const PcgLimits& limits,
-               double* x) {
+  PcgEnd solve(Product product, Precondition precondition, const double* rhs, const double* scale,
+               const PcgLimits& limits, double* x) {
     const std::size_t n = x_.size();
     for (std::size_t i = 0; i < n; ++i) {
       x_[i] = 0.0;

@@ -12,8 +12,8 @@ namespace ba {
 
 namespace {
 
-constexpr std::size_t kLine = 64, kHugePage = std::size_t{1} << 21, kSlab = std::size_t{1} << 24;
-// Slabs without pieces that are not given back.
+constexpr std::size_t kCacheLine = 64, kHugePage = std::size_t{1} << 21, kSlab = std::size_t{1} << 24;
+// Bytes of slabs out of use that are not given back.
 constexpr std::size_t kKept = std::size_t{1} << 25;
 
 std::size_t rounded(std::size_t bytes, std::size_t to) { return (bytes + to - 1) / to * to; }
@@ -28,13 +28,13 @@ Slabs& Slabs::shared() {
 }
 
 void Slabs::warm() {
-  void* piece = take(kHugePage);
-  std::memset(piece, 0, kHugePage);
-  give(piece, kHugePage);
+  void* memory = take(kHugePage);
+  std::memset(memory, 0, kHugePage);
+  give(memory, kHugePage);
 }
 
 void* Slabs::take(std::size_t bytes) {
-  bytes = rounded(bytes, kLine);
+  bytes = rounded(bytes, kCacheLine);
   const std::lock_guard<std::mutex> lock(mutex_);
   for (auto slab = slabs_.rbegin(); slab != slabs_.rend(); ++slab)
     if (slab->size - slab->used >= bytes) return cut(*slab, bytes);
@@ -48,32 +48,31 @@ void* Slabs::take(std::size_t bytes) {
   return cut(slabs_.back(), bytes);
 }
 
-void Slabs::give(void* piece, std::size_t bytes) {
-  bytes = rounded(bytes, kLine);
+void Slabs::give(void* memory, std::size_t bytes) {
+  bytes = rounded(bytes, kCacheLine);
   const std::lock_guard<std::mutex> lock(mutex_);
   std::size_t i = 0;
-  while (!holds(slabs_[i], piece)) ++i;
+  while (!holds(slabs_[i], memory)) ++i;
   Slab& slab = slabs_[i];
-  if (static_cast<char*>(piece) + bytes == slab.begin + slab.used) slab.used -= bytes;
-  if (--slab.pieces != 0) return;
+  if (static_cast<char*>(memory) + bytes == slab.begin + slab.used) slab.used -= bytes;
+  if (--slab.in_use != 0) return;
   slab.used = 0;
   std::size_t idle = 0;
-  for (const Slab& other : slabs_) idle += other.pieces == 0 ? other.size : 0;
+  for (const Slab& other : slabs_) idle += other.in_use == 0 ? other.size : 0;
   if (idle <= kKept) return;
   std::free(slab.begin);
   slabs_.erase(slabs_.begin() + static_cast<std::ptrdiff_t>(i));
 }
 
-bool Slabs::holds(const Slab& slab, const void* piece) {
-  return piece >= slab.begin && piece < slab.begin + slab.size;
+bool Slabs::holds(const Slab& slab, const void* memory) {
+  return memory >= slab.begin && memory < slab.begin + slab.size;
 }
 
 void* Slabs::cut(Slab& slab, std::size_t bytes) {
-  void* piece = slab.begin + slab.used;
+  void* memory = slab.begin + slab.used;
   slab.used += bytes;
-  ++slab.pieces;
-  return piece;
+  ++slab.in_use;
+  return memory;
 }
-
 
 }  // namespace ba

@@ -29,15 +29,15 @@ class Slabs {
   void warm();
 
   void* take(std::size_t bytes);
-  void give(void* piece, std::size_t bytes);
+  void give(void* memory, std::size_t bytes);
 
  private:
   struct Slab {
     char* begin;
-    std::size_t size, used, pieces;
+    std::size_t size, used, in_use;
   };
 
-  static bool holds(const Slab& slab, const void* piece);
+  static bool holds(const Slab& slab, const void* memory);
   static void* cut(Slab& slab, std::size_t bytes);
 
   std::mutex mutex_;
@@ -65,9 +65,13 @@ struct Aligned {
     ::new (static_cast<void*>(p)) U(std::forward<Args>(args)...);
   }
   template <class U>
-  bool operator==(const Aligned<U>&) const { return true; }
+  bool operator==(const Aligned<U>&) const {
+    return true;
+  }
   template <class U>
-  bool operator!=(const Aligned<U>&) const { return false; }
+  bool operator!=(const Aligned<U>&) const {
+    return false;
+  }
 
  private:
 #if defined(__SANITIZE_ADDRESS__)

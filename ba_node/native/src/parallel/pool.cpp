@@ -10,8 +10,9 @@
 
 namespace ba {
 
-// A thread that begins on another core than the one that makes it. Linux often starts a thread where its maker runs, and
-// there it waits for the maker to be preempted, a millisecond or more, as that never sleeps: most of a window's solve.
+// A thread that begins on another core than the one that makes it. Linux often starts a thread where its maker runs,
+// and there it waits for the maker to be preempted, a millisecond or more, as that never sleeps: most of a window's
+// solve.
 class Worker {
  public:
   explicit Worker(std::function<void()> work) : work_(std::move(work)) {
@@ -54,7 +55,7 @@ class Worker {
   bool runs_ = false;
 };
 
-Pool::Pool(int threads) : threads_(threads < 1 ? 1 : threads), shares_(threads_) {
+Pool::Pool(int threads) : threads_(threads < 1 ? 1 : threads), queues_(threads_) {
   for (int i = 1; i < threads_; ++i) workers_.push_back(std::make_unique<Worker>([this, i] { work(i); }));
 }
 
@@ -67,29 +68,30 @@ Pool::~Pool() {
   workers_.clear();
 }
 
-// Whether a share has pieces left, by its next one.
+// Whether a queue has tasks left, by its next one.
 bool Pool::has_left(int thread, std::uint64_t next) const {
-  return (next & kPieces) < static_cast<std::uint64_t>(share(count_.load(std::memory_order_acquire), thread + 1));
+  return (next & kTaskBits) <
+         static_cast<std::uint64_t>(begin_of_queue(count_.load(std::memory_order_acquire), thread + 1));
 }
 
 bool Pool::is_waiting() const {
   for (int i = 0; i < threads_; ++i)
-    if (has_left(i, shares_[i].next.load(std::memory_order_acquire))) return false;
+    if (has_left(i, queues_[i].next.load(std::memory_order_acquire))) return false;
   return true;
 }
 
-// Take pieces of the current round until none is left, first of the own share. Whoever moves next on has the piece: the
+// Take tasks of the current round until none is left, first of the own queue. Whoever moves next on has the task: the
 // round cannot end before it is done, so call_ and function_ are of that round.
 void Pool::take(int thread) {
   for (int i = 0; i < threads_; ++i) {
     const int of = (thread + i) % threads_;
-    std::atomic<std::uint64_t>& share = shares_[of].next;
-    std::uint64_t next = share.load(std::memory_order_acquire);
+    std::atomic<std::uint64_t>& queue = queues_[of].next;
+    std::uint64_t next = queue.load(std::memory_order_acquire);
     while (has_left(of, next)) {
-      if (!share.compare_exchange_weak(next, next + 1, std::memory_order_acq_rel, std::memory_order_acquire)) continue;
-      call_(function_, static_cast<std::int64_t>(next & kPieces), thread);
+      if (!queue.compare_exchange_weak(next, next + 1, std::memory_order_acq_rel, std::memory_order_acquire)) continue;
+      call_(function_, static_cast<std::int64_t>(next & kTaskBits), thread);
       done_.fetch_add(1, std::memory_order_acq_rel);
-      next = share.load(std::memory_order_acquire);
+      next = queue.load(std::memory_order_acquire);
     }
   }
 }

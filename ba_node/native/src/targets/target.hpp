@@ -38,7 +38,7 @@ class Kernel {
   virtual Objectives inner_iterations(const StateView& s, double* points, int steps) = 0;
   virtual double linearise(const StateView& s) = 0;
   // Linearise where the last inner iterations ended; false if too little is known of it.
-  virtual bool linearise_ahead() = 0;
+  virtual bool linearise_prepared() = 0;
   // Add what factors have at the state of the last linearisation: to B (n_free x 36), to the gradient (n_free x 6), and
   // the blocks of the coupled pairs (n_pairs x 36).
   virtual void add_factors(const double* diagonal, const double* gradient, const double* pairs) = 0;
@@ -63,7 +63,8 @@ class Kernel {
   virtual bool solve(double* x) = 0;
   virtual const Fill& analyse(const FillLimits& limits) = 0;
   virtual bool solve_sparse(double* x) = 0;
-  // By conjugate gradients; scale: 1/D (n_free x d). formed: products with S by blocks, summed first; otherwise without.
+  // By conjugate gradients; scale: 1/D (n_free x d). formed: products with S by blocks, summed first; otherwise
+  // without.
   virtual PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) = 0;
 
   // Step of the points for a step of the free keyframes (n_free x d); returns the reduction of the undamped model.
@@ -95,11 +96,11 @@ struct Target {
   void (*agreeing)(const RaysView&, std::int64_t n_points, double gate, bool* agrees);
 };
 
-#define BA_DECLARE_TARGET(name)                        \
-  namespace name {                                     \
-  extern const Target kTarget;                         \
-  Kernel* make_kernel6(KernelArguments&& arguments);   \
-  Kernel* make_kernel9(KernelArguments&& arguments);   \
+#define BA_DECLARE_TARGET(name)                      \
+  namespace name {                                   \
+  extern const Target kTarget;                       \
+  Kernel* make_kernel6(KernelArguments&& arguments); \
+  Kernel* make_kernel9(KernelArguments&& arguments); \
   }
 BA_DECLARE_TARGET(baseline)
 BA_DECLARE_TARGET(avx2)

@@ -1,8 +1,8 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 
-// As much of rclcpp as the example of docs/front_end.md uses, with the same signatures: where rclcpp is not installed, the
-// example is still held against the real messages.
+// As much of rclcpp as the example of docs/front_end.md uses, with the same signatures: where rclcpp is not installed,
+// the example is still held against the real messages.
 
 #pragma once
 
