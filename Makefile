@@ -8,6 +8,7 @@ ARGS ?=
 
 RUN := .venv/bin/python
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
+STYLED := $(CHECKED) examples
 
 .PHONY: help setup demo test fuzz soak sanitize bench thesis robustness lint format clean
 
@@ -42,13 +43,13 @@ robustness: setup ## replay recordings gone wrong, and see that no harm is done 
 	@$(RUN) -m ba_node.cli.main robustness $(ARGS)
 
 lint: setup ## check style and types
-	@$(RUN) -m ruff check $(CHECKED)
-	@$(RUN) -m ruff format --check $(CHECKED)
+	@$(RUN) -m ruff check $(STYLED)
+	@$(RUN) -m ruff format --check $(STYLED)
 	@$(RUN) -m mypy $(CHECKED)
 
 format: setup ## put all Python files into the agreed style
-	@$(RUN) -m ruff check --fix $(CHECKED)
-	@$(RUN) -m ruff format $(CHECKED)
+	@$(RUN) -m ruff check --fix $(STYLED)
+	@$(RUN) -m ruff format $(STYLED)
 
 clean: ## remove .venv and everything else that commands have made
 	@rm -rf .venv build install log out *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -9,6 +9,7 @@ BA_NODE_TARGETS=baseline,avx2 builds some of them, BA_NODE_WERROR=1 makes the co
 
 import os
 import platform
+import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,9 +17,11 @@ from typing import NamedTuple
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.command.develop import develop
+from setuptools.command.install import install
 from setuptools.modified import newer_group
 
-NAME = "ba_node"
+NAME, MESSAGES = "ba_node", "ba_msgs"
 SOURCES = Path(NAME) / "native" / "src"
 # What is compiled once, and what once for each target.
 COMMON = (
@@ -68,7 +71,7 @@ def units() -> list[Unit]:
     return listed
 
 
-class BuildKernels(build_ext):  # type: ignore[misc]  # setuptools comes without types
+class BuildKernels(build_ext):
     """Compiles each unit with flags of its own, on all cores."""
 
     def build_extension(self, ext: Extension) -> None:
@@ -123,8 +126,53 @@ def shared(folder: str) -> list[tuple[str, list[str]]]:
     return [(f"share/{NAME}/{parent}", [str(path) for path in files if path.parent == parent]) for parent in folders]
 
 
+def install_messages(prefix: Path, build: Path) -> None:
+    """Build ba_msgs and install it, unless it is in the workspace or below it as a package of its own.
+
+    colcon looks into no folder below a package, so that it finds ba_node alone; what ba_node cannot do without comes
+    with it then.
+
+    Args:
+        prefix: where ba_node is installed.
+        build: where it is built.
+    """
+    found = [Path(path) for path in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if path]
+    # colcon leaves this file for a package that it has built. One of the last build here is to be built anew.
+    apart = Path("share", "colcon-core", "packages", MESSAGES)
+    others = [path for path in found if path.resolve() != prefix.resolve() and (path / "share" / MESSAGES).is_dir()]
+    if not found or others or any((path / apart).is_file() for path in (prefix, prefix.parent / MESSAGES)):
+        return
+    settings = {"BUILD_TESTING": "OFF", "CMAKE_BUILD_TYPE": "Release", "CMAKE_INSTALL_PREFIX": prefix}
+    settings["Python3_EXECUTABLE"] = sys.executable
+    source = Path(__file__).resolve().parent / "msg_defs"
+    defines = [f"-D{name}={value}" for name, value in settings.items()]
+    subprocess.run(["cmake", "-S", source, "-B", build / MESSAGES, *defines], check=True)
+    subprocess.run(["cmake", "--build", build / MESSAGES, "--target", "install", "--parallel"], check=True)
+
+
+class Install(install):
+    """As colcon installs; for a wheel or a Debian package, which have a root of their own, without ba_msgs."""
+
+    def run(self) -> None:
+        """Install."""
+        super().run()
+        if self.root is None:
+            install_messages(Path(self.install_data), Path(self.get_finalized_command("build").build_base))
+
+
+class Develop(develop):
+    """As `colcon build --symlink-install` installs."""
+
+    def run(self) -> None:
+        """Install."""
+        super().run()
+        install, build = (self.get_finalized_command(name) for name in ("install", "build"))
+        install_messages(Path(install.install_data), Path(build.build_base))
+
+
 setup(
     name=NAME,
+    cmdclass={"build_ext": BuildKernels, "develop": Develop, "install": Install},
     version="0.1.0",
     description="Bundle-adjustment back-end for ROS 2",
     maintainer="The ba_node Authors",
@@ -134,7 +182,6 @@ setup(
     # The definitions of ba_msgs, with which bags are read and written where ROS is not installed.
     package_data={f"{NAME}.io": ["ba_msgs/*.msg"], f"{NAME}.native": ["*.pyi"]},
     ext_modules=extensions(),
-    cmdclass={"build_ext": BuildKernels},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -11,9 +11,21 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.result import Status
+from ba_node.core import geometry
+from ba_node.core.result import Iteration, Status
 
-__all__ = ["Cloud", "Correction", "Estimate", "Extras", "Poses", "SolveReport", "Status", "WindowView"]
+__all__ = [
+    "Cloud",
+    "Correction",
+    "Estimate",
+    "Extras",
+    "Iteration",
+    "Poses",
+    "SolveReport",
+    "Status",
+    "Transform",
+    "WindowView",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -118,6 +130,23 @@ class SolveReport:
     def without_times(self) -> SolveReport:
         """Return a copy that does not depend on the machine, for reproducible files."""
         return dataclasses.replace(self, solve_time_s=0.0, queue_wait_s=0.0)
+
+
+@dataclass(frozen=True)
+class Transform:
+    """A rigid transform: rotation (3, 3), translation (3,) m."""
+
+    rotation: FloatArray
+    translation: FloatArray
+
+    def after(self, other: Transform) -> Transform:
+        """Return the transform that applies ``other`` first, then this one."""
+        parts = geometry.compose(self.rotation, self.translation, other.rotation, other.translation)
+        return Transform(*parts)
+
+    def inverse(self) -> Transform:
+        """Return the inverse."""
+        return Transform(*geometry.inverse(self.rotation, self.translation))
 
 
 @dataclass(frozen=True)

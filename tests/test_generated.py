@@ -10,8 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from ba_node.config import Config, declarations
-from ba_node.core.choices import PARTS
+from ba_node.config import Config
 from ba_node.core.methods import METHODS
 from ba_node.io.parameters import configure
 
@@ -57,18 +56,6 @@ def test_topics_are_latched_as_documented(generator: ModuleType) -> None:
     latched = tuple(topic for topic, (service, _) in generator.OUTPUTS.items() if service == "latched")
     assert latched == qos.LATCHED_OUTPUTS
     assert tuple(t for t, (service, _) in generator.INPUTS.items() if "latched" in service) == qos.LATCHED_INPUTS
-
-
-@pytest.mark.parametrize(
-    ("parameter", "names"),
-    [
-        ("method", tuple(METHODS)),
-        *((option, PARTS[option].names) for option in ("loss", "backend", "cheirality", "linear_solver")),
-    ],
-)
-def test_config_names_what_the_core_declares(parameter: str, names: tuple[str, ...]) -> None:
-    declared = next(p.choices for p in declarations() if p.name == f"solver.{parameter}")
-    assert tuple(name for name in declared if (parameter, name) != ("loss", "auto")) == names
 
 
 def test_every_method_is_described() -> None:

@@ -20,7 +20,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "core": ("core",),
     "scene": ("measurements", "estimate", "scene"),
     "window": ("window", "check"),
-    "backend": ("archive", "backend"),
+    "backend": ("backend",),
     "services": ("messages", "io", "evaluation", "synthetic"),
     "tools": ("ros", "offline", "cli"),
 }
@@ -28,7 +28,6 @@ RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in nam
 # Who may use its neighbours in a layer, and which of them.
 SAME = {
     "scene": {"measurements"},
-    "backend": {"archive"},
     "io": {"messages"},
     "offline": {"ros"},
     "cli": {"offline", "ros"},
@@ -47,6 +46,11 @@ ROS_ONLY = (
     "tf2_msgs",
     "visualization_msgs",
 )
+# What stands above the back-end uses its face, and of the numerics only what describes arrays.
+BEHIND_THE_FACE = ("scene", "window", "check")
+NUMERICS_FOR_ALL = ("geometry", "cameras", "problem")
+# `ba solve` and what belongs to it work on a file, without a back-end.
+WITHOUT_BACKEND = ("offline/solve_bal.py", "offline/solver_settings.py", "cli/steps.py")
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -87,8 +91,23 @@ def test_imports_go_down(path: Path) -> None:
             assert here == "ros", f"{path} imports {name}"
         if parts[0] != "ba_node" or here == "__init__" or parts[1] in (here, "__version__"):
             continue
+        if RANK[here] > RANK["backend"] and here != "thesis":
+            assert parts[1] not in BEHIND_THE_FACE, f"{path} reaches below the back-end: {name}"
+            if parts[1] == "core" and str(path.relative_to(PACKAGE)) not in WITHOUT_BACKEND:
+                assert parts[2] in NUMERICS_FOR_ALL, f"{path} reaches into the core: {name}"
         below = RANK[parts[1]] < RANK[here] or parts[1] in SAME.get(here, ())
         assert below, f"{here} may not import {parts[1]} ({name} in {path.name})"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_nothing_reaches_through_the_face(path: Path) -> None:
+    """The tables of a map are its back-end's own: nothing above takes them by ``backend.scene``."""
+    if RANK.get(unit(path), 0) <= RANK["backend"] or unit(path) == "thesis":
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Attribute) and node.attr == "scene":
+            owner = node.value.attr if isinstance(node.value, ast.Attribute) else getattr(node.value, "id", "")
+            assert owner.endswith("config"), f"{path}, line {node.lineno}: {owner}.scene"
 
 
 @pytest.mark.parametrize(

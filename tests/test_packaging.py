@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import ast
 import importlib
+import os
 import re
 import shutil
 import subprocess
@@ -12,7 +13,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-import yaml
 
 import ba_node
 
@@ -84,11 +84,38 @@ def test_files_carry_the_licence() -> None:
     assert not missing, f"without copyright and SPDX lines: {missing}"
 
 
-@pytest.mark.parametrize("verb", ["build", "test", "list"])
-def test_colcon_finds_both_packages(verb: str) -> None:
-    paths = yaml.safe_load((ROOT / "colcon_defaults.yaml").read_text())[verb]["base-paths"]
-    names = {ElementTree.parse(ROOT / path / "package.xml").findtext("name") for path in paths}
-    assert names == {"ba_node", "ba_msgs"}
+@pytest.mark.slow
+@pytest.mark.parametrize("apart", [False, True])
+def test_messages_come_with_the_node_unless_they_are_a_package_of_their_own(apart: bool, tmp_path: Path) -> None:
+    """colcon looks into no folder below a package, so that setup.py builds what lies there."""
+    source, tools, prefix = tmp_path / "source", tmp_path / "tools", tmp_path / "install" / "ba_node"
+    source.mkdir()
+    for name in ("ba_node", "config", "launch", "bags", "msg_defs", "resource", "package.xml", "setup.cfg", "setup.py"):
+        (source / name).symlink_to(ROOT / name)
+    for name, line in (("cmake", f'echo "$@" >> {tmp_path}/calls'), ("c++", "exit 1"), ("gcc", "exit 1")):
+        tools.mkdir(exist_ok=True)
+        (tools / name).write_text(f"#!/bin/sh\n{line}\n")
+        (tools / name).chmod(0o755)
+    if apart:
+        marker = prefix.parent / "ba_msgs" / "share" / "colcon-core" / "packages" / "ba_msgs"
+        marker.parent.mkdir(parents=True)
+        marker.touch()
+    build = ["egg_info", "--egg-base", str(tmp_path), "build", "--build-base", str(tmp_path / "build")]
+    install = ["install", "--prefix", str(prefix), "--record", str(tmp_path / "log")]
+    environ = {**os.environ, "PATH": f"{tools}{os.pathsep}{os.environ['PATH']}", "CC": "false", "CXX": "false"}
+    # Of another ROS than the one of this Python, which has ba_msgs.
+    script = f"import os, runpy; os.environ['AMENT_PREFIX_PATH'] = {str(prefix)!r}; runpy.run_path('setup.py')"
+    command = [sys.executable, "-c", script, *build, *install, "--single-version-externally-managed"]
+    done = subprocess.run(command, cwd=source, env=environ, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (prefix / "share" / "ba_node" / "package.xml").is_file()
+    calls = (tmp_path / "calls").read_text().splitlines() if (tmp_path / "calls").exists() else []
+    assert len(calls) == (0 if apart else 2), calls
+    assert apart or f"-DCMAKE_INSTALL_PREFIX={prefix}" in calls[0]
+
+
+def test_messages_carry_the_licence_of_the_node() -> None:
+    assert (ROOT / "msg_defs" / "LICENSE").read_text() == (ROOT / "LICENSE").read_text()
 
 
 def test_cmake_lists_every_message() -> None:

@@ -16,9 +16,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ba_node.config import Config, Value
-from ba_node.core.choices import PARTS
-from ba_node.core.methods import CATALOGUE
+from ba_node.config import Config, SolverOptions, Value, declared
+from ba_node.core.methods import METHODS
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
 from ba_node.messages.commands import ACTION_TYPES, SERVICE_TYPES
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
@@ -149,21 +148,24 @@ def methods_page() -> str:
 
 def methods_tables() -> str:
     """Return the named methods, what they choose, and what each part may be."""
+    options = {option.name: option for option in declared(SolverOptions)}
     about = ["| method | what | source |", "|---|---|---|"]
-    about += [f"| `{name}` | {method.doc} | {method.source} |" for name, method in CATALOGUE.items()]
-    names = list(CATALOGUE)
+    about += [f"| `{method.name}` | {method.doc} | {method.source} |" for method in options["method"].allowed]
+    names = list(METHODS)
     chosen = ["| option | " + " | ".join(f"`{name}`" for name in names) + " |", "|---" * (len(names) + 1) + "|"]
-    described = [describe(CATALOGUE[name].options) for name in names]
+    described = [describe(METHODS[name]) for name in names]
     chosen += [
         f"| {option} | " + " | ".join(_shown(option, values) for values in described) + " |"
         for option in described[0]
-        if option not in ("method", "backend", "cheirality", "objective_tolerance")
+        if option not in ("method", "kernels", "cheirality", "objective_tolerance")
     ]
     parts = ["| option | choice | what | source |", "|---|---|---|---|"]
-    for part in PARTS.values():
+    for part in options.values():
+        if part.name == "method" or not part.allowed:
+            continue
         aliases = f" (also `{'`, `'.join(part.aliases)}`)" if part.aliases else ""
-        parts.append(f"| **`{part.option}`**{aliases} | | {part.doc} | |")
-        for choice in part.choices:
+        parts.append(f"| **`{part.name}`**{aliases} | | {part.doc} | |")
+        for choice in part.allowed:
             also = f" (`{'`, `'.join(choice.aliases)}`)" if choice.aliases else ""
             parts.append(f"| | `{choice.name}`{also} | {choice.doc} | {choice.source} |")
     return "\n".join([*about, "", *chosen, "", *parts]) + "\n"
@@ -175,7 +177,7 @@ def _shown(option: str, values: dict[str, Value]) -> str:
         "initial_damping": values["damping"] == "none",
         "damping_policy": values["damping"] == "none",
         "initial_radius": values["trust_region"] == "none",
-        "loss_scale": values["loss"] == "squared",
+        "loss_scale_px": values["loss"] == "squared",
         **dict.fromkeys(
             ("preconditioner", "t_eps", "max_linear_iterations"), values["linear_solver"] not in ("auto", "pcg")
         ),

@@ -44,7 +44,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "poses": lambda: _poses(tracks, related()),
         "depth": lambda: units.check_depth(tracks, related()),
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
-        "lengths": lambda: units.check_lengths(tracks, related()),
+        "lengths": lambda: units.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
     }
     for name, test in tests.items():
         if name in told | outcome.told or (outcome.harmful and name not in _RELATIONS):

@@ -17,10 +17,9 @@ import numpy as np
 
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
 from ba_node.check.relations import AGREED, median_share, spread
+from ba_node.config import SolverOptions
 from ba_node.core import cameras, geometry, methods, native_kernels, solver, triangulation
 from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
-from ba_node.core.objective import Rules
-from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Observations, Problem, State
 
 if TYPE_CHECKING:
@@ -37,7 +36,8 @@ _MIN_KEYFRAMES = 8
 _WIDE, _NARROW = (
     dataclasses.replace(
         methods.options("auto"),
-        rules=Rules(loss="cauchy", loss_scale=scale),
+        loss="cauchy",
+        loss_scale_px=scale,
         max_iterations=iterations,
         function_tolerance=1e-3,
     )
@@ -111,7 +111,7 @@ def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diag
     n = len(measure)
     least = min(measure(adjusted[1.0 / _BRACKET]), measure(adjusted[_BRACKET]))
     flat = n * (least / now - 1.0) < _SURE
-    tried = [(model, _Adjusted(problem, model.params)) for model in _others(tracks)]
+    tried = [(model, _Adjusted(problem, model.params)) for model in other_models(tracks)]
     if least < now or measure.noise > _LARGE:
         for factor in (*_SMALLER, *_LARGER):
             adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
@@ -119,10 +119,10 @@ def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diag
         factor = _lowest(cost)
         if abs(factor - 1.0) > _LEAST_FACTOR and _is_sharp(cost):
             tried.append((_focal(given, factor), adjusted[min(cost, key=lambda one: cost[one])]))
-    rows = [
-        Row(_TEST, "as given", _explained(now)),
-        *(Row(_TEST, m.cause, _explained(measure(one))) for m, one in tried),
-    ]
+    rows = [Row(_TEST, "as given", _explained(now))]
+    for cause in dict.fromkeys(model.cause for model, _ in tried):
+        least_loss = min(measure(one) for model, one in tried if model.cause == cause)
+        rows.append(Row(_TEST, cause, _explained(least_loss)))
     if tried:
         model, best = min(tried, key=lambda one: measure(one[1]))
         lowest = measure(best)
@@ -199,7 +199,7 @@ def _lowest(cost: dict[float, float]) -> float:
     return float(np.exp(-b / (2.0 * a)))
 
 
-def _others(tracks: Tracks) -> list[Model]:
+def other_models(tracks: Tracks) -> list[Model]:
     """Return the camera models that are usual mistakes: of the other kind of image, of another size of it."""
     given = tracks.cameras.params
     models = other_sizes(tracks)

@@ -205,7 +205,10 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
     ]
     if not named:
         return _misfit(camera, relation, now, rows)
-    evidence = f"of the tracks of cameras 0 and {camera}, {rows[0].share:.0%} meet in front as given, so {best:.0%}"
+    evidence = (
+        f"of the tracks of cameras 0 and {camera}, {rows[0].share:.0%} meet in front as given,"
+        f" {best:.0%} with that undone"
+    )
     return Diagnosis([_finding(named, evidence, camera)], rows=rows)
 
 
@@ -248,7 +251,10 @@ def _misfit(camera: int, relation: Relation, given: Pose, rows: list[Row]) -> Di
     if two_view.share(shifted, given) >= _NAMED * relation.share:
         causes.append(f"principal point of camera {camera} off by as much")
         changes.append(info)
-    evidence = f"of the tracks of cameras 0 and {camera}, {row.share:.0%} meet as given, so {relation.share:.0%}"
+    evidence = (
+        f"of the tracks of cameras 0 and {camera}, {row.share:.0%} meet as given,"
+        f" {relation.share:.0%} where they see it"
+    )
     other.findings.append(Finding(tuple(causes), evidence, tuple(changes)))
     return other
 
@@ -275,7 +281,9 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     best = min(float(np.median(other.off)) for other in tried.values())
     named = [one for one, it in tried.items() if np.median(it.off) <= 1.15 * best + 1.0 and now.loses_to(it)]
     if named:
-        evidence = f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, so {best:.0f}"
+        evidence = (
+            f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, {best:.0f} with that undone"
+        )
         return Diagnosis([_finding(named, evidence)], rows=rows)
     if not agreed(usable):
         return Diagnosis(untold=["too many outliers to tell how the poses are off the tracks"], rows=rows)

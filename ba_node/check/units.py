@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _PARALLAX = 4.0
 _POINTS = 8
 _PAIRS = 4
+_MANY_PAIRS = 10
 # Factors of a depth and of a length beyond which they are wrong: the front-end's steps are no better.
 _DEPTH_FACTOR = 1.5
 _LENGTH_FACTOR = 1.3
@@ -154,8 +155,14 @@ def _depth_finding(cause: str, evidence: str) -> Finding:
     return Finding((cause,), evidence, ("depth_m in the feature_tracks, expected metres along the optical axis",))
 
 
-def check_lengths(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
-    """Compare depths of two cameras, which are in units of their baseline, with those of the front-end's steps."""
+def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: bool = True) -> Diagnosis:
+    """Compare depths of two cameras, which are in units of their baseline, with those of the front-end's steps.
+
+    Args:
+        tracks: what was seen.
+        relations: of images in motion.
+        intrinsics_fit: that is known; where it is not, a mistake needs more pairs of images, as it may be theirs.
+    """
     outcome, given = Diagnosis(), as_given(tracks)
     if len(given.cameras.rotation) > 1 and len(tracks) < _KEYFRAMES:
         return Diagnosis(untold=["too few keyframes to compare a baseline with steps"])
@@ -178,8 +185,11 @@ def check_lengths(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             outcome.untold.append(f"too little parallax to compare the baseline of camera {camera} with steps")
             continue
         found = _lengths(tracks, camera, float(np.linalg.norm(baseline.translation)), pairs)
-        if found.findings and not agreed(relations):
-            found = Diagnosis(untold=[f"too many outliers to measure the baseline of camera {camera}"], rows=found.rows)
+        why = "" if agreed(relations) else "too many outliers"
+        if not intrinsics_fit and len(pairs) < _MANY_PAIRS:
+            why = why or "too little is known of the intrinsics"
+        if found.findings and why:
+            found = Diagnosis(untold=[f"{why} to measure the baseline of camera {camera}"], rows=found.rows)
         outcome.add(found)
     return outcome
 

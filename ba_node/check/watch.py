@@ -10,6 +10,7 @@ still open, until all have told or the last of these numbers is reached.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ba_node.check import two_view
@@ -25,19 +26,37 @@ _AT = (3, 6, 10, 15, 25, 40, 60, 90, 130, 200, 300, 450, 700, 1000)
 # The newest of them are looked at.
 _NEWEST = 60
 
-Work = Callable[[], Diagnosis]
+
+@dataclass
+class Check:
+    """A check that may run on any thread.
+
+    Attributes:
+        scene: that it is of; asked only whether it is still the current one.
+        work: what it does; the scene is not touched.
+        found: what it found, None before :meth:`run`.
+    """
+
+    scene: Scene
+    work: Callable[[], Diagnosis]
+    found: Diagnosis | None = None
+
+    def run(self) -> Check:
+        """Do the work."""
+        self.found = self.work()
+        return self
 
 
 class SetUpWatch:
     """The check of one session after the other.
 
     Attributes:
-        elsewhere: hands work to another thread and sees to it that :meth:`take` gets its result; None to do it at once.
+        elsewhere: runs a check on another thread and sees to it that :meth:`take` gets it; None to do it at once.
     """
 
     def __init__(self) -> None:
         """Start with nothing checked."""
-        self.elsewhere: Callable[[Scene, Work], None] | None = None
+        self.elsewhere: Callable[[Check], None] | None = None
         self._reason = ""
         self._scene: Scene | None = None
         self._told: frozenset[str] = frozenset()
@@ -66,18 +85,20 @@ class SetUpWatch:
         tracks, told = tracks_of(scene, _NEWEST), self._told
         if tracks is None:
             return
+        check = Check(scene, lambda: examine(tracks, told))
         if self.elsewhere is None:
-            self.take(scene, examine(tracks, told))
+            self.take(check.run())
         else:
             self._busy = True
-            self.elsewhere(scene, lambda: examine(tracks, told))
+            self.elsewhere(check)
 
-    def take(self, scene: Scene, found: Diagnosis) -> bool:
+    def take(self, check: Check) -> bool:
         """Take in a result; return True if it is of the current session and says that solves do harm.
 
         Then the scene is as the front-end gave it.
         """
-        if scene is not self._scene:
+        scene, found = check.scene, check.found
+        if scene is not self._scene or found is None:
             return False
         self._busy = False
         self._told |= found.told

@@ -1,79 +1,112 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from the tracks of a recording whether rig, poses, depths and intrinsics are what they are said to be.
+"""Test rig, poses, depths and intrinsics of a recording against its tracks.
 
-Prints how well the usual mistakes explain the tracks, the likely one, and what to change. Changes nothing.
+Prints how well the usual mistakes explain the tracks, the likely one, and what to change. Changes nothing. In the table
+stand the share of the tracks that agree with a hypothesis, and by how much it is off what the tracks say by themselves.
 
 Exit code: 0 the set-up fits the tracks, 2 the recording cannot be read or has too little to tell, 3 a mistake is
-likely.
+likely, or something else is to be looked at: stamps that jump, messages that were turned away.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
+import sys
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import require_folder, table
+from ba_node.cli.console import add_parameter_options, parameters, require_folder, table
 
 if TYPE_CHECKING:
-    from ba_node.check.diagnosis import Diagnosis, Row
+    from ba_node.backend import Diagnosis, Row
 
-SUMMARY = "find out from the tracks whether the set-up is what it is said to be"
+SUMMARY = "test calibration and conventions of a recording against its tracks"
 EXAMPLE = "ba check bags/stereo_loop.mcap"
 TOO_LITTLE, MISTAKE = 2, 3
+
+# Columns of the text, and of the hypotheses in the table.
+_WIDTH, _HYPOTHESIS = 100, 52
+_HEAD = ("tracks agree", "rotation off", "direction off")
+_SHOWN = {"free": "best fit to the tracks, whatever is given"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", type=Path, metavar="RECORDING")
-    parser.add_argument(
-        "--params", type=Path, metavar="YAML", help="parameters, in the form of ROS or plain (ba params)"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
-    )
+    add_parameter_options(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all of it as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    from ba_node.config import parse_assignment  # noqa: PLC0415
     from ba_node.io.json_file import write_json  # noqa: PLC0415
-    from ba_node.io.parameters import configure  # noqa: PLC0415
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
     require_folder(args.json)
-    config = configure(args.params, dict(parse_assignment(text) for text in args.set))
+    config = parameters(args)
     sessions = check_recording(args.bag, config)
-    for session, found in sessions:
+    for number, session in enumerate(sessions, start=1):
         if len(sessions) > 1:
-            print(f"session {session}")
-        _print(found)
+            first, last = (stamp_ns * 1e-9 for stamp_ns in session.stamps_ns)
+            ids = f"keyframes {session.keyframe_ids[0]} to {session.keyframe_ids[1]}"
+            text = f"part {number} of {len(sessions)}: session {session.session_id}, {ids}"
+            print(*([""] if number > 1 else []), f"{text}, stamps {first:.3f} to {last:.3f} s", "", sep="\n")
+        _print(session.found)
+        sys.stdout.flush()
+        for text in session.warnings:
+            print(f"ba: warning: {text}", file=sys.stderr)
     if args.json is not None:
-        write_json(args.json, {"sessions": [{"session_id": key, **found.as_dict()} for key, found in sessions]})
-    if any(found.findings for _, found in sessions):
+        write_json(args.json, {"sessions": [session.as_dict() for session in sessions]})
+    if any(session.found.findings or session.warnings for session in sessions):
         return MISTAKE
-    return 0 if any(found.sound for _, found in sessions) else TOO_LITTLE
+    return 0 if any(session.found.sound for session in sessions) else TOO_LITTLE
 
 
 def _print(found: Diagnosis) -> None:
     if found.rows:
-        print(table(("test", "hypothesis", "tracks that meet", "rotation off", "direction off"), _rows(found.rows)))
+        print(_table(found.rows), end="\n\n")
     for finding in found.findings:
-        print(f"likely mistake: {'; or '.join(finding.causes)}")
-        print(f"  why: {finding.evidence}")
-        print(f"  change: {'; or '.join(finding.changes)}")
-    if not found.findings:
-        print(found.summary())
+        print(_entry("likely mistake", finding.causes))
+        print(_entry("  why", (finding.evidence,)))
+        print(_entry("  change", finding.changes))
+    if found.findings:
+        return
+    if found.sound:
+        print(_items("the set-up fits the tracks:", found.sound))
+    if found.untold:
+        print(_items("not told:" if found.sound else "the tracks cannot tell:", found.untold))
 
 
-def _rows(rows: list[Row]) -> list[tuple[str, ...]]:
-    def degrees(value: float) -> str:
-        return "" if math.isnan(value) else f"{value:.2f} deg"
+def _table(rows: list[Row]) -> str:
+    """Return the hypotheses under the name of their test, in as many columns as a terminal usually has."""
+    lines: list[tuple[str, ...]] = [("", *_HEAD)]
+    for test, of_test in itertools.groupby(rows, key=lambda row: row.test):
+        lines.append((test, "", "", ""))
+        for row in of_test:
+            *above, last = _wrapped(_SHOWN.get(row.hypothesis, row.hypothesis), _HYPOTHESIS)
+            lines += [(f"  {text}", "", "", "") for text in above]
+            angles = (row.rotation_deg, row.direction_deg)
+            lines.append((f"  {last}", f"{row.share:.0%}", *("" if math.isnan(a) else f"{a:.2f} deg" for a in angles)))
+    return table(lines[0], lines[1:])
 
-    return [
-        (row.test, row.hypothesis, f"{row.share:.0%}", degrees(row.rotation_deg), degrees(row.direction_deg))
-        for row in rows
-    ]
+
+def _entry(name: str, texts: Sequence[str]) -> str:
+    """Return a name and texts, of which one is meant, each on lines of its own."""
+    indent = " " * (len(name) - len(name.lstrip()) + 4)
+    lines: list[str] = []
+    for i, text in enumerate(dict.fromkeys(texts)):
+        lines += _wrapped(text, _WIDTH, f"{name}: " if i == 0 else f"{indent}or ", indent)
+    return "\n".join(lines)
+
+
+def _items(head: str, texts: Sequence[str]) -> str:
+    return "\n".join([head, *(line for text in texts for line in _wrapped(text, _WIDTH, "  - ", "    "))])
+
+
+def _wrapped(text: str, width: int, first: str = "", others: str = "") -> list[str]:
+    return textwrap.wrap(text, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)

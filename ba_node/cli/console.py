@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ba_node.config import Config
     from ba_node.io.bag_topics import TopicChoice
 
 
@@ -59,11 +60,11 @@ def require_folder(path: Path | None) -> None:
         raise TargetError(f"{path}: there is no folder {path.parent}: make it first")
 
 
-def require_mcap(path: Path) -> None:
-    """Raise TargetError unless a recording may have this name."""
+def require_mcap(path: Path, otherwise: str = "") -> None:
+    """Raise TargetError unless a recording may have this name; ``otherwise`` says what else may be meant."""
     require_folder(path)
     if path.suffix != ".mcap":
-        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so")
+        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so{otherwise}")
 
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
@@ -78,6 +79,24 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--namespace", default="", metavar="NS", help="take topics of this namespace only, e.g. /robot1"
     )
+
+
+def add_parameter_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that run the back-end."""
+    parser.add_argument(
+        "--params", type=Path, metavar="YAML", help="parameters, in the form of ROS or plain (ba params)"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
+    )
+
+
+def parameters(args: argparse.Namespace) -> Config:
+    """Return all parameters, with what these options change."""
+    from ba_node.config import parse_assignment  # noqa: PLC0415
+    from ba_node.io.parameters import configure  # noqa: PLC0415
+
+    return configure(args.params, dict(parse_assignment(text) for text in args.set))
 
 
 def topic_choice(args: argparse.Namespace) -> TopicChoice:

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Start the node as a process of its own, play a recording into it over DDS from another, and judge what comes back.
+"""Start the node as a process of its own, play a recording into it over DDS from another, and evaluate what comes back.
 
 The node runs in a ROS domain that nobody else uses, on this machine only. Writes into DIR: trajectory.tum,
 trajectory_input.tum, ground_truth.tum, points.ply, trajectory.png, and the logs node.log and play.log.
@@ -43,8 +43,9 @@ def run(args: argparse.Namespace) -> int:
     rows = []
     for kind, unit in (("translation", "m"), ("rotation", "deg")):
         for name, error in errors.items():
-            figures = getattr(error, kind)
-            rows.append([f"{kind} {name} [{unit}]", *(f"{x:.4f}" for x in (figures.rmse, figures.median, figures.max))])
+            statistics = getattr(error, kind)
+            shown = (statistics.rmse, statistics.median, statistics.max)
+            rows.append([f"{kind} {name} [{unit}]", *(f"{x:.4f}" for x in shown)])
     print(f"\n{table(['error to ground truth', 'rmse', 'median', 'max'], rows)}\n")
     print(facts(_rows(outcome)))
     print(f"written to {args.out}: trajectory.png, trajectory.tum, points.ply, ...")

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="largest difference of the stamps of a pair, s (default: 0.01)",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the errors as JSON too")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw both trajectories and the error over time")
 
 
@@ -51,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
     estimate, reference = (_poses(read_tum(path)) for path in (args.estimate, args.reference))
     error = absolute_error(estimate, reference, args.align, args.max_difference)
     rows = []
-    for name, unit, numbers in (("translation", "m", error.translation), ("rotation", "deg", error.rotation)):
-        figures = (numbers.rmse, numbers.mean, numbers.median, numbers.max, numbers.std)
-        rows.append([f"{name} [{unit}]", *(f"{value:.6f}" for value in figures)])
+    for name, unit, of in (("translation", "m", error.translation), ("rotation", "deg", error.rotation)):
+        shown = (of.rmse, of.mean, of.median, of.max, of.std)
+        rows.append([f"{name} [{unit}]", *(f"{value:.6f}" for value in shown)])
     print(f"{len(error.stamp_ns)} of {len(estimate)} poses have a partner; alignment {args.align}")
     print(table(["", "rmse", "mean", "median", "max", "std"], rows))
     if args.align == "sim3":

@@ -8,8 +8,8 @@ Older sessions of the recording go to DIR/session_<id>/, to DIR/session_<id>_2/ 
 
 Exit code: 0 all is well, 2 nothing was written (keyframes, tracks or cameras are missing, or none can be used), 3
 written, but something has to be looked at: input that was turned away, solutions that were not taken, nothing refined
-at all (empty tracks, one keyframe, all known already), stamps that jumped, a set-up that looks wrong. Each is said in a
-line of its own and under "attention" in report.json.
+at all (empty tracks, one keyframe, all known already), stamps that jumped, a set-up that looks wrong. Each has a line
+of its own on the terminal and stands under "attention" in report.json.
 """
 
 from __future__ import annotations
@@ -21,7 +21,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ba_node.cli.console import add_topic_options, facts, progress_bar, require_folder, topic_choice
+from ba_node.cli.console import (
+    add_parameter_options,
+    add_topic_options,
+    facts,
+    parameters,
+    progress_bar,
+    require_folder,
+    topic_choice,
+)
 from ba_node.offline.attention import HARMLESS
 
 SUMMARY = "run the back-end on a recording, without a middleware"
@@ -45,12 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="folder for the results; made if missing"
     )
     add_topic_options(parser)
-    parser.add_argument(
-        "--params", type=Path, metavar="YAML", help="parameters, in the form of ROS or plain (ba params)"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
-    )
+    add_parameter_options(parser)
     parser.add_argument(
         "--load-map", type=Path, metavar="FILE", help="begin with a map; the recording goes on in its session"
     )
@@ -64,12 +67,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay."""
-    from ba_node.config import parse_assignment  # noqa: PLC0415
-    from ba_node.io.parameters import configure  # noqa: PLC0415
     from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
 
     require_folder(args.save_map)
-    config = configure(args.params, dict(parse_assignment(text) for text in args.set))
+    config = parameters(args)
     with progress_bar("replay", "messages") as progress:
         options = MapOptions(args.load_map, args.final_optimize, args.save_map, topic_choice(args))
         report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
@@ -86,6 +87,10 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         *(("left aside", f"{topic}: {reason}") for topic, reason in report["topics_left"].items()),
         *(("adjusted", note) for note in report["cameras_adjusted"]),
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
+        *(
+            ("not refined", report["unrefined"])
+            for _ in range(bool(report["unrefined"] and report["keyframes_refined"]))
+        ),
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
         *((label, _change(report[key])) for label, key in _ERRORS),
         *_behind(report["observations_behind"]),

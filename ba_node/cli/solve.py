@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from ba_node.cli.console import require_folder
 
 if TYPE_CHECKING:
-    from ba_node.core.result import Iteration
+    from ba_node.estimate import Iteration
 
 SUMMARY = "solve a BAL file as a whole"
 EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json"
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--iterations", type=int, metavar="N", help="cap on outer iterations (default: the method's, 50)"
     )
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="change an option; repeatable")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write trace, options and figures as JSON")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write trace, options and statistics as JSON")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem as a BAL file")
 
 
@@ -58,21 +58,21 @@ def run(args: argparse.Namespace) -> int:
     require_folder(args.json)
     require_folder(args.out)
     solution = solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
-    figures = solution.as_dict()
-    figures["peak_rss_mb"] = _peak_rss_mb()
+    summary = solution.as_dict()
+    summary["peak_rss_mb"] = _peak_rss_mb()
     if args.json:
-        write_json(args.json, figures)
+        write_json(args.json, summary)
     if not solution.result.status.usable:
-        print(f"ba: error: {args.problem}: {solution.result.status.name.lower()}: {figures['reason']}", file=sys.stderr)
+        print(f"ba: error: {args.problem}: {solution.result.status.name.lower()}: {summary['reason']}", file=sys.stderr)
         return NOTHING
-    sizes, status = figures["problem"], figures["status"]
+    sizes, status = summary["problem"], summary["status"]
     print(
-        f"{status.lower()}: {figures['reason']}\n"
-        f"objective {figures['objective_before']:.8g} -> {figures['objective_after']:.8g},"
-        f" rms {figures['rms_px_before']:.4g} -> {figures['rms_px_after']:.4g} px"
+        f"{status.lower()}: {summary['reason']}\n"
+        f"objective {summary['objective_before']:.8g} -> {summary['objective_after']:.8g},"
+        f" rms {summary['rms_px_before']:.4g} -> {summary['rms_px_after']:.4g} px"
         f" ({sizes['cameras']} cameras, {sizes['points']} points, {sizes['observations']} observations)\n"
-        f"linear solver: {figures['linear_solver']}\n"
-        f"set-up {figures['setup_s']:.3f} s, solver {figures['solve_s']:.3f} s, memory {figures['peak_rss_mb']:.0f} MB"
+        f"linear solver: {summary['linear_solver']}\n"
+        f"set-up {summary['setup_s']:.3f} s, solver {summary['solve_s']:.3f} s, memory {summary['peak_rss_mb']:.0f} MB"
     )
     if solution.origin.any():
         print("solved about the origin {:g} {:g} {:g}, as that of the file is far away".format(*solution.origin))

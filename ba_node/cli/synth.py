@@ -83,7 +83,8 @@ def _recording(args: argparse.Namespace, given: dict[str, Any]) -> int:
     from ba_node.offline.recording import record  # noqa: PLC0415
     from ba_node.synthetic import SyntheticOptions, generate  # noqa: PLC0415
 
-    require_mcap(args.target)
+    is_bal = args.target.suffix in _BAL
+    require_mcap(args.target, f", or --kind {_SPHERE} for a BAL problem" if is_bal else "")
     data = generate(SyntheticOptions(**given))
     count = record(args.target, data.timeline(), data.truth)
     observations = sum(len(image.track_id) for images in data.tracks for image in images)
@@ -97,7 +98,10 @@ def _recording(args: argparse.Namespace, given: dict[str, Any]) -> int:
 def _sphere(args: argparse.Namespace, given: dict[str, Any]) -> int:
     require_folder(args.target)
     if args.target.suffix not in _BAL:
-        raise TargetError(f"{args.target}: BAL problems are written as {', '.join(_BAL)}: give a name that ends so")
+        raise TargetError(
+            f"{args.target}: BAL problems are written as {', '.join(_BAL)}: give a name that ends so,"
+            f" or leave out --kind {_SPHERE} for a recording"
+        )
     print(_spheres().make(args.target, args.preset, given))
     return 0
 

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from ba_node.config import SolverOptions
 from ba_node.core.objective import Objective
-from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem, State
 
 # The surrogate of this graduation differs from the loss within 0.5 % of the scale only.
@@ -37,10 +37,10 @@ class Annealing:
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
         """Set the first level."""
-        self._objective = Objective(problem, options.rules)
+        self._objective = Objective(problem, options)
         self.state, self.value = problem.start, self._objective.value(problem.start)
         norms = np.linalg.norm(self._objective.errors(problem.start), axis=1) / problem.observations.sigma_px
-        share = 2.0 * float(np.max(norms[np.isfinite(norms)], initial=0.0)) ** 2 / options.rules.loss_scale**2
+        share = 2.0 * float(np.max(norms[np.isfinite(norms)], initial=0.0)) ** 2 / options.loss_scale_px**2
         self.graduation = 1.0 / (share - 1.0) if 1.0 < share < np.inf else np.inf
         levels = max(1, options.max_iterations // 2)
         self._growth = max(_GROWTH, (_LAST / self.graduation) ** (1.0 / levels)) if self.active else 1.0

@@ -33,7 +33,7 @@ from ba_node.core.kernels import DENSE_LIMIT
 from ba_node.core.objective import Objective
 
 if TYPE_CHECKING:
-    from ba_node.core.options import SolverOptions
+    from ba_node.config import SolverOptions
     from ba_node.core.problem import Problem, State
 
 FloatArray = NDArray[np.float64]
@@ -50,7 +50,7 @@ def pose_covariances(problem: Problem, state: State, options: SolverOptions, con
     Args:
         problem: as it was solved.
         state: its solution.
-        options: the rules (loss, cheirality) and the kernels that it was solved with; poses are stepped locally.
+        options: loss, cheirality and the kernels that it was solved with; poses are stepped locally.
         conditions: (n_free, 6, n_conditions) g: conditions that hold what no fixed pose holds; or none, (n_free, 6, 0).
 
     Returns:
@@ -63,10 +63,10 @@ def pose_covariances(problem: Problem, state: State, options: SolverOptions, con
     n = 6 * n_free
     if n == 0 or n > DENSE_LIMIT or problem.free_intrinsics:
         return unknown
-    rules = dataclasses.replace(options.rules, parameterisation="local")
+    options = dataclasses.replace(options, parameterisation="local", schur="points")
     with np.errstate(all="ignore"):
-        variance = unit_variance(Objective(problem, rules), state, conditions.shape[2])
-        kernels = native_kernels.make(problem, rules, options.backend)
+        variance = unit_variance(Objective(problem, options), state, conditions.shape[2])
+        kernels = native_kernels.make(problem, options)
         kernels.linearise(state)
         s = kernels.reduce(np.zeros((n_free, 6)), np.zeros((problem.n_points, 3))).dense()
     if not np.isfinite(variance) or not np.isfinite(s).all():

@@ -22,23 +22,6 @@ DENSE_LIMIT = 3000
 
 
 @dataclass(frozen=True)
-class Demands:
-    """What a method asks of the kernels beside the rules.
-
-    Attributes:
-        schur: which unknowns are eliminated.
-        preconditioner: M of PCG.
-        space: D of the scaled space, as of scaling.scaled_space.
-        threads: of the C++ kernels; 0 for one a core. Results do not depend on it.
-    """
-
-    schur: str = "points"
-    preconditioner: str = "none"
-    space: str = "none"
-    threads: int = 1
-
-
-@dataclass(frozen=True)
 class Moved:
     """What a step did.
 

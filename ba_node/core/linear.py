@@ -67,8 +67,8 @@ class PcgLimits:
             further steps would not lower the objective by what they cost. 0 for never.
     """
 
-    t_eps: float = 0.1
-    max_iterations: int = 500
+    t_eps: float
+    max_iterations: int
     radius: float = np.inf
     q_eps: float = 0.0
 

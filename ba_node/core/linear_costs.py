@@ -9,9 +9,9 @@ of d, P pairs of keyframes over all points, F block products of the sparse facto
 - sparse: the same for S, 2 d^3 F for the factor, at a lower rate where a column and what it needs leave the cache;
 - pcg:    N blocks of d x 3 read in each of _PCG_STEPS steps; nothing is formed.
 
-Both factors are our own. The sparse one (native/src/linalg/sparse_cholesky.hpp), by blocks as large as a camera, took
-0.02 s where Eigen's SimplicialLLT took 0.20 s and CHOLMOD's supernodal one 0.15 s (1000 cameras on a circle, one core),
-and on 49 cameras that all see each other 0.8 ms where LAPACK took 1.1, CHOLMOD 3.8 and Eigen 9 ms. The dense one
+Both factors are our own. The sparse one (native/src/linalg/sparse_cholesky.hpp), by blocks of the size of a camera,
+took 0.02 s where Eigen's SimplicialLLT took 0.20 s and CHOLMOD's supernodal one 0.15 s (1000 cameras on a circle, one
+core), and on 49 cameras that all see each other 0.8 ms where LAPACK took 1.1, CHOLMOD 3.8 and Eigen 9 ms. The dense one
 (native/src/linalg/cholesky.hpp) takes as long as the sparse one there, and gains more from a second thread.
 """
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Robust losses, as functions of the norm of a whitened residual: each is declared once, with its formulas.
+"""Robust losses, as functions of the norm of a whitened residual; config/solver.py has their formulas.
 
 The objective is ``1/2 sum Psi(|r|)`` with Psi(x) ~ x^2 near zero (4.20-4.22, where Psi carries the half itself). IRLS
 (4.23-4.28) weighs each residual with ``w = Psi'(x) / (2 x)``, the first-order weight: it is never negative, so the
@@ -18,32 +18,12 @@ convex for a small graduation mu and the loss itself for mu without end::
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 CostAndWeight = tuple[FloatArray, FloatArray]
-
-
-@dataclass(frozen=True)
-class Loss:
-    """One loss.
-
-    Attributes:
-        name: how it is asked for.
-        doc: Psi and w, with c for the scale.
-        source: equation.
-        function: (norm, scale) -> (Psi, w).
-        aliases: other names.
-    """
-
-    name: str
-    doc: str
-    source: str
-    function: Callable[[FloatArray, float], CostAndWeight]
-    aliases: tuple[str, ...] = ()
 
 
 def _squared(norm: FloatArray, _scale: float) -> CostAndWeight:
@@ -70,17 +50,12 @@ def _geman_mcclure(norm: FloatArray, scale: float) -> CostAndWeight:
     return norm * norm * root, root * root
 
 
-LOSSES: dict[str, Loss] = {
-    loss.name: loss
-    for loss in (
-        Loss("squared", "Psi = x^2, w = 1", "2.26", _squared),
-        Loss("huber", "Psi = x^2 up to c, then 2 c x - c^2; w = min(1, c/x)", "4.21", _huber),
-        Loss(
-            "truncated_quadratic", "Psi = min(x^2, c^2); w = 1 up to c, then 0", "4.22", _truncated_quadratic, ("tq",)
-        ),
-        Loss("cauchy", "Psi = c^2 log(1 + x^2/c^2); w = 1/(1 + x^2/c^2)", "", _cauchy),
-        Loss("geman_mcclure", "Psi = x^2/(1 + x^2/c^2); w = 1/(1 + x^2/c^2)^2", "", _geman_mcclure),
-    )
+LOSSES: dict[str, Callable[[FloatArray, float], CostAndWeight]] = {
+    "squared": _squared,
+    "huber": _huber,
+    "truncated_quadratic": _truncated_quadratic,
+    "cauchy": _cauchy,
+    "geman_mcclure": _geman_mcclure,
 }
 
 
@@ -103,7 +78,7 @@ def evaluate(loss: str, norm: FloatArray, scale: float, graduation: float = np.i
         raise ValueError(f"loss {loss!r} does not exist: choose one of {', '.join(LOSSES)}")
     if loss == "truncated_quadratic" and np.isfinite(graduation):
         return _surrogate(norm, scale, graduation)
-    return LOSSES[loss].function(norm, scale)
+    return LOSSES[loss](norm, scale)
 
 
 def _surrogate(norm: FloatArray, scale: float, mu: float) -> CostAndWeight:

@@ -1,35 +1,16 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Name the methods: each is a set of choices for the one loop of ``solver.py``."""
+"""Say what each named method chooses for the one loop of ``solver.py``; their names stand in config/solver.py."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
-from ba_node.config import SolverConfig
-from ba_node.core.objective import Rules
-from ba_node.core.options import SolverOptions
-
-
-@dataclass(frozen=True)
-class Method:
-    """A named method.
-
-    Attributes:
-        doc: what it is.
-        source: algorithm or section of the thesis; empty if it is not from there.
-        options: its choices.
-    """
-
-    doc: str
-    source: str
-    options: SolverOptions
-
+from ba_node.config import SolverConfig, SolverOptions
 
 # What the methods of the thesis have in common. They stop by |g| or the objective alone, so function_tolerance is 0.
 _THESIS = SolverOptions(
-    rules=Rules(parameterisation="global"),
+    parameterisation="global",
     damping="none",
     damping_policy="nielsen",
     initial_damping=10.0,
@@ -37,7 +18,7 @@ _THESIS = SolverOptions(
     initial_radius=1.0,
     linear_solver="pcg",
     preconditioner="none",
-    polish_steps=0,
+    inner_iterations=0,
     max_linear_iterations=2000,
     function_tolerance=0.0,
 )
@@ -51,35 +32,27 @@ _DINM = dataclasses.replace(_THESIS, damping="identity", trust_region="inc")
 _ADINM = dataclasses.replace(
     _DINM, schur="adaptive", preconditioner="schur_block", max_linear_iterations=3000, initial_radius=1e4
 )
-_LOCAL = dataclasses.replace(_DINM, rules=Rules(parameterisation="local"))
+_LOCAL = dataclasses.replace(_DINM, parameterisation="local")
 # Where damping alone holds points back, the gradient falls with mu: a tenth of it is two steps gained.
 _LOCAL_DINM = dataclasses.replace(_LOCAL, initial_damping=1.0)
-_HUBER = dataclasses.replace(_LOCAL, rules=Rules(loss="huber"))
-_TQ = dataclasses.replace(_LOCAL, rules=Rules(loss="truncated_quadratic"), annealing="gnc")
+_HUBER = dataclasses.replace(_LOCAL, loss="huber")
+_TQ = dataclasses.replace(_LOCAL, loss="truncated_quadratic", annealing="gnc")
 
-_DECLARED: dict[str, Method] = {
-    "auto": Method(
-        "the node's default: Marquardt steps by the cheapest linear solver, and points that follow each",
-        "",
-        SolverOptions(q_eps=0.1),
-    ),
-    "lma_cd": Method("Levenberg-Marquardt with Cholesky decomposition, a baseline", "3.2.2, 3.2.3", _LMA_CD),
-    "bal": Method("Levenberg-Marquardt with PCG and M = B, a baseline (Agarwal et al. 2010)", "3.2.3", _BAL),
-    "inm": Method("inexact Newton: a scaled region, no damping", "Alg. 5", _INM),
-    "tnm": Method("truncated Newton: damping, no region", "Alg. 7, 8", _TNM),
-    "dinm": Method("damped inexact Newton: damping and a scaled region", "Alg. 9", _DINM),
-    "adinm": Method("dinm that eliminates points or cameras, whichever is better conditioned", "Alg. 10", _ADINM),
-    "local_dinm": Method("dinm with local parameterisation", "4.2", _LOCAL_DINM),
-    "irls_huber": Method("local_dinm with Huber's loss", "Alg. 11, 4.21", _HUBER),
-    "irls_tq": Method(
-        "local_dinm with a truncated quadratic, led up to by graduated non-convexity", "Alg. 11, 4.22", _TQ
-    ),
+_CHOICES = {
+    "auto": SolverOptions(q_eps=0.1),
+    "lma_cd": _LMA_CD,
+    "bal": _BAL,
+    "inm": _INM,
+    "tnm": _TNM,
+    "dinm": _DINM,
+    "adinm": _ADINM,
+    "local_dinm": _LOCAL_DINM,
+    "irls_huber": _HUBER,
+    "irls_tq": _TQ,
 }
-CATALOGUE: dict[str, Method] = {
-    name: dataclasses.replace(method, options=dataclasses.replace(method.options, method=name))
-    for name, method in _DECLARED.items()
+METHODS: dict[str, SolverOptions] = {
+    name: dataclasses.replace(options, method=name) for name, options in _CHOICES.items()
 }
-METHODS: dict[str, SolverOptions] = {name: method.options for name, method in CATALOGUE.items()}
 
 
 def options(name: str) -> SolverOptions:
@@ -94,30 +67,11 @@ def options(name: str) -> SolverOptions:
 
 
 def from_config(config: SolverConfig) -> SolverOptions:
-    """Return the choices that the parameters ``solver.*`` ask for."""
-    chosen = options(config.method)
-    linear_solver = chosen.linear_solver
-    if config.linear_solver != "auto" and chosen.trust_region == "none":
-        linear_solver = config.linear_solver
-    loss = config.loss
-    if loss == "auto":
-        loss = chosen.rules.loss if chosen.rules.loss != "squared" else "cauchy"
-    keeps_loss = loss == chosen.rules.loss
-    rules = Rules(
-        parameterisation=chosen.rules.parameterisation,
-        loss=loss,
-        loss_scale=config.loss_scale_px,
-        cheirality=config.cheirality,
-    )
-    return dataclasses.replace(
-        chosen,
-        rules=rules,
-        annealing=chosen.annealing if keeps_loss else "none",
-        backend=config.backend,
-        linear_solver=linear_solver,
-        threads=config.threads,
-        max_iterations=config.max_iterations,
-        max_linear_iterations=config.max_linear_iterations,
-        function_tolerance=config.function_tolerance,
-        gradient_tolerance=config.gradient_tolerance,
-    )
+    """Return what the parameters ``solver.*`` ask for, and what their method chooses where they leave it open."""
+    method = options(config.method)
+    chosen = dataclasses.replace(method, **dataclasses.asdict(config))
+    if config.linear_solver == "auto" or method.trust_region != "none":
+        chosen = dataclasses.replace(chosen, linear_solver=method.linear_solver)
+    if config.loss == "auto":
+        chosen = dataclasses.replace(chosen, loss=method.loss if method.loss != "squared" else "cauchy")
+    return chosen if chosen.loss == method.loss else dataclasses.replace(chosen, annealing="none")

@@ -12,13 +12,14 @@ import scipy
 from numpy.typing import NDArray
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import scaling
-from ba_node.core.kernels import Demands, Kernels, Moved, System
+from ba_node.core.kernels import Kernels, Moved, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.native_factors import NativeFactorSum
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Rules, reprojection_errors
+from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Problem, State
 
 if TYPE_CHECKING:
@@ -31,29 +32,28 @@ class KernelsError(ValueError):
     """Kernels that were asked for by name and cannot be had."""
 
 
-_POINTS = Demands()
 _NO_PAIRS = (np.empty(0, np.int64), np.empty(0, np.int64))
 
 
-def make(problem: Problem, rules: Rules, backend: str = "auto", demands: Demands = _POINTS) -> Kernels:
+def make(problem: Problem, options: SolverOptions) -> Kernels:
     """Return the kernels of a problem.
 
     Raises:
         KernelsError: native is asked for and is not built, or does not have what else is asked for.
     """
-    reason = missing(rules, demands)
-    if backend == "native" and reason:
-        raise KernelsError(f"backend native: {reason}; take numpy or auto")
-    if backend == "numpy" or reason:
-        return NumpyKernels(problem, rules, demands)
-    return NativeKernels(problem, rules, demands.threads)
+    reason = missing(options)
+    if options.kernels == "native" and reason:
+        raise KernelsError(f"kernels native: {reason}; take numpy or auto")
+    if options.kernels == "numpy" or reason:
+        return NumpyKernels(problem, options)
+    return NativeKernels(problem, options)
 
 
-def missing(rules: Rules, demands: Demands) -> str:
+def missing(options: SolverOptions) -> str:
     """Return why the C++ kernels cannot be used, or an empty string if they can."""
-    reason = native.missing(rules.parameterisation, rules.loss)
-    if not reason and demands.schur != "points":
-        return f"the C++ kernels eliminate points only, not schur = {demands.schur}"
+    reason = native.missing(options.parameterisation, options.loss)
+    if not reason and options.schur != "points":
+        return f"the C++ kernels eliminate points only, not schur = {options.schur}"
     return reason
 
 
@@ -69,12 +69,14 @@ def residual_norms(problem: Problem, state: State, backend: str = "auto") -> Flo
 class NativeKernels:
     """The kernels in C++."""
 
-    def __init__(self, problem: Problem, rules: Rules, threads: int = 1) -> None:
-        """Hand the problem over; it is copied and sorted once. threads: 0 for one a core."""
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
+        """Hand the problem over; it is copied and sorted once."""
         self.size = 9 if problem.free_intrinsics else 6
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
         pairs = _NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns)
-        self._kernel: Kernel = native.kernels.Kernel(problem, rules, pairs, threads or len(os.sched_getaffinity(0)))
+        threads = options.threads or len(os.sched_getaffinity(0))
+        cost = (options.loss, options.loss_scale_px, options.cheirality)
+        self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
         self._system = _NativeSystem(self._kernel, self.size)

@@ -8,11 +8,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ba_node.core import columns, linear, parameterisation, polish, scaling
+from ba_node.config import SolverOptions
+from ba_node.core import columns, inner_iterations, linear, parameterisation, scaling
 from ba_node.core.blocks import condition
-from ba_node.core.kernels import DENSE_LIMIT, Demands, Moved, System
+from ba_node.core.kernels import DENSE_LIMIT, Moved, System
 from ba_node.core.linear_costs import MAX_BYTES, Factor
-from ba_node.core.objective import Linearisation, Objective, Rules
+from ba_node.core.objective import Linearisation, Objective
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
 from ba_node.core.schur_cameras import CameraReduction, FullSystem
@@ -22,7 +23,6 @@ Reduction = ReducedSystem | CameraReduction | FullSystem
 
 # A sparse matrix fuller than this share is factored as a dense one, if there is the memory.
 _DENSE_SHARE = 0.1
-_POINTS = Demands()
 _SIDES: dict[str, type[ReducedSystem] | type[CameraReduction] | type[FullSystem]] = {
     "points": ReducedSystem,
     "cameras": CameraReduction,
@@ -33,12 +33,12 @@ _SIDES: dict[str, type[ReducedSystem] | type[CameraReduction] | type[FullSystem]
 class NumpyKernels:
     """The kernels in numpy and scipy."""
 
-    def __init__(self, problem: Problem, rules: Rules, demands: Demands = _POINTS) -> None:
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
         """Sort the observations once."""
         columns.keep_memory()
         self._structure = Structure(problem)
-        self._objective = Objective(problem, rules)
-        self._demands = demands
+        self._objective = Objective(problem, options)
+        self._options = options
         self._free = np.flatnonzero(~problem.fixed)
         self.n_free, self.size = self._structure.n_free, self._structure.size
         self.gradient_norm = np.inf
@@ -46,7 +46,7 @@ class NumpyKernels:
         self._equations: NormalEquations
         self._damping: tuple[FloatArray, FloatArray]
         # The rows at the last state that points were polished at: if the step is taken they are asked for again.
-        self._polished: polish.Polished | None = None
+        self._polished: inner_iterations.Polished | None = None
 
     def graduate(self, graduation: float) -> None:
         """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself."""
@@ -66,7 +66,7 @@ class NumpyKernels:
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
         """Add damping to the diagonals and eliminate."""
-        side, factor = self._demands.schur, 1.0
+        side, factor = self._options.schur, 1.0
         if side == "adaptive":
             side, factor = self._adapt(damping_c, damping_p)
         reduction = _SIDES[side](self._structure, self._equations, damping_c, damping_p)
@@ -91,7 +91,7 @@ class NumpyKernels:
         if not polish_steps:
             value = self.objective(moved)
             return Moved(moved, predicted, damping, value, value)
-        found = self._polished = polish.polish_points(self._objective, self._structure, moved, polish_steps)
+        found = self._polished = inner_iterations.polish_points(self._objective, self._structure, moved, polish_steps)
         return Moved(found.state, predicted, damping, found.before, found.after)
 
     def _retract(self, state: State, step_c: FloatArray, step_p: FloatArray) -> State:
@@ -99,7 +99,7 @@ class NumpyKernels:
         free = self._free
         rotation, translation = state.rotation.copy(), state.translation.copy()
         rotation[free], translation[free] = parameterisation.retract(
-            self._objective.rules.parameterisation, rotation[free], translation[free], step_c[:, :6]
+            self._options.parameterisation, rotation[free], translation[free], step_c[:, :6]
         )
         intrinsics = state.intrinsics
         if len(intrinsics):
@@ -129,7 +129,7 @@ class NumpyKernels:
 
     def polish_points(self, state: State, steps: int) -> tuple[float, State]:
         """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
-        found = polish.polish_points(self._objective, self._structure, state, steps)
+        found = inner_iterations.polish_points(self._objective, self._structure, state, steps)
         return found.after, found.state
 
 

@@ -10,11 +10,12 @@ are weighed by the loss separately.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.config import SolverOptions
 from ba_node.core import cameras, columns, loss, parameterisation
 from ba_node.core.factors import FactorSum, FactorTerms
 from ba_node.core.problem import Problem, State
@@ -27,21 +28,24 @@ BoolArray = NDArray[np.bool_]
 _BEHIND_NORM = 100.0
 
 
-@dataclass(frozen=True)
-class Rules:
-    """How residuals are judged.
+class CostModel(Protocol):
+    """What the objective reads of the options of a solve (``SolverOptions``, which declares them)."""
 
-    Attributes:
-        parameterisation: how a pose is stepped.
-        loss: robust loss.
-        loss_scale: where it leaves the square, in sigmas.
-        cheirality: what points behind their camera cost.
-    """
+    @property
+    def parameterisation(self) -> str:
+        """Return how a pose is stepped."""
 
-    parameterisation: str = "local"
-    loss: str = "squared"
-    loss_scale: float = 1.0
-    cheirality: str = "keep"
+    @property
+    def loss(self) -> str:
+        """Return the name of the robust loss."""
+
+    @property
+    def loss_scale_px(self) -> float:
+        """Return where the loss leaves the square, in sigmas."""
+
+    @property
+    def cheirality(self) -> str:
+        """Return what points behind their camera cost."""
 
 
 @dataclass(frozen=True)
@@ -117,17 +121,17 @@ class _Known:
 
 
 class Objective:
-    """The objective of one problem under given rules; knows which image each observation belongs to.
+    """The objective of one problem with a cost model; knows which image each observation belongs to.
 
     Attributes:
         factors: the sum of the problem's factors; None if it has none.
     """
 
-    def __init__(self, problem: Problem, rules: Rules) -> None:
+    def __init__(self, problem: Problem, cost: CostModel) -> None:
         """Prepare what stays the same over all iterations."""
         self.problem = problem
-        self.rules = rules
-        self.factors = FactorSum(problem.factors, problem.fixed, rules.parameterisation) if problem.factors else None
+        self.cost_model = cost
+        self.factors = FactorSum(problem.factors, problem.fixed, cost.parameterisation) if problem.factors else None
         # mu of the surrogate that stands in for a truncated quadratic; infinite for the loss itself.
         self.graduation = np.inf
         obs, cams = problem.observations, problem.cameras
@@ -149,7 +153,7 @@ class Objective:
             depth_weight,
             np.zeros(0, dtype=bool),
         )
-        if rules.cheirality == "drop":
+        if cost.cheirality == "drop":
             self._all = replace(self._all, ignored=cameras.behind(self.in_camera(problem.start), self._all.model))
 
     def in_camera(self, state: State) -> FloatArray:
@@ -195,7 +199,7 @@ class Objective:
             rows, d_intrinsics = self._rows(state, self._all, intrinsics=intrinsics)
         points = columns.take(state.points, obs.point)
         d_keyframe = parameterisation.pose_jacobian(
-            self.rules.parameterisation, rows.d_point, points, state.rotation, obs.keyframe
+            self.cost_model.parameterisation, rows.d_point, points, state.rotation, obs.keyframe
         )
         if intrinsics:
             d_keyframe = np.concatenate([d_keyframe.T, d_intrinsics.T]).T
@@ -234,7 +238,7 @@ class Objective:
     def retract(self, state: State, step_keyframes: FloatArray, step_points: FloatArray) -> State:
         """Return the state after a step: (n_kf, 6 or 9) and (n_pt, 3)."""
         rotation, translation = parameterisation.retract(
-            self.rules.parameterisation, state.rotation, state.translation, step_keyframes[:, :6]
+            self.cost_model.parameterisation, state.rotation, state.translation, step_keyframes[:, :6]
         )
         intrinsics = state.intrinsics + step_keyframes[:, 6:] if len(state.intrinsics) else state.intrinsics
         return State(rotation, translation, state.points + step_points, intrinsics)
@@ -264,7 +268,7 @@ class Objective:
     def _mask(self, x_cam: FloatArray, of: _Known) -> IntArray:
         """Return which observations push nothing, and move their points off the plane so that nothing is infinite."""
         hidden = cameras.behind(x_cam, of.model)
-        if self.rules.cheirality == "keep":
+        if self.cost_model.cheirality == "keep":
             on_plane = np.abs(x_cam[:, 2]) < cameras.MIN_DEPTH * 1e-6
             hidden = np.where(of.model == cameras.Model.EQUIDISTANT, hidden, on_plane)
         masked = np.flatnonzero(hidden | of.ignored if len(of.ignored) else hidden)
@@ -289,10 +293,9 @@ class Objective:
 
     def _costs(self, residual: FloatArray, masked: IntArray, of: _Known) -> tuple[FloatArray, FloatArray]:
         """Return Psi of each observation and the square root of the weight of each row, (n, 1) or (n, 3)."""
-        rules = self.rules
         norm = np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)
         cost, weight = self._loss(norm)
-        if rules.cheirality != "keep" and len(masked):
+        if self.cost_model.cheirality != "keep" and len(masked):
             behind, _ = self._loss(np.array([_BEHIND_NORM]))
             cost[masked] = behind[0]
         if len(of.ignored):
@@ -305,7 +308,7 @@ class Objective:
         return cost, root
 
     def _loss(self, norm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return loss.evaluate(self.rules.loss, norm, self.rules.loss_scale, self.graduation)
+        return loss.evaluate(self.cost_model.loss, norm, self.cost_model.loss_scale_px, self.graduation)
 
     def _row_scale(self, root_weight: FloatArray, of: _Known) -> FloatArray:
         """Return sqrt(weight) / sigma of each row, (n, 1 or 3)."""
@@ -336,4 +339,12 @@ def _lenses(problem: Problem, used: IntArray) -> tuple[NDArray[np.uint8], FloatA
 
 def reprojection_errors(problem: Problem, state: State) -> FloatArray:
     """Return predicted minus measured, (n_obs, 2) px, NaN for points that their camera cannot see."""
-    return Objective(problem, Rules()).errors(state)
+    return Objective(problem, SolverOptions()).errors(state)
+
+
+def rms_px(problem: Problem, *states: State) -> list[float]:
+    """Return for each state the rms over the observations whose point is in front of the camera, px; 0 without any."""
+    measure = Objective(problem, SolverOptions())
+    errors = (measure.errors(state) for state in states)
+    seen = [error[~np.isnan(error[:, 0])] for error in errors]
+    return [float(np.sqrt(np.mean(error * error))) if len(error) else 0.0 for error in seen]

@@ -19,9 +19,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.config import SolverOptions
 from ba_node.core import blocks, linear, linear_costs, scaling
 from ba_node.core.kernels import DENSE_LIMIT, System
-from ba_node.core.options import SolverOptions
 
 FloatArray = NDArray[np.float64]
 Hessian = Callable[[], tuple[FloatArray, FloatArray]]
@@ -100,7 +100,7 @@ class ReducedSolver:
         self, system: System, hessian: Hessian, limits: linear.PcgLimits, kind: str, *, formed: bool
     ) -> linear.Solution:
         """Solve by PCG with a preconditioner, by the kernels' own where they have one."""
-        scale = 1.0 / system.gather(*scaling.scaled_space(self._options.demands.space, hessian()))
+        scale = 1.0 / system.gather(*scaling.scaled_space(self._options.scaled_space, hessian()))
         found = system.pcg(kind, scale, limits, formed=formed)
         if found is None:
             precondition = preconditioner(kind, system, scale)

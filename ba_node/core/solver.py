@@ -17,8 +17,8 @@ Damping: ``nielsen`` (Algorithm 6): rho > 0: mu *= max(1/3, 1 - (2 rho - 1)^3), 
 ``fast``: the same, but mu / 5 where rho > 1/2 and mu / 2 where rho > 1/4: along a flat valley rho stays a little below
 1/2, and Nielsen's mu where it is.
 
-With ``polish_steps`` > 0 each step of the keyframes is followed by that many damped Newton steps of every point alone
-(inner iterations); a step that was bad only because the points had not followed it is saved by them.
+With ``inner_iterations`` > 0 each step of the keyframes is followed by that many damped Newton steps of every point
+alone; a step that was bad only because the points had not followed it is saved by them.
 
 A step that is not finite, or that could not be computed, counts as a rejected one.
 """
@@ -29,11 +29,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import linear, native_kernels
 from ba_node.core.annealing import Annealing
-from ba_node.core.choices import ChoiceError
 from ba_node.core.kernels import Kernels
-from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem
 from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Iteration, Result, Status
@@ -70,12 +69,12 @@ def solve(
 
     Raises:
         ProblemError: the problem is not well formed.
-        ChoiceError: a choice does not exist or contradicts another.
+        ConfigError: a choice does not exist or contradicts another.
     """
     options.check()
     problem.check()
     if problem.factors and options.schur == "cameras":
-        raise ChoiceError(
+        raise ConfigError(
             f"schur = cameras with {problem.n_factors} factors, which couple keyframes with each other: take"
             " schur = points, none or adaptive"
         )
@@ -104,7 +103,7 @@ class _Run:
         self.clock, self.began = clock, clock()
         self.on_iteration = on_iteration
         with np.errstate(all="ignore"):
-            self.kernels = kernels or native_kernels.make(problem, options.rules, options.backend, options.demands)
+            self.kernels = kernels or native_kernels.make(problem, options)
         self.reduced = ReducedSolver(options)
         self.state = problem.start
         self.value = np.inf
@@ -180,7 +179,7 @@ class _Run:
         solution = self.reduced.solve(system, self.kernels.diagonals, self.radius)
         if solution.x is None:
             return self._judge(-1.0, solution), solution
-        moved = self.kernels.move(self.state, system, solution.x, self.options.polish_steps)
+        moved = self.kernels.move(self.state, system, solution.x, self.options.inner_iterations)
         rho = -1.0
         predicted = moved.predicted - (moved.damping if self.options.gain_model == "damped" else 0.0)
         if np.isfinite(moved.unpolished) and predicted > 0:

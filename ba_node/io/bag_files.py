@@ -63,14 +63,10 @@ def _find_several(paths: Sequence[Path]) -> BagFiles:
 
 def _of_one_metadata(files: list[Path]) -> bool:
     """Return True if one metadata.yaml lists all of some files."""
-    folders = {file.parent for file in files}
-    if len(folders) > 1 or not (files[0].parent / METADATA).is_file():
+    if len({file.parent for file in files}) > 1:
         return False
-    try:
-        names = {Path(str(name)).name for name in _metadata(files[0].parent)["relative_file_paths"]}
-    except (YamlError, OSError):
-        return False
-    return {file.name.removesuffix(PACKED) for file in files} <= {name.removesuffix(PACKED) for name in names}
+    names = {name.removesuffix(PACKED) for name in _names(files[0].parent)}
+    return {file.name.removesuffix(PACKED) for file in files} <= names
 
 
 def _require_common_name(files: list[Path]) -> None:
@@ -111,14 +107,26 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return facts
 
 
+def _names_in(facts: dict[str, Any]) -> list[str]:
+    """Return the files that a metadata.yaml lists, relative to its folder; older writers add its own name in front."""
+    return list(dict.fromkeys(Path(str(name)).name for name in facts["relative_file_paths"]))
+
+
+def _names(folder: Path) -> list[str]:
+    """Return the files that the metadata.yaml of a folder lists, none where there is none that can be read."""
+    try:
+        return _names_in(_metadata(folder))
+    except (YamlError, OSError):
+        return []
+
+
 def _listed(folder: Path, facts: dict[str, Any]) -> BagFiles:
     storage, packing = facts.get("storage_identifier"), str(facts.get("compression_format") or "")
     if storage not in _KNOWN:
         raise BagError(f"{folder}: storage {storage!r} is not read: convert it with ros2 bag convert to mcap")
     if packing not in ("", "zstd"):
         raise BagError(f"{folder}: compression_format {packing!r} is not read: unpack it, or record with zstd or none")
-    # Names are relative to the folder; older writers put its own name in front.
-    names = list(dict.fromkeys(Path(str(name)).name for name in facts["relative_file_paths"]))
+    names = _names_in(facts)
     found = {name: _there(folder / name) for name in names}
     files = [file for file in found.values() if file is not None]
     missing = [name for name, file in found.items() if file is None]
@@ -149,12 +157,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _part_of(path: Path) -> dict[str, str]:
     """Return a warning if a file is one of several of a recording."""
-    if not (path.parent / METADATA).is_file():
-        return {}
-    try:
-        names = [Path(str(name)).name for name in _metadata(path.parent)["relative_file_paths"]]
-    except (YamlError, OSError):
-        return {}
+    names = _names(path.parent)
     if len(names) < 2 or path.name not in names:
         return {}
     return {"split": f"{path} is one of {len(names)} files of a recording: give its folder {path.parent} to read all"}

@@ -42,9 +42,9 @@ _COMPRESSIONS = ("", "lz4", "zstd")
 
 
 class Message(NamedTuple):
-    """A message: channel, log time in ns, bytes."""
+    """A message: number of its channel, log time in ns, bytes."""
 
-    channel_id: int
+    channel: int
     log_time: int
     data: bytes
 
@@ -123,27 +123,41 @@ def read_messages(
     Raises:
         BagError: so many blocks overlap in time that they do not fit into memory.
     """
-    wanted = frozenset(channels)
-    blocks = iter([block for block in index.blocks if block.channels is None or block.channels & wanted])
-    following, held = next(blocks, None), 0
-    # Of each open block: time, place in the file and number of its next message; all of it; its bytes.
-    waiting: list[tuple[int, int, int, list[Message], int]] = []
-    while waiting or following:
-        # A block is opened only when its first message may come before all that wait.
-        if following and (not waiting or following[:2] < waiting[0][:2]):
-            messages = _sorted_messages(stream, index, following, wanted, report)
-            offset, number, size = following.offset, 0, sum(len(message.data) for message in messages)
-            following, held = next(blocks, None), held + size
-            if held > MAX_WAITING_BYTES:
-                raise BagError(f"chunks of more than {MAX_WAITING_BYTES >> 20} MB overlap in time: split or sort it")
+    wanted, open_bytes = frozenset(channels), 0
+
+    def opened(block: Block) -> Iterator[Message]:
+        nonlocal open_bytes
+        messages = _sorted_messages(stream, index, block, wanted, report)
+        size = sum(len(message.data) for message in messages)
+        open_bytes += size
+        if open_bytes > MAX_WAITING_BYTES:
+            raise BagError(f"chunks of more than {MAX_WAITING_BYTES >> 20} MB overlap in time: split or sort it")
+        yield from messages
+        open_bytes -= size
+
+    blocks = (block for block in index.blocks if block.channels is None or block.channels & wanted)
+    return merge_by_time((block.start_ns, block.offset, opened(block)) for block in blocks)
+
+
+def merge_by_time(parts: Iterator[tuple[int, int, Iterator[Message]]]) -> Iterator[Message]:
+    """Yield the messages of all parts by log time; those of the same time by the place of their part.
+
+    Args:
+        parts: log time of the first message, ns, place, and messages by log time of each part, by the first two. A part
+            is read only when its first message may come before all that wait.
+    """
+    part = next(parts, None)
+    waiting: list[tuple[int, int, Message, Iterator[Message]]] = []
+    while waiting or part:
+        if part and (not waiting or part[:2] < waiting[0][:2]):
+            _, place, messages = part
+            part = next(parts, None)
         else:
-            _, offset, number, messages, size = heapq.heappop(waiting)
-            yield messages[number]
-            number += 1
-        if number < len(messages):
-            heapq.heappush(waiting, (messages[number].log_time, offset, number, messages, size))
-        else:
-            held -= size
+            _, place, message, messages = heapq.heappop(waiting)
+            yield message
+        following = next(messages, None)
+        if following:
+            heapq.heappush(waiting, (following.log_time, place, following, messages))
 
 
 def _sorted_messages(
@@ -237,7 +251,7 @@ def _index_block(stream: IO[bytes], index: BagIndex, block: Block) -> None:
             index.add(record)
     if messages:
         times = [message.log_time for message in messages]
-        channels = Counter(message.channel_id for message in messages)
+        channels = Counter(message.channel for message in messages)
         index.blocks.append(block._replace(start_ns=min(times), channels=frozenset(channels)))
         index.message_count += len(times)
         index.counts.update(channels)

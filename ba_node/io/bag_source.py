@@ -5,15 +5,16 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, field
-from typing import IO, TYPE_CHECKING, Any, Protocol
+import functools
+from dataclasses import dataclass
+from typing import IO, TYPE_CHECKING, Any
 
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
-from ba_node.io.bag_index import BagIndex, read_index, read_messages
+from ba_node.io.bag_index import BagIndex, Message, read_index, read_messages
 from ba_node.io.files import FileKindError, open_regular
 
 if TYPE_CHECKING:
@@ -49,9 +50,9 @@ class BagChannel:
     count: int | None
 
 
-@dataclass
-class SourceFacts:
-    """What a file says of itself.
+@dataclass(frozen=True)
+class Source:
+    """One open file.
 
     Attributes:
         channels: all.
@@ -59,23 +60,15 @@ class SourceFacts:
         start_ns: log time of the first, ns.
         end_ns: log time of the last, ns.
         problems: what is wrong with it, as (reason, words).
+        read: yields the messages of some channels by log time; what cannot be read goes to the function given.
     """
 
     channels: list[BagChannel]
     message_count: int
     start_ns: int
     end_ns: int
-    problems: list[tuple[str, str]] = field(default_factory=list)
-
-
-class Source(Protocol):
-    """One open file."""
-
-    facts: SourceFacts
-
-    def read(self, channels: Collection[int], report: Callable[[str, str], None]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield channel, log time in ns and bytes of the messages of some channels, by log time."""
-        ...
+    problems: list[tuple[str, str]]
+    read: Callable[[Collection[int], Callable[[str, str], None]], Iterator[Message]]
 
 
 def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
@@ -93,7 +86,7 @@ def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
         stream = stack.enter_context(open_regular(path, MAX_BYTES))
         head = stream.read(len(_SQLITE_MAGIC))
         stream.seek(0)
-        return SqliteSource(path, stack) if head == _SQLITE_MAGIC else McapSource(stream, path.stat().st_size)
+        return _sqlite(path, stack) if head == _SQLITE_MAGIC else _mcap(stream, path.stat().st_size)
     except BagError as error:
         raise type(error)(f"{name}: {error}") from None
     except FileKindError as error:
@@ -102,20 +95,13 @@ def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
         raise BagError(f"{name}: cannot be opened: {error.strerror}") from error
 
 
-class McapSource:
-    """An MCAP file, whole or damaged."""
-
-    def __init__(self, stream: IO[bytes], size: int) -> None:
-        """Index it."""
-        self._stream = stream
-        self._index = index = read_index(stream, size)
-        channels = [_mcap_channel(index, channel) for channel in index.channels.values()]
-        start_ns = index.blocks[0].start_ns if index.blocks else 0
-        self.facts = SourceFacts(channels, index.message_count, start_ns, index.end_ns, index.problems)
-
-    def read(self, channels: Collection[int], report: Callable[[str, str], None]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield channel, log time and bytes; see :class:`Source`."""
-        return read_messages(self._stream, self._index, channels, report)
+def _mcap(stream: IO[bytes], size: int) -> Source:
+    """Index an MCAP file, whole or damaged."""
+    index = read_index(stream, size)
+    channels = [_mcap_channel(index, channel) for channel in index.channels.values()]
+    start_ns = index.blocks[0].start_ns if index.blocks else 0
+    read = functools.partial(read_messages, stream, index)
+    return Source(channels, index.message_count, start_ns, index.end_ns, index.problems, read)
 
 
 def _mcap_channel(index: BagIndex, channel: Channel) -> BagChannel:
@@ -130,37 +116,36 @@ def _mcap_channel(index: BagIndex, channel: Channel) -> BagChannel:
     )
 
 
-class SqliteSource:
-    """An SQLite file of rosbag2; those before Jazzy hold no definitions, so that ours are taken."""
+def _sqlite(path: Path, stack: contextlib.ExitStack) -> Source:
+    """Open an SQLite file of rosbag2; those before Jazzy hold no definitions, so that ours are taken."""
+    reader = Sqlite3Reader(path)
+    try:
+        reader.open()
+        stack.callback(reader.close)
+        about = reader.metadata
+        channels = [_sqlite_channel(connection) for connection in reader.connections]
+    except Exception as error:  # a damaged database leads the library into errors of every kind
+        raise BagError(f"not an SQLite recording of rosbag2, or damaged: {error}") from error
+    if about.message_count == 0:
+        raise EmptyBagError("no message can be read: it was closed before anything was recorded")
+    problems = []
+    journal = path.with_name(f"{path.name}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        words = f"{journal.name} beside it holds messages that were not written into it: open it with sqlite3 once"
+        problems.append(("truncated", words))
+    read = functools.partial(_read_sqlite, reader)
+    return Source(channels, about.message_count, about.start_time, about.end_time - 1, problems, read)
 
-    def __init__(self, path: Path, stack: contextlib.ExitStack) -> None:
-        """Open it."""
-        self._reader = Sqlite3Reader(path)
-        try:
-            self._reader.open()
-            stack.callback(self._reader.close)
-            facts = self._reader.metadata
-            channels = [_sqlite_channel(connection) for connection in self._reader.connections]
-        except Exception as error:  # a damaged database leads the library into errors of every kind
-            raise BagError(f"not an SQLite recording of rosbag2, or damaged: {error}") from error
-        if facts.message_count == 0:
-            raise EmptyBagError("no message can be read: it was closed before anything was recorded")
-        self.facts = SourceFacts(channels, facts.message_count, facts.start_time, facts.end_time - 1)
-        journal = path.with_name(f"{path.name}-wal")
-        if journal.is_file() and journal.stat().st_size:
-            words = f"{journal.name} beside it holds messages that were not written into it: open it with sqlite3 once"
-            self.facts.problems.append(("truncated", words))
 
-    def read(self, channels: Collection[int], report: Callable[[str, str], None]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield channel, log time and bytes; see :class:`Source`."""
-        connections = [connection for connection in self._reader.connections if connection.id in channels]
-        if not connections:
-            return
-        try:
-            for connection, log_time, data in self._reader.messages(connections):
-                yield connection.id, log_time, data
-        except Exception as error:  # as when it is opened
-            report("corrupt", f"the database is damaged: {error}")
+def _read_sqlite(
+    reader: Sqlite3Reader, channels: Collection[int], report: Callable[[str, str], None]
+) -> Iterator[Message]:
+    connections = [connection for connection in reader.connections if connection.id in channels]
+    try:
+        for connection, log_time, data in reader.messages(connections) if connections else ():
+            yield Message(connection.id, log_time, data)
+    except Exception as error:  # as when it is opened
+        report("corrupt", f"the database is damaged: {error}")
 
 
 def _sqlite_channel(connection: Any) -> BagChannel:

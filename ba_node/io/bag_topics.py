@@ -90,7 +90,7 @@ class Chooser:
         """Return what is taken and what is left.
 
         Raises:
-            BagError: a topic that the user names is not there, or it cannot be told which of several is meant.
+            BagError: a topic that the user names is not there, or several are possible.
         """
         options = self._narrowed(choice)
         for name in INPUT_TYPES:

@@ -3,7 +3,7 @@
 """Write files that are either whole or not there, each by one process at a time, and read none but regular ones.
 
 While it is written a file is ``.NAME.<random>.partial`` beside its place: made anew, so that no link that someone has
-planted is written through, and locked, so that what a killed process has left is told from what another one writes.
+planted is written through, and locked, so that what a killed process has left is not taken for one that is written.
 """
 
 from __future__ import annotations
@@ -87,10 +87,18 @@ def discard_partials() -> None:
 def locked_folder(path: Path) -> Iterator[None]:
     """Make a folder, and have it for this process alone while the block runs.
 
+    On an error the folders that were made for it go again if nothing is in them.
+
     Raises:
         FolderInUseError: another process has it.
+        NotADirectoryError: something else has the name of it or of one above it.
     """
-    path.mkdir(parents=True, exist_ok=True)
+    new = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        other = next(folder for folder in (path, *path.parents) if folder.exists() and not folder.is_dir())
+        raise NotADirectoryError(errno.ENOTDIR, "is no folder: results need one, of another name", str(other)) from None
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
@@ -100,6 +108,11 @@ def locked_folder(path: Path) -> Iterator[None]:
                 f"{path}: another process writes its results there: wait for its end, or name another folder"
             ) from None
         yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for made in new:
+                made.rmdir()
+        raise
     finally:
         os.close(folder)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write figures as JSON that every reader takes: null for infinity and NaN, which JSON does not have."""
+"""Write JSON that every reader takes: null for infinity and NaN, which JSON does not have."""
 
 from __future__ import annotations
 

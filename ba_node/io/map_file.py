@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ba_node import __version__, archive
+from ba_node import __version__
+from ba_node.backend import MapContent, MapError, archive
 from ba_node.io.files import FileKindError, open_regular, whole_file
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for
-from ba_node.scene.map_content import MapContent, MapError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def write_map(path: Path | str, content: MapContent) -> None:
 
 
 def read_map(path: Path | str) -> MapContent:
-    """Read a file as it is; whether its parts fit together is for the back-end to judge, see :func:`load_map`.
+    """Read a file as it is; whether its parts fit together is checked by :func:`load_map`.
 
     Raises:
         MapFileError: it cannot be opened, is no map or damaged, or has a newer format.

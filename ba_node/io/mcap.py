@@ -5,18 +5,17 @@
 from __future__ import annotations
 
 import contextlib
-import heapq
 import pickle
 import tempfile
 from collections import Counter, deque
 from itertools import chain, combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
 from ba_node.io.bag_files import PACKED, find_files, unpack_file
-from ba_node.io.bag_index import MAX_CHUNK_BYTES
+from ba_node.io.bag_index import MAX_CHUNK_BYTES, Message, merge_by_time
 from ba_node.io.bag_source import BagChannel, Source, open_source
 from ba_node.io.bag_topics import CAMERAS, NO_CHOICE, Chooser, Chosen, TopicChoice
 from ba_node.io.bag_writer import BagWriter
@@ -35,14 +34,6 @@ _NOTES = 100
 _LOOKED_AT = 20
 # Parts of a recording follow each other but for this: messages wait a while before they are written.
 _MAX_OVERLAP_NS = 1_000_000_000
-
-
-class _Raw(NamedTuple):
-    """A message as it is recorded: number of its channel, log time in ns, bytes."""
-
-    channel: int
-    log_time: int
-    data: bytes
 
 
 class BagReader:
@@ -87,16 +78,16 @@ class BagReader:
     def __enter__(self) -> BagReader:
         with contextlib.ExitStack() as stack:
             self._open(stack)
-            self._channels = [channel for _, source in self._sources for channel in source.facts.channels]
+            self._channels = [channel for _, source in self._sources for channel in source.channels]
             self.topics = {}
             for channel in self._channels:
                 self.topics.setdefault(channel.topic, channel.type_name)
             if not self._are_parts:
                 self._require_one_recording()
             self._stack = stack.pop_all()
-        self.message_count = sum(source.facts.message_count for _, source in self._sources)
+        self.message_count = sum(source.message_count for _, source in self._sources)
         for path, source in self._sources:
-            for reason, words in source.facts.problems:
+            for reason, words in source.problems:
                 self._reject(path, reason, words)
         return self
 
@@ -157,7 +148,7 @@ class BagReader:
             cameras_known: the recording may come without cameras.
 
         Raises:
-            BagError: keyframes, tracks or cameras are missing, it cannot be told which of several are meant, or a
+            BagError: keyframes, tracks or cameras are missing, several are possible, or a
                 definition lacks a field.
         """
         chosen = self._choose(cameras_known)
@@ -170,7 +161,7 @@ class BagReader:
         cameras = {n for n in numbers if self._channels[n].type_name in [INPUT_TYPES[name] for name in CAMERAS]}
         return self._measurements(numbers, self._first_cameras(cameras))
 
-    def _measurements(self, numbers: Collection[int], first: _Raw | None) -> Iterator[tuple[str, int, Measurement]]:
+    def _measurements(self, numbers: Collection[int], first: Message | None) -> Iterator[tuple[str, int, Measurement]]:
         counts: Counter[str] = Counter()
         raw = self._raw(numbers)
         if first is not None:
@@ -187,7 +178,7 @@ class BagReader:
                 continue
             yield channel.topic, log_time, measurement
 
-    def _first_cameras(self, numbers: Collection[int]) -> _Raw | None:
+    def _first_cameras(self, numbers: Collection[int]) -> Message | None:
         """Return the first message of some channels that holds cameras that can be read."""
         rejected, notes = self.rejected.copy(), self.rejection_notes.copy()
         try:
@@ -245,37 +236,25 @@ class BagReader:
             return found if isinstance(found, CameraRig) else None
         return None
 
-    def _raw(self, numbers: Collection[int]) -> Iterator[_Raw]:
+    def _raw(self, numbers: Collection[int]) -> Iterator[Message]:
         """Yield the messages of some channels of all files by log time; those of the same time file by file."""
         count, lost = 0, self.rejected["corrupt"]
-        waiting: list[tuple[int, int, _Raw, Iterator[_Raw]]] = []
-        following = self._readers(numbers)
-        opened = next(following, None)
-        while waiting or opened:
-            # A file is read only when its first message may come before all that wait.
-            if opened and (not waiting or opened[0] <= waiting[0][0]):
-                place, raws = opened[1:]
-                opened = next(following, None)
-            else:
-                _, place, raw, raws = heapq.heappop(waiting)
-                count += 1
-                yield raw
-            entry = next(raws, None)
-            if entry:
-                heapq.heappush(waiting, (entry.log_time, place, entry, raws))
+        for message in merge_by_time(self._readers(numbers)):
+            count += 1
+            yield message
         if not count and self.rejected["corrupt"] > lost:
             raise BagError(f"{self.path}: no message can be read: {self.rejection_notes[-1]}")
 
-    def _readers(self, numbers: Collection[int]) -> Iterator[tuple[int, int, Iterator[_Raw]]]:
+    def _readers(self, numbers: Collection[int]) -> Iterator[tuple[int, int, Iterator[Message]]]:
         """Yield, for each file by its first time, that time, its place and its messages."""
         begin = 0
         for place, (path, source) in enumerate(self._sources):
-            own = {c.id: begin + i for i, c in enumerate(source.facts.channels) if begin + i in numbers}
-            begin += len(source.facts.channels)
+            own = {c.id: begin + i for i, c in enumerate(source.channels) if begin + i in numbers}
+            begin += len(source.channels)
             if own:
-                yield source.facts.start_ns, place, self._of_source(path, source, own)
+                yield source.start_ns, place, self._of_source(path, source, own)
 
-    def _of_source(self, path: Path, source: Source, numbers: dict[int, int]) -> Iterator[_Raw]:
+    def _of_source(self, path: Path, source: Source, numbers: dict[int, int]) -> Iterator[Message]:
         def report(reason: str, words: str) -> None:
             self._reject(path, reason, words)
 
@@ -285,7 +264,7 @@ class BagReader:
                 if data[:4] == ZSTD_MAGIC:
                     whole = self._unpacked(path, numbers[channel], data)
                 if whole is not None:
-                    yield _Raw(numbers[channel], log_time, whole)
+                    yield Message(numbers[channel], log_time, whole)
         except BagError as error:
             raise BagError(f"{path}: {error}") from None
 
@@ -340,7 +319,7 @@ class BagReader:
                 self._sources.append((path, source))
         if not self._sources:
             raise errors[0]
-        self._sources.sort(key=lambda entry: (entry[1].facts.start_ns, entry[1].facts.end_ns, entry[0].name))
+        self._sources.sort(key=lambda entry: (entry[1].start_ns, entry[1].end_ns, entry[0].name))
         notes = [str(error) for error in errors if not isinstance(error, EmptyBagError)]
         self.rejected.update(["unreadable_file"] * len(notes))
         self.rejection_notes.extend(notes)
@@ -349,10 +328,10 @@ class BagReader:
     def _require_one_recording(self) -> None:
         """Raise BagError if files cannot be parts of one recording: of the same time, or with other cameras."""
         for (path, source), (other, later) in combinations(self._sources, 2):
-            shared = {c.topic for c in source.facts.channels} & {c.topic for c in later.facts.channels}
+            shared = {c.topic for c in source.channels} & {c.topic for c in later.channels}
             inputs = {topic for topic in shared if self.topics[topic] in INPUT_TYPES.values()}
             why = ""
-            if inputs and source.facts.end_ns - later.facts.start_ns > _MAX_OVERLAP_NS:
+            if inputs and source.end_ns - later.start_ns > _MAX_OVERLAP_NS:
                 why = "are of the same time"
             elif any(self._other_cameras(topic, source, later) for topic in inputs):
                 why = "have different cameras"
@@ -366,7 +345,7 @@ class BagReader:
             return False
         found = set()
         for source in sources:
-            own = {id(channel) for channel in source.facts.channels if channel.topic == topic}
+            own = {id(channel) for channel in source.channels if channel.topic == topic}
             first = self._first_cameras({n for n, channel in enumerate(self._channels) if id(channel) in own})
             if first is not None:
                 channel = self._channels[first.channel]
@@ -383,7 +362,7 @@ def _source_or_error(path: Path, folder: Path | None, stack: contextlib.ExitStac
         return error
 
 
-def _without(raws: Iterator[_Raw], first: _Raw) -> Iterator[_Raw]:
+def _without(raws: Iterator[Message], first: Message) -> Iterator[Message]:
     """Yield all messages but one, the first that is equal to it."""
     for raw in raws:
         if raw == first:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ba_node.core import geometry
+from ba_node.estimate import Transform
 from ba_node.messages.factory import MessageFactory, header_message, pose_message
 from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
-from ba_node.window.correction import Transform
 
 if TYPE_CHECKING:
     from ba_node.estimate import Correction, Estimate

@@ -37,16 +37,6 @@ class Problem(Protocol):
     @property
     def observations(self) -> object: ...
 
-class CostModel(Protocol):
-    """Loss and cheirality by name."""
-
-    @property
-    def loss(self) -> str: ...
-    @property
-    def loss_scale(self) -> float: ...
-    @property
-    def cheirality(self) -> str: ...
-
 class PcgLimits(Protocol):
     """As core.linear.PcgLimits."""
 
@@ -76,9 +66,11 @@ class Rays(Protocol):
     def distance_sigma_m(self) -> Doubles: ...
 
 class Kernel:
-    """One problem; the arrays are copied."""
+    """One problem; the arrays are copied. cost: loss, its scale and cheirality."""
 
-    def __init__(self, problem: Problem, cost: CostModel, factor_pairs: tuple[Ints, Ints], threads: int) -> None: ...
+    def __init__(
+        self, problem: Problem, cost: tuple[str, float, str], factor_pairs: tuple[Ints, Ints], threads: int
+    ) -> None: ...
     @property
     def n_free(self) -> int: ...
     @property

@@ -29,18 +29,25 @@ def attention(report: Mapping[str, Any]) -> list[str]:
     for session in (*report["older_sessions"], report):
         lines += session["warnings"].values()
         of = f"session {session['session_id']}: " if report["older_sessions"] else ""
-        if session.get("unrefined"):
-            lines.append(f"{of}nothing was refined: {session['unrefined']}")
-        lines += _worse(session, of)
-        for name in ("FAILED", "HELD"):
-            count = session["solves_by_status"].get(name, 0)
-            if count:
-                lines.append(f"{of}{count} of {session['solves']} solves {name.lower()}: their result was not taken")
-        lines += _turned_away(session["rejected"], of)
-    return lines + _turned_away(report["bag_rejected"], "")
+        lines += [of + line for line in (*_not_taken(session), *_worse(session), *turned_away(session["rejected"]))]
+    return lines + turned_away(report["bag_rejected"])
 
 
-def _worse(session: Mapping[str, Any], of: str) -> list[str]:
+def _not_taken(session: Mapping[str, Any]) -> list[str]:
+    """Return which solves gave nothing, and why nothing was refined unless a warning has said that."""
+    counts = [
+        f"{session['solves_by_status'][name]} of {session['solves']} solves {name.lower()}"
+        for name in ("FAILED", "HELD")
+        if session["solves_by_status"].get(name)
+    ]
+    if session.get("keyframes_refined", 1):
+        return [f"{count}: their result was not taken" for count in counts]
+    reason, warnings = session["unrefined"], session["warnings"]
+    known = any(reason in text for text in warnings.values()) or ("setup" in warnings and "set-up" in reason)
+    return ["nothing was refined: " + "; ".join([*([] if known else [reason]), *counts, "the front-end's poses stand"])]
+
+
+def _worse(session: Mapping[str, Any]) -> list[str]:
     """Return by which measures the result of a session is worse than what came in."""
     found = []
     for key, name, share in _MEASURES:
@@ -49,9 +56,10 @@ def _worse(session: Mapping[str, Any], of: str) -> list[str]:
             found.append(f"{name} {before:.3g} -> {after:.3g} px")
     if not found:
         return []
-    return [f"{of}the result explains the observations worse than what came in: {', '.join(found)}"]
+    return [f"the result explains the observations worse than what came in: {', '.join(found)}"]
 
 
-def _turned_away(rejected: Mapping[str, int], of: str) -> list[str]:
+def turned_away(rejected: Mapping[str, int]) -> list[str]:
+    """Return how many messages were turned away, by reason, but for those that do no harm."""
     counts = {reason: count for reason, count in rejected.items() if reason not in HARMLESS}
-    return [f"{of}turned away: {', '.join(f'{n} {reason}' for reason, n in counts.items())}"] if counts else []
+    return [f"turned away: {', '.join(f'{n} {reason}' for reason, n in counts.items())}"] if counts else []

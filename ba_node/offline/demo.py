@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Show the whole way: the node in one process, a recording played into it from another, its answers judged here."""
+"""Run the node in one process, play a recording into it from another, and evaluate its output in this one."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def run(bag: Path, out: Path, say: Callable[[str], None]) -> Outcome:
                 what = f"the refined keyframe {last.keyframe_id}"
                 _await(listener, lambda: last.keyframe_id in listener.keyframe_ids, timeout_s, (node, player), what)
             newest_ns = max(keyframe.stamp_ns for keyframe in inputs)
-            listener.spin_until(lambda: _told(listener, newest_ns), _POINTS_S)
+            listener.spin_until(lambda: _has_last_solve(listener, newest_ns), _POINTS_S)
             if not listener.reports:
                 raise DemoError(f"the node sent no report; {node.last_words()}")
         after = listener.poses()
@@ -226,7 +226,7 @@ def _await(
         raise DemoError(f"waited {timeout_s:.0f} s for {what}; {'; '.join(p.last_words() for p in processes)}")
 
 
-def _told(listener: NodeListener, newest_ns: int) -> bool:
+def _has_last_solve(listener: NodeListener, newest_ns: int) -> bool:
     """Return True if points and report of the last solve have come; they are sent after its keyframes."""
     reports = [stamp_ns_from_message(report.header.stamp) for report in listener.reports[-1:]]
     return listener.points_stamp_ns == newest_ns and reports == [newest_ns]

@@ -103,7 +103,7 @@ def placed(
 def read_truth(reader: BagReader) -> Poses | None:
     """Return the true poses in a recording by time, numbered from 0; None if it has none that can be read.
 
-    What cannot be read is told in ``reader.warnings``. Of several robots the truth is that of the keyframes taken.
+    ``reader.warnings`` names what cannot be read. Of several robots the truth is that of the keyframes taken.
     """
     try:
         return _read_truth(reader)

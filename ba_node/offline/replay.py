@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from ba_node import native
-from ba_node.backend import Admitted, Backend
+from ba_node.backend import Backend, MapEnded, MapSummary
 from ba_node.config import Config
-from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
@@ -35,8 +34,6 @@ from ba_node.messages.conversion import output_messages
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.session_record import SessionRecord
-from ba_node.scene.scene import Scene
-from ba_node.window import full
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
 # leave a file that grows with the square of its length.
@@ -77,7 +74,7 @@ class MapOptions:
         load: map to begin with; the recording must go on in its session.
         optimize: refine everything of the newest session at the end.
         save: file for the map of the newest session.
-        topics: which topics of the recording are taken, where it cannot be told.
+        topics: which topics of the recording are taken, where several are possible.
     """
 
     load: Path | None = None
@@ -125,11 +122,15 @@ def replay(
             run.end(options.optimize)
             if not run.sessions:
                 raise ReplayError(f"{reader.path}: {_nothing_to_use(run)}{_why(reader, run)}")
-            if run.backend.scene.cameras is None:
-                refused = run.backend.scene.refused_rig or "none came"
+            if run.sessions[-1].summary.cameras == 0:
+                refused = run.sessions[-1].summary.refused_rig or "none came"
                 raise ReplayError(f"{reader.path}: no camera rig that can be used: {refused}")
         truth = read_truth(reader)
-        report = {"bag": reader.path.name, "kernels": native.description(config.solver.backend), **_write(out, run.sessions, truth)}
+        report = {
+            "bag": reader.path.name,
+            "kernels": native.description(config.solver.kernels),
+            **_write(out, run.sessions, truth),
+        }
         report |= {"topics_taken": reader.taken, "topics_left": reader.left, "cameras_adjusted": run.camera_notes}
         report["bag_warnings"] = dict(reader.warnings)
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
@@ -163,66 +164,49 @@ class _Run:
     def load(self, path: Path) -> None:
         """Begin with a map."""
         self.backend.take_over(load_map(path, self._config.scene))
-        self._known = set(self.backend.scene.keyframes.keyframe_id.tolist())
-        scene, table = self.backend.scene, self.backend.scene.keyframes
-        orientation = geometry.quaternion_from_matrix(table.input_rotation)
-        rows = zip(table.keyframe_id.tolist(), table.stamp_ns.tolist(), table.input_position, orientation, strict=True)
-        for key, stamp_ns, position, quaternion in rows:
-            self._inputs[key] = Keyframe(scene.session_id or 0, key, stamp_ns, scene.frame_id, position, quaternion)
+        inputs = self.backend.map.input_keyframes()
+        self._known = {keyframe.keyframe_id for keyframe in inputs}
+        self._inputs = {keyframe.keyframe_id: keyframe for keyframe in inputs}
 
     def read(self, measurements: Iterable[Measurement], total: int) -> None:
+        for told in self.backend.replay(self._counting(measurements, total)):
+            if isinstance(told, Estimate):
+                self._record(told)
+            elif isinstance(told, Keyframe):
+                if told.keyframe_id in self._known and told.session_id == self.backend.map.session_id:
+                    self.known_already.add(told.keyframe_id)
+                self._inputs.setdefault(told.keyframe_id, told)
+            else:
+                self._map_ended(told)
+
+    def _counting(self, measurements: Iterable[Measurement], total: int) -> Iterator[Measurement]:
         for done, measurement in enumerate(measurements, start=1):
             self.counted[type(measurement)] += 1
             if isinstance(measurement, CameraRig):
                 self.camera_notes += [note for note in measurement.notes if note not in self.camera_notes]
-            self._take(self.backend.admit(measurement))
+            yield measurement
             self._watch.progress(done, total)
-        self._take(self.backend.admit_rest())
-        self.backend.flush(final=True)
-        while self.backend.ready:
-            self._solve()
 
     def end(self, optimize: bool) -> None:
         """End the newest session, after a solve of everything if that is wanted."""
-        if optimize:
-            taken = full.copy(self.backend.scene, self._config)
-            if isinstance(taken, full.Copy):
-                merged = self.backend.merge(taken, taken.solve(full.options(self._config.solver)))
-                self._record(merged[0] if merged else None)
-        if not self.sessions and len(self.backend.scene.keyframes):
+        estimate = self.backend.optimize() if optimize else None
+        if estimate is not None:
+            self._record(estimate)
+        if not self.sessions and self.backend.map.keyframe_count:
             # A loaded map to which the recording added nothing.
             self._begin(self.backend.estimate())
-        self._close(self.backend.scene)
+        self._close(self.backend.summary())
 
-    def _take(self, several: Iterable[Admitted]) -> None:
-        """Take in what the back-end admits, with a solve before each new keyframe."""
-        backend = self.backend
-        for admitted in several:
-            if backend.completes(admitted):
-                self._solve()
-            scene = backend.scene
-            backend.take(admitted)
-            if backend.scene is not scene:
-                self._close(scene)
-                self._known = set()
-                if admitted.begins is not None and admitted.begins.replaces and self.sessions:
-                    self.sessions.pop()
-            one = admitted.measurement
-            if not isinstance(one, Keyframe) or backend.scene.find_keyframe(one.keyframe_id) is None:
-                continue
-            if one.keyframe_id in self._known and one.session_id == backend.scene.session_id:
-                self.known_already.add(one.keyframe_id)
-            self._inputs.setdefault(one.keyframe_id, one)
+    def _map_ended(self, ended: MapEnded) -> None:
+        self._close(ended.summary)
+        self._known = set()
+        if ended.replaced and self.sessions:
+            self.sessions.pop()
 
-    def _solve(self) -> None:
-        self._record(self.backend.solve())
-
-    def _record(self, estimate: Estimate | None) -> None:
-        if estimate is None:
-            return
+    def _record(self, estimate: Estimate) -> None:
         if not self.sessions or self.sessions[-1].map_index != estimate.map_index:
             self._begin(estimate)
-        self.sessions[-1].add(estimate, self.backend.scene)
+        self.sessions[-1].add(estimate, self.backend.map.refined_keyframes())
         if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
             self._written = len(estimate.trajectory)
             self._write(estimate, _AllTopics())
@@ -230,17 +214,16 @@ class _Run:
             self._write(estimate, _AllTopics(without=_WHOLE_MAP))
 
     def _begin(self, estimate: Estimate) -> None:
-        session = self.backend.scene.session_id or 0
-        record = SessionRecord(session, map_index=estimate.map_index, last=estimate, inputs=self._inputs)
-        self.sessions.append(record)
+        session_id = self.backend.map.session_id
+        self.sessions.append(SessionRecord(session_id, estimate, inputs=self._inputs))
         self._written = 0
 
-    def _close(self, scene: Scene) -> None:
+    def _close(self, summary: MapSummary) -> None:
         """End a session: its whole map is written once more if the last estimate was not."""
         record = self.sessions[-1] if self.sessions else None
-        if record is not None and not record.figures:
-            record.close(scene, self._config)
-            if record.last is not None and len(record.last.trajectory) > self._written:
+        if record is not None and not record.closed:
+            record.close(summary)
+            if len(record.last.trajectory) > self._written:
                 self._write(record.last, _WHOLE_MAP)
         self._inputs = {}
 
@@ -262,20 +245,19 @@ class _AllTopics:
 
 
 def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dict[str, Any]:
-    """Write the files of every session; return the figures of the newest, with those of the older ones in it."""
+    """Write the files of every session; return the summary of the newest, with those of the older ones in it."""
     folders = [*(out / name for name in _folder_names(sessions[:-1])), out]
     for folder, record in zip(folders, sessions, strict=True):
         folder.mkdir(exist_ok=True)
-        assert record.last is not None
         write_tum(folder / "trajectory.tum", record.trajectory)
         write_tum(folder / "trajectory_input.tum", record.input_trajectory)
         write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
-    figures = [record.as_dict() | _against(truth, record) for record in sessions]
-    for folder, entry in zip(folders[:-1], figures, strict=False):
+    summaries = [record.as_dict() | _against(truth, record) for record in sessions]
+    for folder, entry in zip(folders[:-1], summaries, strict=False):
         entry["folder"] = folder.name
     if truth is not None:
         write_tum(out / "ground_truth.tum", truth)
-    return {**figures[-1], "older_sessions": figures[:-1]}
+    return {**summaries[-1], "older_sessions": summaries[:-1]}
 
 
 def _against(truth: Poses | None, record: SessionRecord) -> dict[str, Any]:
@@ -304,8 +286,8 @@ def _folder_names(sessions: list[SessionRecord]) -> Iterator[str]:
 def _nothing_to_use(run: _Run) -> str:
     """Say what there was of each kind of message, as no keyframe could be used."""
     counts = [run.counted[kind] for kind in (Keyframe, FeatureTracks, CameraRig)]
-    told = "none of {} keyframes can be used" if counts[0] else "it holds no keyframes"
-    return f"{told.format(counts[0])} (tracks messages: {counts[1]}, camera rigs: {counts[2]})"
+    reason = f"none of {counts[0]} keyframes can be used" if counts[0] else "it holds no keyframes"
+    return f"{reason} (tracks messages: {counts[1]}, camera rigs: {counts[2]})"
 
 
 def _why(reader: BagReader, run: _Run) -> str:

@@ -35,19 +35,18 @@ class SavedMap:
 
     def facts(self) -> list[tuple[str, str]]:
         """Return name and value of what there is to tell."""
-        scene, report = self.backend.scene, self.estimate.report
-        table, poses = scene.keyframes, self.estimate.trajectory
+        summary, report, poses = self.backend.summary(), self.estimate.report, self.estimate.trajectory
         span = (poses.stamp_ns[-1] - poses.stamp_ns[0]) / _NS_PER_S if len(poses) else 0.0
         way = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())
         rows = [
-            ("session", "none yet" if scene.session_id is None else str(scene.session_id)),
+            ("session", "none yet" if summary.session_id is None else str(summary.session_id)),
             ("frame of the map", self.estimate.frame_id),
-            ("frame of the input", scene.frame_id or "not named"),
-            ("cameras", str(0 if scene.cameras is None else len(scene.cameras.model))),
-            ("keyframes", f"{len(table)}, {np.count_nonzero(table.refined)} refined, {span:.1f} s, {way:.1f} m"),
-            ("landmarks", f"{len(scene.landmarks)}, {len(self.estimate.cloud)} with position and two views"),
-            ("observations", f"{len(scene.sightings)}, {np.count_nonzero(scene.sightings.outlier)} outliers"),
-            ("rms, all observations", f"{self.backend.rms_px():.3f} px"),
+            ("frame of the input", summary.frame_id or "not named"),
+            ("cameras", str(summary.cameras)),
+            ("keyframes", f"{summary.keyframes}, {summary.refined} refined, {span:.1f} s, {way:.1f} m"),
+            ("landmarks", f"{summary.landmarks}, {len(self.estimate.cloud)} with position and two views"),
+            ("observations", f"{summary.observations}, {summary.outliers} outliers"),
+            ("rms, all observations", f"{self.backend.map.rms_px():.3f} px"),
             ("solves", f"{self.backend.solve_count}, the last: {report.status.name.lower()}, {report.reason}"),
             ("rejected", ", ".join(f"{n} {reason}" for reason, n in self.backend.rejected.items()) or "nothing"),
         ]

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ba_node.config import Config
+from ba_node.backend import MapSummary
 from ba_node.estimate import Estimate, Poses
 from ba_node.measurements import Keyframe
-from ba_node.scene.scene import Scene
-from ba_node.window import quality
+
+_IDS_SHOWN = 6
 
 
 @dataclass
@@ -23,7 +24,6 @@ class SessionRecord:
 
     Attributes:
         session_id: the session.
-        map_index: which map of the back-end it is; several may have the same session id.
         last: newest estimate.
         forgotten: last values of the keyframes that the back-end has forgotten.
         inputs: accepted keyframe messages by id.
@@ -32,13 +32,13 @@ class SessionRecord:
         solver_time_s: in all, s.
         slowest: time and keyframe of the slowest solve.
         iterations: outer iterations in all.
-        unrefined: why no keyframe was refined, empty if one was; see :meth:`close`.
-        figures: what is known only while the session's scene exists, see :meth:`close`.
+        reasons: why a solve gave nothing, by its newest keyframe.
+        unrefined: which keyframes were not refined and why, empty if all were; see :meth:`close`.
+        closed: summary of the map at its end, None before :meth:`close`.
     """
 
     session_id: int
-    map_index: int = 0
-    last: Estimate | None = None
+    last: Estimate
     forgotten: list[Poses] = field(default_factory=list)
     inputs: dict[int, Keyframe] = field(default_factory=dict)
     refined: set[int] = field(default_factory=set)
@@ -46,46 +46,60 @@ class SessionRecord:
     solver_time_s: float = 0.0
     slowest: tuple[float, int] = (0.0, 0)
     iterations: int = 0
+    reasons: dict[int, str] = field(default_factory=dict)
     unrefined: str = ""
-    figures: dict[str, Any] = field(default_factory=dict)
+    closed: MapSummary | None = None
 
-    def add(self, estimate: Estimate, scene: Scene) -> None:
-        """Take in the next estimate."""
-        if self.last is not None:
-            before = self.last.trajectory
-            gone = ~np.isin(before.keyframe_id, estimate.trajectory.keyframe_id)
-            if gone.any():
-                self.forgotten.append(before[gone])
+    @property
+    def map_index(self) -> int:
+        """Return which map of the back-end it is; several may have the same session id."""
+        return self.last.map_index
+
+    @property
+    def summary(self) -> MapSummary:
+        """Return the summary of the map at its end."""
+        assert self.closed is not None, "close() comes first"
+        return self.closed
+
+    def add(self, estimate: Estimate, refined: set[int]) -> None:
+        """Take in the next estimate, and which keyframes of the map are refined now."""
+        before = self.last.trajectory
+        gone = ~np.isin(before.keyframe_id, estimate.trajectory.keyframe_id)
+        if gone.any():
+            self.forgotten.append(before[gone])
         self.last = estimate
         report = estimate.report
         self.statuses[report.status.name] += 1
         self.iterations += report.iterations
         self.solver_time_s += report.solve_time_s
         self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
-        rows = ((key, scene.find_keyframe(key)) for key in estimate.refined.keyframe_id.tolist())
-        self.refined.update(key for key, row in rows if row is not None and scene.keyframes.refined[row])
+        if not report.status.usable:
+            self.reasons[report.newest_keyframe_id] = report.reason
+        self.refined.update(refined.intersection(estimate.refined.keyframe_id.tolist()))
         # What a check of the set-up has taken back.
-        table = scene.keyframes
-        self.refined.difference_update(table.keyframe_id[~table.refined].tolist())
+        self.refined.difference_update(set(estimate.trajectory.keyframe_id.tolist()) - refined)
 
-    def close(self, scene: Scene, config: Config) -> None:
-        """Take the figures of the whole map from a scene that is about to go."""
-        self.unrefined = "" if self.refined else _why_unrefined(scene, self.statuses, self.last)
-        of = {state: quality.summary(scene, config, state) for state in quality.STATES}
-        self.figures = {
-            **{name: {state: of[state][name] for state in of} for name in of["input"]},
-            "observations": len(scene.sightings),
-            "outliers": int(np.count_nonzero(scene.sightings.outlier)),
-            "rejected": dict(sorted(scene.log.rejected.items())),
-            "notices": dict(sorted(scene.log.notices.items())),
-            "rejection_notes": list(scene.log.notes),
-            "warnings": dict(scene.log.warnings),
-        }
+    def close(self, summary: MapSummary) -> None:
+        """Take what there is to tell of the map at its end."""
+        self.closed = summary
+        self.unrefined = self._some_unrefined() if self.refined else _why_unrefined(summary, self.statuses, self.last)
+
+    def _some_unrefined(self) -> str:
+        """Return which keyframes were not refined though others were, and the usual reason; empty if all were."""
+        poses = self.input_trajectory
+        left = ~np.isin(poses.keyframe_id, np.array(list(self.refined), dtype=np.uint64))
+        ids = poses.keyframe_id[left].tolist()
+        if not ids:
+            return ""
+        reasons = Counter(self.reasons[key] for key in ids if key in self.reasons)
+        reason = reasons.most_common(1)[0][0] if reasons else "solves of their windows left them out"
+        moved = np.linalg.norm(np.diff(poses.position[left], axis=0), axis=1).sum()
+        by = f" (the front-end's poses move {moved:.3g} m over them)" if _adjacent(left) else ""
+        return f"{_listed(ids, together=_adjacent(left))}{by}: {reason}"
 
     @property
     def trajectory(self) -> Poses:
         """Return the newest estimate of every keyframe, by time."""
-        assert self.last is not None
         return _by_time(_joined([*self.forgotten, self.last.trajectory]))
 
     @property
@@ -102,7 +116,6 @@ class SessionRecord:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for report.json."""
-        assert self.last is not None
         return {
             "session_id": self.session_id,
             "frame_id": self.last.frame_id,
@@ -110,7 +123,7 @@ class SessionRecord:
             "keyframes_refined": len(self.refined),
             "unrefined": self.unrefined,
             "landmarks": len(self.last.cloud),
-            **self.figures,
+            **_figures(self.summary),
             "solves": sum(self.statuses.values()),
             "solves_by_status": dict(sorted(self.statuses.items())),
             "iterations": self.iterations,
@@ -120,16 +133,44 @@ class SessionRecord:
         }
 
 
-def _why_unrefined(scene: Scene, statuses: Counter[str], last: Estimate | None) -> str:
+def _figures(summary: MapSummary) -> dict[str, Any]:
+    """Return what report.json tells of a map."""
+    residuals = summary.residuals
+    return {
+        **{name: {state: residuals[state][name] for state in residuals} for name in residuals["input"]},
+        "observations": summary.observations,
+        "outliers": summary.outliers,
+        "rejected": summary.rejected,
+        "notices": summary.notices,
+        "rejection_notes": summary.rejection_notes,
+        "warnings": summary.warnings,
+    }
+
+
+def _why_unrefined(summary: MapSummary, statuses: Counter[str], last: Estimate) -> str:
     """Return why no keyframe of a session was refined, in words."""
     if not statuses:
         return "all keyframes of the recording are in the loaded map already"
-    empty = scene.log.notices["empty_tracks"]
-    if scene.cameras is None:
+    empty = summary.notices.get("empty_tracks", 0)
+    if summary.cameras == 0:
         return "no cameras came, neither camera_rig nor camera_info"
-    if not len(scene.sightings):
+    if not summary.observations:
         return f"all {empty} tracks messages are empty" if empty else "no tracks came that could be used"
-    return last.report.reason if last is not None else ""
+    return last.report.reason
+
+
+def _adjacent(chosen: NDArray[np.bool_]) -> bool:
+    """Return True if all that is chosen of a row of things lies side by side, and is more than one."""
+    rows = np.flatnonzero(chosen)
+    return len(rows) > 1 and int(rows[-1] - rows[0]) == len(rows) - 1
+
+
+def _listed(ids: list[int], *, together: bool) -> str:
+    """Return ids in words, the first few where there are many."""
+    if together:
+        return f"keyframes {ids[0]} to {ids[-1]}"
+    shown = ", ".join(map(str, ids[:_IDS_SHOWN])) + (", ..." if len(ids) > _IDS_SHOWN else "")
+    return f"keyframe{'s' if len(ids) > 1 else ''} {shown}"
 
 
 def _joined(parts: list[Poses]) -> Poses:

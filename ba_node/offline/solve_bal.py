@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve a BAL problem as a whole, and tell everything about how it went."""
+"""Solve a BAL problem as a whole, and report how it went."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.options import SolverOptions
+from ba_node.config import SolverOptions
+from ba_node.core.objective import rms_px
 from ba_node.core.problem import Problem
-from ba_node.core.result import Iteration, Result
+from ba_node.core.result import Result
 from ba_node.core.solver import solve
+from ba_node.estimate import Iteration
 from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated
 from ba_node.offline.solver_settings import describe
-from ba_node.window.quality import problem_rms_px
 
 # Points that lie so many times their own extent from the origin are moved there: coordinates of a whole country, as UTM
 # has them, leave too few digits to the steps of a solver.
@@ -34,7 +35,7 @@ class Solution:
 
     Attributes:
         source: the file.
-        bal: what it held, moved by minus the origin.
+        bal: its content, moved by minus the origin.
         problem: the same in our terms.
         origin: (3,) of the coordinates in which it was solved, in those of the file; zeros if they are the same.
         result: state and trace.
@@ -87,10 +88,10 @@ class Solution:
         return lines, grave
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON; an infinite radius becomes null there."""
+        """Return statistics, options and trace for JSON; an infinite radius becomes null there."""
         result = self.result
         with np.errstate(all="ignore"):  # infinite where the solve failed
-            rms_before, rms_after = problem_rms_px(self.problem, self.problem.start, result.state)
+            rms_before, rms_after = rms_px(self.problem, self.problem.start, result.state)
         return {
             "problem": {
                 "file": Path(self.source).name,

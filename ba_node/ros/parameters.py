@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Declare the parameters of ``config.py`` on a node, and keep the two in step."""
+"""Declare the parameters of ``config/`` on a node, and keep the two in step."""
 
 from __future__ import annotations
 

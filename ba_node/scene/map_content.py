@@ -61,6 +61,15 @@ class MapContent:
         require(all(type(n) is int and n >= 0 for n in value.values()), f"{name}: expected counts")
         return {str(key): n for key, n in value.items()}
 
+    def sizes(self) -> dict[str, int]:
+        """Return how many keyframes, landmarks and observations it has."""
+        columns = {
+            "keyframes": "keyframes/keyframe_id",
+            "landmarks": "landmarks/track_id",
+            "observations": "sightings/keyframe",
+        }
+        return {name: len(self.arrays[column]) for name, column in columns.items()}
+
     def columns(self, group: str, wanted: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
         """Return the arrays of a group, of equal length.
 

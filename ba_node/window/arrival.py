@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ba_node.config import SolverOptions
 from ba_node.core import geometry, native_kernels
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
 from ba_node.window.problems import problem_of
 
@@ -125,7 +126,7 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
     near = [_near(problem, start, config) for start in starts]
     for i in sorted(range(len(starts)), key=lambda i: -near[i])[:_TRIED]:
         state = _lowered(problem, starts[i])
-        norms = native_kernels.residual_norms(problem, state, config.solver.backend)
+        norms = native_kernels.residual_norms(problem, state, config.solver.kernels)
         agreeing = int(np.count_nonzero(norms <= _WIDE * config.tracks.outlier_px))
         if agreeing > most:
             best, most = state, agreeing
@@ -158,7 +159,7 @@ def _views(scene: Scene, config: Config, row: int) -> Problem | None:
 
 def _near(problem: Problem, state: State, config: Config) -> int:
     """Return how many points are near enough to their views for the solve to mend the pose."""
-    norms = native_kernels.residual_norms(problem, state, config.solver.backend)
+    norms = native_kernels.residual_norms(problem, state, config.solver.kernels)
     return int(np.count_nonzero(norms <= _limit(problem)))
 
 
@@ -186,7 +187,9 @@ def _lowered(problem: Problem, state: State) -> State:
     """Return the pose after steps of a robust loss that narrows; points are held."""
     with np.errstate(all="ignore"):
         for width in _WIDTHS:
-            measure = Objective(problem, Rules(loss="geman_mcclure", loss_scale=width, cheirality="constant"))
+            measure = Objective(
+                problem, SolverOptions(loss="geman_mcclure", loss_scale_px=width, cheirality="constant")
+            )
             value, mu = measure.value(state), 1e-4
             for _ in range(_ROUNDS):
                 at = measure.linearise(state)

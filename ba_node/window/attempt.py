@@ -67,7 +67,7 @@ def attempt(
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration)
         solve_time_s += clock() - began
-        found = outcome(scene, selection, result, config.tracks, config.solver.backend)
+        found = outcome(scene, selection, result, config.tracks, config.solver.kernels)
         if found.state is None:
             return Attempt(selection, result, found, guard.Health(), "", without, solve_time_s)
         verdict = guard.judge(config, selection, found, trust)

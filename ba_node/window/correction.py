@@ -23,29 +23,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ba_node.core import geometry
+from ba_node.estimate import Transform
 
 if TYPE_CHECKING:
     from ba_node.config import FramesConfig
-    from ba_node.scene.tables import FloatArray
 
 _S = 1e-9
-
-
-@dataclass(frozen=True)
-class Transform:
-    """A rigid transform: rotation (3, 3), translation (3,) m."""
-
-    rotation: FloatArray
-    translation: FloatArray
-
-    def after(self, other: Transform) -> Transform:
-        """Return the transform that applies ``other`` first, then this one."""
-        parts = geometry.compose(self.rotation, self.translation, other.rotation, other.translation)
-        return Transform(*parts)
-
-    def inverse(self) -> Transform:
-        """Return the inverse."""
-        return Transform(*geometry.inverse(self.rotation, self.translation))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from ba_node.core import covariance, geometry
 from ba_node.window import gauge
 
 if TYPE_CHECKING:
-    from ba_node.core.options import SolverOptions
+    from ba_node.config import SolverOptions
     from ba_node.core.problem import State
     from ba_node.scene.tables import FloatArray, IntArray
     from ba_node.window.selection import Selection

@@ -35,8 +35,7 @@ from ba_node.window.selection import Selection, select
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ba_node.config import Config, SolverConfig
-    from ba_node.core.options import SolverOptions
+    from ba_node.config import Config, SolverConfig, SolverOptions
     from ba_node.core.problem import State
     from ba_node.core.result import Iteration, Result
     from ba_node.scene.scene import Scene
@@ -100,12 +99,12 @@ class Copy:
         """Solve, on any thread. The scene is not touched."""
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration)
         whole = dataclasses.replace(self.selection.problem, observations=self.selection.sightings)
-        return Solved(result, native_kernels.residual_norms(whole, result.state, chosen.backend))
+        return Solved(result, native_kernels.residual_norms(whole, result.state, chosen.kernels))
 
     def outcome(self, state: State, config: Config) -> Merged:
         """Return a solution in the scale of the map, with its points where they may be published."""
         state = scaled(self.selection, self.position, state)
-        return settled(self.selection, state, config.tracks, config.solver.backend)
+        return settled(self.selection, state, config.tracks, config.solver.kernels)
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ def _join(scene: Scene, config: Config, later: int) -> None:
     selection = select(scene, dataclasses.replace(config, window=wide))
     if not isinstance(selection, str):
         result = solver.solve(selection.problem, options(config.solver, max_iterations=config.solver.max_iterations))
-        merge(scene, selection, result, config.tracks, config.solver.backend)
+        merge(scene, selection, result, config.tracks, config.solver.kernels)
 
 
 def _corrections(
@@ -283,5 +282,5 @@ def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArr
         keyframes=keyframes,
         landmarks=landmarks,
     )
-    norms = native_kernels.residual_norms(problem, problem.start, config.solver.backend)
-    judge(scene, now, problem.start, norms, config.tracks, config.solver.backend)
+    norms = native_kernels.residual_norms(problem, problem.start, config.solver.kernels)
+    judge(scene, now, problem.start, norms, config.tracks, config.solver.kernels)

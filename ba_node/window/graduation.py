@@ -19,7 +19,7 @@ import numpy as np
 from ba_node.core import solver
 
 if TYPE_CHECKING:
-    from ba_node.core.options import SolverOptions
+    from ba_node.config import SolverOptions
     from ba_node.core.problem import Problem
     from ba_node.scene.tables import FloatArray
 
@@ -41,8 +41,8 @@ def begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Proble
         norms: (n_obs,) sizes of their residuals at the start, sigmas.
         options: what it will be solved with.
     """
-    scale = options.rules.loss_scale
-    if options.rules.loss not in _FADING or problem.n_keyframes > _YOUNG:
+    scale = options.loss_scale_px
+    if options.loss not in _FADING or problem.n_keyframes > _YOUNG:
         return problem
     far = norms > _FAR * scale
     keyframe = problem.observations.keyframe
@@ -53,8 +53,7 @@ def begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Proble
     wide = max(float(np.quantile(norms[keyframe == k], _RANK, method="lower")) for k in np.flatnonzero(suspect))
     if not np.isfinite(wide):
         return problem
-    rules = dataclasses.replace(options.rules, loss_scale=wide)
-    first = solver.solve(problem, dataclasses.replace(options, rules=rules, max_iterations=_ITERATIONS))
+    first = solver.solve(problem, dataclasses.replace(options, loss_scale_px=wide, max_iterations=_ITERATIONS))
     if not first.status.usable or not first.state.is_finite():
         return problem
     return dataclasses.replace(problem, start=first.state)

@@ -27,13 +27,6 @@ BOUND_PX = 1000.0
 _COMPARED_PX = 20.0
 
 
-def problem_rms_px(problem: Problem, *states: State) -> list[float]:
-    """Return for each state the rms over the observations whose point is in front of the camera; 0 without any."""
-    measure = objective.Objective(problem, objective.Rules())
-    errors = (_in_front(measure.errors(state)) for state in states)
-    return [float(np.sqrt(np.mean(error * error))) if len(error) else 0.0 for error in errors]
-
-
 def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
     """Return the rms over the observations of a solve whose point is in front of the camera; 0 without any.
 

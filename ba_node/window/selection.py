@@ -149,7 +149,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     is_new[window] = True
     is_old = ~is_new[part.keyframes]
     if is_old.all():
-        return "no keyframe of the window sees enough points that a second image sees"
+        return "no keyframe of the window sees enough points that a second image sees from another place"
     obs, table = part.problem.observations, scene.keyframes
     track_id = scene.landmarks.track_id[part.landmarks]
     tried, aside = trial.choose(track_id, obs.point[usable], config.guard.held_out_tracks)
@@ -206,7 +206,7 @@ def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     part = _turned(scene, _reach(scene, window, config, without), window, config)
     part = dataclasses.replace(part, problem=_placed(scene, part, config))
     start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
-    return part, native_kernels.residual_norms(part.problem, start, config.solver.backend)
+    return part, native_kernels.residual_norms(part.problem, start, config.solver.kernels)
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:
@@ -293,8 +293,8 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
     if len(rows):
         of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
         guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        gate = _gate(scene, part, new, config) or poses_gate(of_new, config.tracks, config.solver.backend)
-        points[new] = initial_points(of_new, guess, config.tracks, gate, config.solver.backend)
+        gate = _gate(scene, part, new, config) or poses_gate(of_new, config.tracks, config.solver.kernels)
+        points[new] = initial_points(of_new, guess, config.tracks, gate, config.solver.kernels)
     return _with_points(part.problem, points)
 
 
@@ -304,7 +304,7 @@ def _gate(scene: Scene, part: _Part, new: BoolArray, config: Config) -> float | 
     if len(rows) < _BULK:
         return None
     known = some_observations(part.problem, rows)
-    norms = native_kernels.residual_norms(known, known.start, config.solver.backend)
+    norms = native_kernels.residual_norms(known, known.start, config.solver.kernels)
     return widened(config.tracks.max_triangulation_px, norms)
 
 

@@ -25,7 +25,6 @@ from unittest import mock
 from ba_node.core import linear, native_kernels
 from ba_node.core import solver as loop
 from ba_node.core.methods import METHODS
-from ba_node.core.objective import Rules
 from experiments.benchmarks import problems
 from experiments.benchmarks.floor import flops
 from experiments.benchmarks.problem_file import Case, case_problem
@@ -64,8 +63,15 @@ def _timed(name: str, function: Callable[..., Any], parts: Seconds) -> Callable[
 def solve_once(case: Case, loss: str, method: Mapping[str, Any]) -> tuple[Seconds, int]:
     """Return seconds by part, ``total`` among them, and the number of iterations."""
     parts: Seconds = defaultdict(float)
-    rules = Rules(loss=loss, cheirality="keep")
-    options = dataclasses.replace(METHODS["auto"], rules=rules, max_iterations=100, function_tolerance=1e-8, **method)
+    options = dataclasses.replace(
+        METHODS["auto"],
+        loss=loss,
+        loss_scale_px=1.0,
+        cheirality="keep",
+        max_iterations=100,
+        function_tolerance=1e-8,
+        **method,
+    )
     make = native_kernels.make
     began = time.perf_counter()
     problem = _timed("set-up: case to problem", case_problem, parts)(case)
@@ -98,7 +104,7 @@ def main() -> int:
         if prepared is None:
             print(f"skipped: {problem.name}: no {problem.needs} in {args.data}")
             continue
-        runs = [solve_once(prepared[1], problem.loss, {"backend": args.backend}) for _ in range(args.repeats)]
+        runs = [solve_once(prepared[1], problem.loss, {"kernels": args.backend}) for _ in range(args.repeats)]
         print(f"\n{problem.name}: {runs[0][1]} iterations\n\n{_table(runs, flops(prepared[1]))}")
     return 0
 

@@ -17,9 +17,8 @@ import sys
 import time
 from pathlib import Path
 
+from ba_node.config import SolverOptions
 from ba_node.core.methods import METHODS
-from ba_node.core.objective import Rules
-from ba_node.core.options import SolverOptions
 from ba_node.core.solver import solve
 from experiments.benchmarks import problems
 from experiments.benchmarks.metrics import time_to
@@ -32,18 +31,18 @@ Trace = list[tuple[float, float]]
 
 def variants(loss: str) -> dict[str, SolverOptions]:
     """Return the default method and what is left of it without each of its ingredients."""
-    rules = Rules(loss=loss, cheirality="keep")
-    base = dataclasses.replace(METHODS["auto"], rules=rules, max_iterations=100, function_tolerance=1e-8)
-    wide = dataclasses.replace(rules, parameterisation="global")
+    base = dataclasses.replace(
+        METHODS["auto"], loss=loss, cheirality="keep", max_iterations=100, function_tolerance=1e-8
+    )
     return {
         "all": base,
-        "polish_steps=0": dataclasses.replace(base, polish_steps=0),
+        "inner_iterations=0": dataclasses.replace(base, inner_iterations=0),
         "damping_policy=nielsen": dataclasses.replace(base, damping_policy="nielsen"),
         "linear_solver=cholesky": dataclasses.replace(base, linear_solver="cholesky"),
         "linear_solver=pcg": dataclasses.replace(base, linear_solver="pcg"),
         "threads=2": dataclasses.replace(base, threads=2),
-        "backend=numpy": dataclasses.replace(base, backend="numpy"),
-        "backend=numpy parameterisation=global": dataclasses.replace(base, backend="numpy", rules=wide),
+        "kernels=numpy": dataclasses.replace(base, kernels="numpy"),
+        "kernels=numpy parameterisation=global": dataclasses.replace(base, kernels="numpy", parameterisation="global"),
     }
 
 
@@ -62,7 +61,7 @@ def rows(case: Case, loss: str, repeats: int) -> list[list[str]]:
     traces: dict[str, list[Trace]] = {name: [] for name in choices}
     for repeat in range(repeats):
         for name, options in choices.items():
-            if options.backend != "numpy" or repeat < 2:
+            if options.kernels != "numpy" or repeat < 2:
                 traces[name].append(run(case, options))
     target = (1.0 + GAP) * min(row[1] for runs in traces.values() for row in runs[0])
     seconds = {name: min(time_to(trace, target) for trace in runs) for name, runs in traces.items()}

@@ -207,7 +207,7 @@ def run(args: argparse.Namespace, case: Case, backend: str) -> list[str]:
     """Play into a node with some kernels; return lines of the table."""
     frames = recording(args, case)
     peer = Peer(args.topics)
-    settings = [f"solver.backend:={backend}", f"window.max_fixed_keyframes:={case.fixed}", *args.set]
+    settings = [f"solver.kernels:={backend}", f"window.max_fixed_keyframes:={case.fixed}", *args.set]
     command = [sys.executable, str(_PROBE), "--ros-args", *[word for s in settings for word in ("-p", s)]]
     environ = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     node = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ)

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ba_node.config import SolverOptions
 from ba_node.core.cameras import MIN_DEPTH
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from ba_node.io.bal import read_bal
 from experiments.benchmarks.generators import loop, sphere, window
 from experiments.benchmarks.problem_file import Case, case_problem, read_case, sorted_by_point, write_case
@@ -72,7 +73,7 @@ def _in_front(case: Case) -> Case:
     Solvers that leave such observations out by themselves have the same objective as the others here.
     """
     problem = case_problem(case)
-    keep = Objective(problem, Rules()).in_camera(problem.start)[:, 2] > MIN_DEPTH
+    keep = Objective(problem, SolverOptions()).in_camera(problem.start)[:, 2] > MIN_DEPTH
     bal = case.bal
     keep &= np.bincount(bal.point_index[keep], minlength=len(bal.points))[bal.point_index] >= 2
     points, renumbered = np.unique(bal.point_index[keep], return_inverse=True)

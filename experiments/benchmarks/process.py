@@ -12,7 +12,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from ba_node.core.objective import Objective, Rules
+from ba_node.config import SolverOptions
+from ba_node.core.objective import Objective
 from experiments.benchmarks.problem_file import Case, case_problem, read_state
 from experiments.benchmarks.solvers import ROOT, Solver
 
@@ -70,7 +71,7 @@ def run(solver: Solver, file: Path, case: Case, loss: str, limits: Limits) -> Ru
 def objective(case: Case, loss: str) -> float:
     """Return the objective at the start of a case; points behind a camera keep their residual."""
     problem = case_problem(case)
-    return Objective(problem, Rules(loss=loss, cheirality="keep")).value(problem.start)
+    return Objective(problem, SolverOptions(loss=loss, cheirality="keep")).value(problem.start)
 
 
 def _execute(command: list[str], threads: int, seconds: float) -> str:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ba_node.config import SolverOptions
 from ba_node.core.cameras import MIN_DEPTH
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from experiments.benchmarks import metrics
 from experiments.benchmarks.floor import Peak, floor_s
 from experiments.benchmarks.problem_file import Case, case_problem
@@ -160,7 +161,7 @@ def _is_settled(result: Result) -> bool:
 
 def _any_behind(case: Case) -> bool:
     problem = case_problem(case)
-    return bool((Objective(problem, Rules()).in_camera(problem.start)[:, 2] <= MIN_DEPTH).any())
+    return bool((Objective(problem, SolverOptions()).in_camera(problem.start)[:, 2] <= MIN_DEPTH).any())
 
 
 def _line(one: Run) -> str:

@@ -19,7 +19,16 @@ from ba_node.io.trajectory import read_tum
 # What is published may have this much more error than what came in: a share of it, and a length or an angle.
 MORE_SHARE, MORE_M, MORE_DEG = 0.1, 0.005, 0.1
 # Where report.json holds words for a user.
-_WORDS = ("attention", "warnings", "bag_warnings", "rejection_notes", "bag_notes", "rejected", "bag_rejected")
+_WORDS = (
+    "attention",
+    "warnings",
+    "unrefined",
+    "bag_warnings",
+    "rejection_notes",
+    "bag_notes",
+    "rejected",
+    "bag_rejected",
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,10 @@ def said(report: Mapping[str, Any]) -> str:
     for part in (*report.get("older_sessions", ()), report):
         for name in _WORDS:
             value = part.get(name, ())
-            lines += (f"{key}: {text}" for key, text in value.items()) if isinstance(value, Mapping) else value
+            if isinstance(value, Mapping):
+                lines += (f"{key}: {text}" for key, text in value.items())
+            else:
+                lines += [value] if isinstance(value, str) else value
     return "\n".join(lines)
 
 

@@ -93,7 +93,7 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
     """
     method, iterations, cure, *assignments = settings
     options = solver_options(method, [*assignments, f"max_iterations={iterations}", "backend=numpy"])
-    kernels = (WatchedCure if cure else Watched)(posed.problem, options.rules, options.demands)
+    kernels = (WatchedCure if cure else Watched)(posed.problem, options)
     kernels.rows = []
     result = solve(posed.problem, options, kernels=kernels)
     rows = kernels.rows

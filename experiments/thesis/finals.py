@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.objective import Objective, Rules, reprojection_errors
+from ba_node.config import SolverOptions
+from ba_node.core.objective import Objective, reprojection_errors
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import Structure, normal_equations
 from ba_node.evaluation.alignment import align
@@ -39,10 +40,10 @@ def truth_errors(state: State, truth: State) -> dict[str, float]:
     return {**out, "median_points": float(np.median(np.linalg.norm(away, axis=1)))}
 
 
-def gradients(problem: Problem, rules: Rules, state: State) -> dict[str, Any]:
+def gradients(problem: Problem, options: SolverOptions, state: State) -> dict[str, Any]:
     """Return the norm of the gradient for each kind of parameter, its largest entry, and its distribution."""
     structure = Structure(problem)
-    equations = normal_equations(structure, Objective(problem, rules).linearise(state))
+    equations = normal_equations(structure, Objective(problem, options).linearise(state))
     size = equations.gradient_c.shape[1]
     norms = {
         kind: float(np.linalg.norm(equations.gradient_c[:, columns]))

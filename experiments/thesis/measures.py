@@ -15,10 +15,10 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from ba_node.config import SolverOptions
 from ba_node.core import linear, native_kernels
-from ba_node.core.kernels import Demands
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from ba_node.core.problem import State
 from ba_node.core.reduced import preconditioner
 from ba_node.core.schur import Structure, normal_equations
@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 Clock = Callable[[], float]
 Measured = dict[str, Any]
 
-_GLOBAL = Rules(parameterisation="global")
+_GLOBAL = SolverOptions(parameterisation="global")
 _SYSTEMS = 50
 _REPEATS = 5
 
@@ -89,7 +89,7 @@ def linear_solver(posed: Posed, settings: Sequence[str], clock: Clock) -> Measur
 
     The difference is that of (3.83), |p - p_CD|^2 / s, over all s parameters.
     """
-    kernels = NumpyKernels(posed.problem, _GLOBAL, Demands())
+    kernels = NumpyKernels(posed.problem, _GLOBAL)
     kernels.linearise(posed.problem.start)
     d_c, d_p = (np.ones_like(d) for d in kernels.diagonals())
     seconds, differences, steps = 0.0, [], 0
@@ -153,8 +153,8 @@ def layout(posed: Posed, _settings: Sequence[str], _clock: Clock) -> Measured:
 def linearisation(posed: Posed, settings: Sequence[str], clock: Clock) -> Measured:
     """Return what one linearisation takes with the kernels of a backend and a parameterisation, local if none, s."""
     backend, *parameterisation = settings
-    rules = Rules(parameterisation=parameterisation[0]) if parameterisation else Rules()
-    kernels = native_kernels.make(posed.problem, rules, backend)
+    options = SolverOptions(kernels=backend, parameterisation=parameterisation[0] if parameterisation else "local")
+    kernels = native_kernels.make(posed.problem, options)
     kernels.linearise(posed.problem.start)
     seconds = _fastest(lambda: kernels.linearise(posed.problem.start), clock, _REPEATS)
     return {"figures": {"seconds": seconds, "observations": float(len(posed.problem.observations))}}

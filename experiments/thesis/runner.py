@@ -89,7 +89,7 @@ class Runner:
 
         kernels = None
         if task.kernels:
-            kernels = VARIANTS[task.kernels](posed.problem, options.rules, options.demands)
+            kernels = VARIANTS[task.kernels](posed.problem, options)
         result = solve(posed.problem, options, clock=self._clock, on_iteration=watch, kernels=kernels)
         return {
             "method": task.method,
@@ -113,7 +113,7 @@ class Runner:
 def _end(task: Run, posed: Posed, result: Result) -> dict[str, Any]:
     problem, state = posed.problem, result.state
     out: dict[str, Any] = {
-        "gradient": finals.gradients(problem, task.options().rules, state),
+        "gradient": finals.gradients(problem, task.options(), state),
         "residuals": finals.residuals(problem, state),
         "images": finals.pictures(problem, state, task.images),
     }

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.objective import Objective, Rules
+from ba_node.config import SolverOptions
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -62,7 +63,7 @@ def search_steps(problem: Problem, parameterisation: str) -> list[StepErrors]:
         problem: with free intrinsics for f, k1, k2 to take part.
         parameterisation: local or global.
     """
-    objective = Objective(problem, Rules(parameterisation=parameterisation))
+    objective = Objective(problem, SolverOptions(parameterisation=parameterisation))
     with np.errstate(all="ignore"):
         columns = {"rotation": range(3), "translation": range(3, 6)}
         if problem.free_intrinsics:

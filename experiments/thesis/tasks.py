@@ -12,8 +12,7 @@ import hashlib
 import json
 from dataclasses import dataclass, replace
 
-from ba_node.config import Value
-from ba_node.core.options import SolverOptions
+from ba_node.config import SolverOptions, Value
 from ba_node.core.scaling import INC_STEPS
 from ba_node.offline.solver_settings import describe, solver_options
 from experiments.thesis.problems import Library
@@ -23,6 +22,8 @@ _FORMAT = 1
 _QUICK = 3
 # Options that change no digit of a result.
 _WITHOUT_EFFECT = ("threads",)
+# Names of options when the records in docs/thesis_results.json were made: their keys stay.
+_NAMES_IN_KEYS = {"loss_scale_px": "loss_scale", "kernels": "backend", "inner_iterations": "polish_steps"}
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,9 @@ class Run:
 
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""
-        options: dict[str, Value] = {k: v for k, v in describe(self.options()).items() if k not in _WITHOUT_EFFECT}
+        options: dict[str, Value] = {
+            _NAMES_IN_KEYS.get(k, k): v for k, v in describe(self.options()).items() if k not in _WITHOUT_EFFECT
+        }
         content: dict[str, object] = {"run": options, "inc": INC_STEPS}
         content |= {"iterations": self.iterations, "images": self.images}
         return content | {"kernels": self.kernels} if self.kernels else content

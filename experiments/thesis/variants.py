@@ -29,7 +29,7 @@ class UnscaledPreconditioner(NumpyKernels):
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
         """Return the system; its diagonal blocks come out as those of S after the solver has scaled them."""
         system = super().reduce(damping_c, damping_p)
-        d = system.gather(*scaling.scaled_space(self._demands.space, self.diagonals()))
+        d = system.gather(*scaling.scaled_space(self._options.scaled_space, self.diagonals()))
         for name in ("diagonal_blocks", "own_blocks"):
             parts = _multiplied(getattr(system, name)(), d)
             setattr(system, name, lambda parts=parts: parts)

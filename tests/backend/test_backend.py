@@ -328,10 +328,10 @@ def test_rms_counts_every_observation() -> None:
     backend = Backend(Config())
     replay(backend, messages(outlier_share=0.0, noise_px=0.5, drift_translation=0.05))
     # Noise of 0.5 px in each coordinate, and points and poses that have partly taken it up.
-    assert 0.3 < backend.rms_px() < 0.6, f"{backend.rms_px():.3f} px"
-    assert backend.rms_px("input") > 2 * backend.rms_px()
+    assert 0.3 < backend.map.rms_px() < 0.6, f"{backend.map.rms_px():.3f} px"
+    assert backend.map.rms_px("input") > 2 * backend.map.rms_px()
     with pytest.raises(ValueError, match="expected one of input, refined"):
-        backend.rms_px("middle")
+        backend.map.rms_px("middle")
 
 
 def test_stamps_that_jump_back_begin_a_new_session_with_the_same_result() -> None:

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from ba_node.archive import unpack
 from ba_node.backend import Backend
+from ba_node.backend.archive import unpack
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement

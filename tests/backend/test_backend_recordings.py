@@ -75,8 +75,8 @@ def test_real_stereo_recording(shared_data: Path) -> None:
     assert backend.scene.keyframes.refined.all()
     # 1/2 sum |r|^2 = 17069.622 over 32756 coordinates, as another library computes it from the data behind the bag.
     assert 2 * len(backend.scene.sightings) == 32756
-    assert backend.rms_px("input") == pytest.approx(np.sqrt(2 * 17069.622 / 32756), rel=2e-6)
-    assert backend.rms_px("refined") <= 0.37, f"{backend.rms_px('refined'):.4f} px"
+    assert backend.map.rms_px("input") == pytest.approx(np.sqrt(2 * 17069.622 / 32756), rel=2e-6)
+    assert backend.map.rms_px("refined") <= 0.37, f"{backend.map.rms_px('refined'):.4f} px"
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_images_of_a_whole_map_as_keyframes(shared_data: Path) -> None:
     assert np.isfinite(last.trajectory.position).all()
     assert np.isfinite(last.cloud.position).all()
     assert len(last.cloud) > 0.99 * len(problem.points)
-    before, after = backend.rms_px("input"), backend.rms_px("refined")
+    before, after = backend.map.rms_px("input"), backend.map.rms_px("refined")
     start = to_problem(problem)
     error = objective.reprojection_errors(start, start.start)
     # Another route to the same number; 31 of the observed points start behind their camera and count in neither.
@@ -107,4 +107,4 @@ def test_a_keyframe_that_starts_far_off_is_brought_in(shared_data: Path) -> None
     backend = Backend(Config().with_values({"odometry.enabled": False}))
     replay(backend, messages_of(read_bal(shared_data / "gtsam-dubrovnik-small" / "dubrovnik-3-7-pre.txt")))
     assert backend.scene.keyframes.refined.all()
-    assert backend.rms_px("refined") < 0.5, f"{backend.rms_px('refined'):.2f} px"
+    assert backend.map.rms_px("refined") < 0.5, f"{backend.map.rms_px('refined'):.2f} px"

@@ -62,7 +62,7 @@ def stream(only_in_front: bool) -> Iterator[Measurement]:
 
 
 def run(only_in_front: bool, backend: str = "auto") -> Backend:
-    config = Config().with_values({"solver.backend": backend})
+    config = Config().with_values({"solver.kernels": backend})
     node = Backend(config)
     for measurement in stream(only_in_front):
         if node.completes(measurement):

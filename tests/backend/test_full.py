@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ba_node.archive import unpack
-from ba_node.backend import Backend
+from ba_node.backend import Backend, Optimization
+from ba_node.backend.archive import unpack
 from ba_node.config import Config
 from ba_node.core import geometry, solver
-from ba_node.core.result import Iteration, Result, Status
+from ba_node.core.result import Iteration, Status
 from ba_node.evaluation.alignment import align
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
@@ -61,19 +61,20 @@ def cut(data: SyntheticData, keyframes: int) -> tuple[list[Measurement], list[Me
     return stream[:first], stream[first:]
 
 
-def everything(backend: Backend) -> full.Copy:
-    taken = full.copy(backend.scene, backend.config)
-    assert isinstance(taken, full.Copy)
+def everything(backend: Backend) -> Optimization:
+    taken = backend.begin_optimization()
+    assert isinstance(taken, Optimization)
     return taken
 
 
-def objectives(backend: Backend, of: full.Copy) -> tuple[float, float]:
+def objectives(backend: Backend, of: Optimization) -> tuple[float, float]:
     """Return the robust objective of the observations of a copy, as it was then and as it is now.
 
     The few points that have lost their place since are left out of both.
     """
-    scene, selection = backend.scene, of.selection
-    keyframes, landmarks = scene.find_keyframes(of.keyframe_id), scene.find_landmarks(of.track_id)
+    scene, selection = backend.scene, of.snapshot.selection
+    keyframes = scene.find_keyframes(of.snapshot.keyframe_id)
+    landmarks = scene.find_landmarks(of.snapshot.track_id)
     placed = scene.landmarks.has_position[landmarks]
     assert placed.mean() > 0.97, f"{np.count_nonzero(~placed)} points of {len(placed)} have lost their place"
     poses = geometry.inverse(
@@ -90,12 +91,12 @@ def objectives(backend: Backend, of: full.Copy) -> tuple[float, float]:
     return before, after
 
 
-def optimised(backend: Backend, later: list[Measurement], **choices: Any) -> tuple[full.Copy, full.Solved]:
-    """Copy, solve, and let the back-end go on meanwhile."""
+def optimised(backend: Backend, later: list[Measurement], **choices: Any) -> Optimization:
+    """Take a snapshot, solve, and let the back-end go on meanwhile."""
     taken = everything(backend)
-    solved = taken.solve(full.options(backend.config.solver, **choices))
+    taken.solve(backend.config.solver, **choices)
     feed(backend, later)
-    return taken, solved
+    return taken
 
 
 def error_m(backend: Backend, data: SyntheticData) -> float:
@@ -109,9 +110,9 @@ def test_it_explains_all_observations_better(kind: str, keyframes: int) -> None:
     data, backend = recording(**KINDS[kind]), Backend(CONFIG)
     early, late = cut(data, keyframes)
     feed(backend, early)
-    taken, solved = optimised(backend, late)
+    taken = optimised(backend, late)
     reference, error = everything(backend), error_m(backend, data)
-    merged = backend.merge(taken, solved)
+    merged = backend.merge(taken)
     assert merged is not None
     before, after = objectives(backend, reference)
     # What is an outlier is judged anew, so the last half percent is not comparable.
@@ -131,8 +132,8 @@ def test_it_explains_all_observations_better(kind: str, keyframes: int) -> None:
 def test_a_floating_scale_does_not_shrink_the_map() -> None:
     data, backend = recording(baseline_m=0.0), Backend(CONFIG)
     feed(backend, (m for _, _, m in data.timeline()))
-    taken, solved = optimised(backend, [])
-    start, state = taken.selection.problem.start, solved.result.state
+    taken = optimised(backend, [])
+    start, state = taken.snapshot.selection.problem.start, taken.result.state
     before, after = (
         np.linalg.norm(np.diff(geometry.inverse(s.rotation, s.translation)[1], axis=0), axis=1).sum()
         for s in (start, state)
@@ -147,7 +148,7 @@ def test_the_same_gives_the_same_bits() -> None:
         backend = Backend(CONFIG)
         early, late = cut(data, 10)
         feed(backend, early)
-        merged = backend.merge(*optimised(backend, late))
+        merged = backend.merge(optimised(backend, late))
         assert merged is not None
         results.append(merged[0])
     assert results[0].trajectory.position.tobytes() == results[1].trajectory.position.tobytes()
@@ -170,7 +171,8 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     def moved(positions: np.ndarray) -> np.ndarray:
         return np.asarray(scale * positions @ turn.T + shift)
 
-    scene, chosen = backend.scene, taken.selection
+    snapshot, scene = taken.snapshot, backend.scene
+    chosen = snapshot.selection
     rotation, position = scene.keyframes.rotation[chosen.keyframes], scene.keyframes.position[chosen.keyframes]
     state = dataclasses.replace(
         chosen.problem.start, points=moved(scene.landmarks.position[chosen.landmarks]) - chosen.origin
@@ -178,9 +180,9 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     inverse = geometry.inverse(turn @ rotation, moved(position) - chosen.origin)
     state = dataclasses.replace(state, rotation=inverse[0], translation=inverse[1])
     # The scale is given to the map by its steps, so they are stretched with it.
-    taken = dataclasses.replace(taken, position=moved(position))
-    state = scaled(taken.selection, taken.position, state)
-    assert full.put(scene, backend.config, taken, state) == 8
+    snapshot = dataclasses.replace(snapshot, position=moved(position))
+    state = scaled(snapshot.selection, snapshot.position, state)
+    assert full.put(scene, backend.config, snapshot, state) == 8
     after = backend.estimate()
     # Those that no solve has had follow the front-end's steps, which are not stretched.
     had = scene.keyframes.refined[scene.order]
@@ -200,7 +202,7 @@ def test_the_result_of_a_map_that_is_gone_changes_nothing(lost: str) -> None:
     stream = [m for _, _, m in data.timeline()]
     backend = Backend(CONFIG)
     feed(backend, stream)
-    taken, solved = optimised(backend, [])
+    taken = optimised(backend, [])
     if lost == "reset":
         backend.reset()
     elif lost == "map":
@@ -208,7 +210,7 @@ def test_the_result_of_a_map_that_is_gone_changes_nothing(lost: str) -> None:
     else:
         feed(backend, [m if isinstance(m, CameraRig) else dataclasses.replace(m, session_id=1) for m in stream])
     before = backend.estimate().trajectory.position
-    assert backend.merge(taken, solved) is None
+    assert backend.merge(taken) is None
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before)
 
 
@@ -218,12 +220,12 @@ def test_forgotten_keyframes_are_passed_over() -> None:
     early, late = cut(data, 18)
     late = late[: len(late) * 2 // 3]
     feed(backend, early)
-    taken, solved = optimised(backend, late)
-    known = backend.scene.find_keyframes(taken.keyframe_id)
+    taken = optimised(backend, late)
+    known = backend.scene.find_keyframes(taken.snapshot.keyframe_id)
     assert (known < 0).any()
     assert (known >= 0).any()
     reference = everything(backend)
-    assert backend.merge(taken, solved) is not None
+    assert backend.merge(taken) is not None
     before, after = objectives(backend, reference)
     assert after < before
 
@@ -233,10 +235,10 @@ def test_when_nothing_of_it_is_left_nothing_changes() -> None:
     backend = Backend(CONFIG.with_values({"scene.max_keyframes": 12}))
     early, late = cut(data, 10)
     feed(backend, early)
-    taken, solved = optimised(backend, late)
-    assert (backend.scene.find_keyframes(taken.keyframe_id) < 0).all()
+    taken = optimised(backend, late)
+    assert (backend.scene.find_keyframes(taken.snapshot.keyframe_id) < 0).all()
     before = backend.estimate().trajectory.position
-    assert backend.merge(taken, solved) is None
+    assert backend.merge(taken) is None
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before)
 
 
@@ -244,20 +246,19 @@ def test_when_nothing_of_it_is_left_nothing_changes() -> None:
 def test_a_result_of_no_use_changes_nothing(status: Status) -> None:
     backend = Backend(CONFIG)
     feed(backend, [m for _, _, m in recording(keyframes=8, landmarks=600, tracks=60).timeline()])
-    taken, solved = optimised(backend, [])
+    taken = optimised(backend, [])
     before = backend.estimate()
     count = backend.solve_count
-    assert backend.merge(taken, solved._replace(result=dataclasses.replace(solved.result, status=status))) is None
-    nan = dataclasses.replace(solved.result.state, points=solved.result.state.points * np.nan)
-    broken = Result(nan, Status.CONVERGED, "", "", ())
-    assert backend.merge(taken, solved._replace(result=broken)) is None
+    assert backend.merge(taken.with_result(status=status)) is None
+    nan = dataclasses.replace(taken.result.state, points=taken.result.state.points * np.nan)
+    assert backend.merge(taken.with_result(state=nan)) is None
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before.trajectory.position)
     assert backend.solve_count == count
 
 
 def test_there_is_a_reason_where_there_is_nothing_to_solve() -> None:
     backend = Backend(CONFIG)
-    assert full.copy(backend.scene, CONFIG) == "no camera rig yet: nothing is known about the cameras"
+    assert backend.begin_optimization() == "no camera rig yet: nothing is known about the cameras"
     assert backend.estimate().trajectory.keyframe_id.tolist() == []
 
 
@@ -271,10 +272,10 @@ def test_a_solve_is_stopped_after_an_iteration() -> None:
         seen.append(row.iteration)
         return len(seen) < 3
 
-    solved = taken.solve(full.options(CONFIG.solver, "lma_cd", 30), on_iteration=watch)
+    taken.solve(CONFIG.solver, "lma_cd", 30, on_iteration=watch)
     assert seen == [0, 1, 2]
-    assert solved.result.status is Status.MAX_ITERATIONS
-    assert solved.result.method == "lma_cd"
+    assert taken.status is Status.MAX_ITERATIONS
+    assert taken.result.method == "lma_cd"
 
 
 @settings(max_examples=25)
@@ -286,16 +287,16 @@ def test_whatever_happens_meanwhile_merging_does_not_raise(data: st.DataObject) 
     backend = Backend(CONFIG.with_values({**limits, "solver.max_iterations": 2}))
     at, end = sorted(data.draw(st.integers(0, len(stream))) for _ in range(2))
     feed(backend, stream[:at], flush=data.draw(st.booleans()))
-    taken = full.copy(backend.scene, backend.config)
+    taken = backend.begin_optimization()
     if isinstance(taken, str):
         return
-    solved = taken.solve(full.options(backend.config.solver, max_iterations=2))
+    taken.solve(backend.config.solver, max_iterations=2)
     lost = data.draw(st.integers(0, 2))
     feed(backend, [m for i, m in enumerate(stream[at:end]) if not lost or i % (lost + 1)], flush=False)
     rows = data.draw(st.lists(st.integers(0, len(backend.scene.landmarks) - 1), max_size=50))
     backend.scene.landmarks.has_position[rows] = False
-    backend.merge(taken, solved)
-    backend.merge(taken, solved)
+    backend.merge(taken)
+    backend.merge(taken)
     assert np.isfinite(backend.scene.keyframes.position).all()
     assert np.isfinite(backend.scene.landmarks.position[backend.scene.landmarks.has_position]).all()
     feed(backend, stream[end:])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ba_node.backend import Backend
+from ba_node.backend import Backend, Optimization
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
@@ -18,7 +18,6 @@ from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.synthetic import SyntheticOptions, generate
-from ba_node.window import full
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -319,7 +318,7 @@ def test_a_point_that_ran_away_goes_back(shared_data: Path) -> None:
     moved = [np.linalg.norm(at - given[int(track)]) for track, at in zip(cloud.track_id, cloud.position, strict=True)]
     assert len(cloud) == len(given) == 509
     assert np.max(moved) < 1.0 and np.median(moved) < 0.03
-    assert backend.rms_px("refined") <= 0.94
+    assert backend.map.rms_px("refined") <= 0.94
 
 
 def test_what_hardly_moves_is_left_as_it_came(shared_data: Path) -> None:
@@ -330,7 +329,7 @@ def test_what_hardly_moves_is_left_as_it_came(shared_data: Path) -> None:
     last = replay(backend, stream)[-1]
     inputs = np.array([one.position for one in stream if isinstance(one, Keyframe)])
     np.testing.assert_allclose(last.trajectory.position, inputs, atol=1e-12)
-    assert backend.rms_px("refined") == pytest.approx(0.7216, abs=1e-3)
+    assert backend.map.rms_px("refined") == pytest.approx(0.7216, abs=1e-3)
     assert "rays to its points meet at" in backend.scene.log.warnings["held"]
 
 
@@ -339,17 +338,17 @@ def test_a_solve_of_everything_is_judged_too(kind: str) -> None:
     stream, _ = recording(**USUAL, **KINDS[kind])
     backend = Backend(ALONE)
     replay(backend, stream)
-    taken = full.copy(backend.scene, backend.config)
-    assert isinstance(taken, full.Copy)
-    solved = taken.solve(full.options(backend.config.solver))
-    state = solved.result.state
+    taken = backend.begin_optimization()
+    assert isinstance(taken, Optimization)
+    taken.solve(backend.config.solver)
+    state = taken.result.state
     wrong = dataclasses.replace(state, translation=1.5 * state.translation, points=1.5 * state.points)
     before = backend.estimate().trajectory.position.copy()
     if kind != "one camera":
-        assert backend.merge(taken, solved._replace(result=dataclasses.replace(solved.result, state=wrong))) is None
+        assert backend.merge(taken.with_result(state=wrong)) is None
         assert backend.refusal and backend.refusal in backend.scene.log.warnings["held"]
         assert np.array_equal(backend.estimate().trajectory.position, before)
-    assert backend.merge(taken, solved) is not None
+    assert backend.merge(taken) is not None
     assert not backend.refusal
 
 

@@ -14,7 +14,7 @@ from experiments.robustness.faults import FAULTS, Recording, spoiled
 from tests.cases.conftest import Replay, harmless
 
 # Faults that are not mended yet; a name goes as soon as its tests pass.
-PENDING = {"outliers_moving", "stands_still", "pure_rotation", "hardly_moves", "rectified_with_distortion"}
+PENDING = {"outliers_moving", "stands_still", "pure_rotation", "hardly_moves"}
 
 
 def siblings() -> list[Any]:

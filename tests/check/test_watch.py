@@ -15,7 +15,6 @@ from ba_node.check import two_view
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Status
 from ba_node.synthetic import SyntheticData
-from ba_node.window import full
 from tests.check.set_ups import WRONG, recording
 
 
@@ -112,9 +111,7 @@ def test_full_solve_is_not_taken() -> None:
     backend = Backend(Config())
     data = recording(wrong="turned 1 about x")
     play(backend, data)
-    taken = full.copy(backend.scene, backend.config)
-    if isinstance(taken, full.Copy):
-        assert backend.merge(taken, taken.solve(full.options(backend.config.solver))) is None
+    assert backend.optimize() is None
     same_as_input(backend.estimate(), data)
 
 
@@ -130,18 +127,17 @@ def test_elsewhere() -> None:
     """Work that is handed over blocks nothing, and its result counts for the session that it is of."""
     backend = Backend(Config())
     handed: list[Any] = []
-    backend.setup.elsewhere = lambda scene, work: handed.append((scene, work))
+    backend.setup.elsewhere = handed.append
     data = recording(wrong="baseline reversed")
     play(backend, data, keyframes=8)
     assert len(handed) == 1
     assert "setup" not in backend.scene.log.warnings
-    scene, work = handed[0]
-    estimate = backend.take_check(scene, work())
+    estimate = backend.take_check(handed[0].run())
     assert estimate is not None
     assert estimate.report.status is Status.HELD
     same_as_input(estimate, data)
     backend.reset()
-    assert backend.take_check(scene, work()) is None
+    assert backend.take_check(handed[0].run()) is None
 
 
 def _standing(data: SyntheticData, still: int) -> SyntheticData:

@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import pytest
 
-from ba_node.check import two_view
 from ba_node.cli.main import main
+from ba_node.measurements import Keyframe
+from ba_node.offline import check
 from ba_node.offline.recording import record
 from tests.check.set_ups import recording
 
@@ -31,6 +33,7 @@ def test_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "change: the position in body_from_camera of camera 1 in camera_rig" in out
     session = json.loads((tmp_path / "found.json").read_text())["sessions"][0]
     assert session["findings"][0]["causes"][0].startswith("baseline of camera 1 reversed")
+    assert max(map(len, out.splitlines())) <= 100, "columns of a usual terminal"
     assert {row["hypothesis"] for row in session["hypotheses"]} >= {"as given", "free", "cameras 0 and 1 swapped"}
 
     assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 3
@@ -48,6 +51,26 @@ def test_poses_of_camera_is_a_parameter(tmp_path: Path) -> None:
     assert main(["check", str(bag), "--set", "frames.poses_of=camera"]) == 0
 
 
+def test_a_clock_that_is_set_back_parts_the_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    back_ns = 3600 * 10**9
+    data = recording(mode="stereo", keyframes=24, length_m=20.0)
+    moved = [
+        (topic, time_ns, dataclasses.replace(m, stamp_ns=m.stamp_ns - back_ns))
+        if isinstance(m, Keyframe) and m.keyframe_id >= 12
+        else (topic, time_ns, m)
+        for topic, time_ns, m in data.timeline()
+    ]
+    record(tmp_path / "back.mcap", moved)
+    assert main(["check", str(tmp_path / "back.mcap"), "--json", str(tmp_path / "found.json")]) == 3
+    told = capsys.readouterr()
+    assert "part 1 of 2: session 0, keyframes 0 to 11, stamps" in told.out
+    assert "part 2 of 2: session 0, keyframes 12 to 23, stamps" in told.out
+    assert "ba: warning: keyframe 12 is 3599.8 s older" in told.err and "the clock was set back" in told.err
+    found = json.loads((tmp_path / "found.json").read_text())["sessions"]
+    assert [session["keyframe_ids"] for session in found] == [[0, 11], [12, 23]]
+    assert not found[0]["warnings"] and "the clock was set back" in found[1]["warnings"][0]
+
+
 def test_too_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = tmp_path / "short.mcap"
     data = recording(mode="mono", keyframes=2, length_m=10.0)
@@ -58,6 +81,6 @@ def test_too_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path / "none.mcap")]) == 2
-    monkeypatch.setattr(two_view, "available", lambda: False)
+    monkeypatch.setattr(check, "can_examine", lambda: False)
     assert main(["check", str(BAGS / "mono_loop.mcap")]) == 2
     assert "python3-opencv" in capsys.readouterr().err

@@ -112,6 +112,10 @@ def test_recording_without_keyframes_names_what_is_missing(
     ("setting", "words"),
     [
         ("window.max_keyframe=3", "did you mean 'window.max_keyframes'?"),
+        ("outlier_px=3", "did you mean 'tracks.outlier_px'?"),
+        ("max_keyframes=3", "did you mean 'window.max_keyframes' or 'scene.max_keyframes'?"),
+        ("outlierpx=3", "did you mean 'tracks.outlier_px'?"),
+        ("foo=1", "parameter 'foo' does not exist; ba params lists all"),
         ("window.max_keyframes=many", "expected int"),
         ("window.max_keyframes=1", "expected a number in [2, 100000]"),
         ("solver.loss=l1", "choose one of squared, huber"),

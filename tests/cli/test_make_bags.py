@@ -50,7 +50,9 @@ def test_synth_records_the_truth(tmp_path: Path) -> None:
 
 def test_synth_refuses_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["synth", str(tmp_path / "s.txt")]) == 2
-    assert "give a name that ends so" in capsys.readouterr().err
+    assert "give a name that ends so, or --kind sphere for a BAL problem" in capsys.readouterr().err
+    assert main(["synth", str(tmp_path / "s.bag")]) == 2
+    assert capsys.readouterr().err.endswith("give a name that ends so\n")
     assert main(["synth", str(tmp_path / "s.mcap"), "--keyframes", "1"]) == 2
     assert "keyframes = 1: expected a number in [2, 100000]" in capsys.readouterr().err
     assert main(["synth", str(tmp_path / "no" / "s.mcap"), *SMALL]) == 2
@@ -120,7 +122,7 @@ def test_synth_makes_a_sphere_with_its_truth(tmp_path: Path, capsys: pytest.Capt
     ("arguments", "words"),
     [
         (["s.mcap", "--preset", "10-253"], "--preset is an option of --kind sphere alone"),
-        (["s.mcap", "--kind", "sphere"], "give a name that ends so"),
+        (["s.mcap", "--kind", "sphere"], "give a name that ends so, or leave out --kind sphere"),
         (["s.txt", "--kind", "sphere", "--keyframes", "5"], "--keyframes is an option of --kind recording alone"),
         (["s.txt", "--kind", "sphere", "--observations", "9"], "need 506"),
     ],

@@ -12,11 +12,11 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.io.files import locked_folder
 from ba_node.io.map_file import is_map
-from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import Keyframe
 from ba_node.offline.recording import record
 from ba_node.synthetic import SyntheticOptions, generate
+from tests.ply import read_ply
 
 
 def replay(bag: Path, out: Path, *options: str) -> int:
@@ -134,5 +134,6 @@ def test_a_map_that_cannot_be_loaded_ends_the_replay(
 ) -> None:
     assert replay(bag, tmp_path / "out", "--load-map", str(tmp_path / "none.npz")) == 2
     assert "none.npz: cannot be read" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
     assert replay(bag, tmp_path / "out", "--save-map", str(tmp_path / "none" / "a.npz")) == 2
     assert "there is no folder" in capsys.readouterr().err

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from ba_node.config import SolverOptions
 from ba_node.core import covariance, geometry, methods, objective, solver
-from ba_node.core.objective import Objective, Rules
-from ba_node.core.options import SolverOptions
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Observations, Problem, State
 from experiments.thesis import matrix_forms
 
@@ -21,7 +21,7 @@ SQUARED = dataclasses.replace(methods.options("auto"), gradient_tolerance=1e-9, 
 
 
 def options(loss: str = "squared", backend: str = "auto") -> SolverOptions:
-    return dataclasses.replace(SQUARED, rules=Rules("local", loss, 1.0, "constant"), backend=backend)
+    return dataclasses.replace(SQUARED, loss=loss, cheirality="constant", kernels=backend)
 
 
 def solved(problem: Problem, chosen: SolverOptions) -> State:
@@ -36,7 +36,7 @@ def none(problem: Problem) -> np.ndarray:
 
 def by_full_inverse(problem: Problem, state: State, chosen: SolverOptions) -> np.ndarray:
     """Return the blocks of the keyframes in the inverse of all of H, put together from one dense Jacobian."""
-    measure = Objective(problem, chosen.rules)
+    measure = Objective(problem, chosen)
     lin = measure.linearise(state)
     h, _ = matrix_forms.explicit_dense(problem, lin)
     rows = int(np.count_nonzero(np.any(lin.d_point != 0.0, axis=2)))
@@ -86,7 +86,7 @@ def test_it_is_what_repeated_measurements_scatter_by(make_problem: MakeProblem) 
         noisy = with_noise(problem, problem.observations, rng)
         state = solved(noisy, chosen)
         errors.append(local_errors(truth, state, free))
-        variances.append(covariance.unit_variance(Objective(noisy, chosen.rules), state))
+        variances.append(covariance.unit_variance(Objective(noisy, chosen), state))
         told.append(covariance.pose_covariances(noisy, state, chosen, none(problem)))
     # The standard error of a standard deviation from n samples is 1 / sqrt(2 n): 3.5 %.
     measured = np.std(np.array(errors), axis=0)
@@ -119,7 +119,7 @@ def test_a_condition_holds_a_scale_that_floats(make_problem: MakeProblem) -> Non
     assert np.isnan(covariance.pose_covariances(problem, state, chosen, none(problem))).any(), "nothing holds the scale"
     g = np.random.default_rng(0).normal(size=(n, 6, 1))
     got = covariance.pose_covariances(problem, state, chosen, g)
-    lin = Objective(problem, chosen.rules).linearise(state)
+    lin = Objective(problem, chosen).linearise(state)
     h, _ = matrix_forms.explicit_dense(problem, lin)
     border = np.zeros((len(h), 1))
     border[: 6 * n, 0] = g.ravel()
@@ -168,7 +168,7 @@ def test_only_the_keyframe_that_hangs_loose_is_unknown(make_problem: MakeProblem
 def test_the_weighted_squares_are_those_of_the_linearisation(make_problem: MakeProblem) -> None:
     problem, _ = make_problem(stereo=True, depth=True, noise_px=2.0)
     for loss in ("squared", "huber", "cauchy"):
-        measure = objective.Objective(problem, Rules("local", loss, 1.0, "constant"))
+        measure = objective.Objective(problem, SolverOptions(loss=loss, cheirality="constant"))
         lin = measure.linearise(problem.start)
         squares, rows = measure.weighted_squares(problem.start)
         assert squares == pytest.approx(np.sum(lin.residual**2), rel=1e-12)

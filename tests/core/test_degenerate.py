@@ -95,7 +95,7 @@ def check(result: Result) -> None:
 def backends(name: str) -> list[str]:
     """Return the kernels that can do a method."""
     chosen = methods.options(name)
-    has_native = native.kernels is not None and not missing(chosen.rules, chosen.demands)
+    has_native = native.kernels is not None and not missing(chosen)
     return ["numpy", "native"] if has_native else ["numpy"]
 
 
@@ -105,7 +105,7 @@ def backends(name: str) -> list[str]:
 def test_no_good_answer(method: str, spoil: str, shape: dict[str, object], make_problem: Make) -> None:
     problem = SPOILS[spoil](make_problem(points=12, keyframes=3, fixed=0, **shape)[0])
     for backend in backends(method):
-        check(solve(problem, dataclasses.replace(methods.options(method), backend=backend, max_iterations=8)))
+        check(solve(problem, dataclasses.replace(methods.options(method), kernels=backend, max_iterations=8)))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -123,10 +123,9 @@ def test_several_faults_at_once(
     problem, _ = make_problem(points=8, keyframes=3, fixed=fixed, free_intrinsics=free, seed=seed)
     for spoil in spoils:
         problem = SPOILS[spoil](problem)
-    chosen = methods.options(method)
-    rules = dataclasses.replace(chosen.rules, cheirality=cheirality)
+    options = dataclasses.replace(methods.options(method), cheirality=cheirality, max_iterations=6)
     for backend in backends(method):
-        check(solve(problem, dataclasses.replace(chosen, rules=rules, backend=backend, max_iterations=6)))
+        check(solve(problem, dataclasses.replace(options, kernels=backend)))
 
 
 @pytest.mark.parametrize("field", ["rotation", "translation", "points"])

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import scipy.sparse
 
+from ba_node.config import SolverOptions
 from ba_node.core import blocks, linear, native_kernels, reduced, scaling
-from ba_node.core.kernels import Demands, System
+from ba_node.core.kernels import System
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Objective, Rules
-from ba_node.core.options import SolverOptions
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
 from experiments.thesis.matrix_forms import FORMS
 
@@ -31,18 +31,18 @@ SIDES = ("points", "cameras", "none", "adaptive")
 PRECONDITIONERS = ("none", "schur_block", "b_block", "schur_diag", "b_diag")
 
 
-def dense_equations(problem: Problem, rules: Rules) -> tuple[np.ndarray, np.ndarray]:
+def dense_equations(problem: Problem, options: SolverOptions) -> tuple[np.ndarray, np.ndarray]:
     """Return H and g by the explicit dense form."""
-    h, g = FORMS["explicit dense"](problem, Objective(problem, rules).linearise(problem.start))
+    h, g = FORMS["explicit dense"](problem, Objective(problem, options).linearise(problem.start))
     return np.asarray(h), g
 
 
-def damped(problem: Problem, side: str, mu: float, rules: Rules) -> tuple[System, np.ndarray, np.ndarray]:
+def damped(problem: Problem, side: str, mu: float, options: SolverOptions) -> tuple[System, np.ndarray, np.ndarray]:
     """Return a system with Marquardt damping, and the damped H and g of the dense form."""
-    kernels = NumpyKernels(problem, rules, Demands(schur=side))
+    kernels = NumpyKernels(problem, dataclasses.replace(options, schur=side))
     kernels.linearise(problem.start)
     d_c, d_p = scaling.diagonals("diag", kernels.diagonals())
-    h, g = dense_equations(problem, rules)
+    h, g = dense_equations(problem, options)
     damping = mu * np.concatenate([d_c.ravel(), d_p.ravel()])
     return kernels.reduce(mu * d_c, mu * d_p), h + np.diag(damping), g
 
@@ -52,7 +52,7 @@ def damped(problem: Problem, side: str, mu: float, rules: Rules) -> tuple[System
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_side_gives_the_dense_step(side: str, mu: float, shape: dict[str, object], make_problem: Make) -> None:
     problem, _ = make_problem(**shape)
-    system, h, g = damped(problem, side, mu, Rules(loss="huber"))
+    system, h, g = damped(problem, side, mu, SolverOptions(loss="huber"))
     expected = np.linalg.solve(h, -g)
     for matrix in (system.dense(), system.sparse()):
         x = linear.cholesky(matrix, system.rhs).x
@@ -61,7 +61,7 @@ def test_every_side_gives_the_dense_step(side: str, mu: float, shape: dict[str, 
         step = np.concatenate([step_c.ravel(), step_p.ravel()])
         error = np.linalg.norm(step - expected) / np.linalg.norm(expected)
         assert error <= 1e-8, f"{side}, mu {mu}: {error:.1e}"
-    undamped, _ = dense_equations(problem, Rules(loss="huber"))
+    undamped, _ = dense_equations(problem, SolverOptions(loss="huber"))
     assert reduction == pytest.approx(-g @ step - 0.5 * step @ undamped @ step, rel=1e-8)
 
 
@@ -69,7 +69,7 @@ def test_every_side_gives_the_dense_step(side: str, mu: float, shape: dict[str, 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_every_form_of_a_system_agrees(side: str, shape: dict[str, object], make_problem: Make) -> None:
     problem, _ = make_problem(**shape)
-    system, h, _ = damped(problem, side, 1e-3, Rules())
+    system, h, _ = damped(problem, side, 1e-3, SolverOptions())
     dense, scale = system.dense(), np.abs(system.dense()).max()
     x = np.random.default_rng(0).normal(size=len(dense))
     np.testing.assert_allclose(system.product(x), dense @ x, rtol=1e-9, atol=1e-11 * scale)
@@ -88,11 +88,11 @@ def test_every_form_of_a_system_agrees(side: str, shape: dict[str, object], make
 def test_reduction_of_the_reduced_model_is_that_of_the_full_one(shape: dict[str, object], make_problem: Make) -> None:
     """(3.102): -m(p) = -m_c(pc) + 1/2 gp' C^-1 gp, for any pc with the points that belong to it."""
     problem, _ = make_problem(**shape)
-    kernels = NumpyKernels(problem, Rules())
+    kernels = NumpyKernels(problem, SolverOptions())
     kernels.linearise(problem.start)
     d_c, d_p = kernels.diagonals()
     system = kernels.reduce(0.0 * d_c, 0.0 * d_p)
-    h, g = dense_equations(problem, Rules())
+    h, g = dense_equations(problem, SolverOptions())
     n_c = len(system.rhs)
     for seed in range(3):
         x = np.random.default_rng(seed).normal(size=n_c) * 1e-3
@@ -111,14 +111,14 @@ def test_reduction_of_the_reduced_model_is_that_of_the_full_one(shape: dict[str,
 def test_reduction_of_the_damped_model(mu: float, shape: dict[str, object], make_problem: Make) -> None:
     """(3.102) of H + mu D: what Algorithm 4 hands on to the gain ratio is the undamped reduction less mu/2 p'D p."""
     problem, _ = make_problem(**shape)
-    system, h, g = damped(problem, "points", mu, Rules())
+    system, h, g = damped(problem, "points", mu, SolverOptions())
     n_c = len(system.rhs)
     g_p = g[n_c:]
     for seed in range(3):
         x = np.random.default_rng(seed).normal(size=n_c) * 1e-3
         step_c, step_p, undamped = system.back_substitute(x)
         step = np.concatenate([step_c.ravel(), step_p.ravel()])
-        plain, _ = dense_equations(problem, Rules())
+        plain, _ = dense_equations(problem, SolverOptions())
         held = 0.5 * step @ (h - plain) @ step
         constant = 0.5 * g_p @ np.linalg.solve(h[n_c:, n_c:], g_p)
         own = system.rhs @ x - 0.5 * x @ system.dense() @ x
@@ -131,8 +131,8 @@ def test_reduction_of_the_damped_model(mu: float, shape: dict[str, object], make
 def test_pcg_leaves_on_the_boundary(side: str, space: str, preconditioner: str, make_problem: Make) -> None:
     """|D p| is the radius to 1e-12 in scaled space, with any preconditioner."""
     problem, _ = make_problem(free_intrinsics=True, points=60)
-    system, _, _ = damped(problem, side, 1e-3, Rules())
-    kernels = NumpyKernels(problem, Rules())
+    system, _, _ = damped(problem, side, 1e-3, SolverOptions())
+    kernels = NumpyKernels(problem, SolverOptions())
     kernels.linearise(problem.start)
     hessian = kernels.diagonals()
     scale = system.gather(*scaling.scaled_space(space, hessian))
@@ -151,8 +151,8 @@ def test_pcg_leaves_on_the_boundary(side: str, space: str, preconditioner: str, 
 @pytest.mark.parametrize("side", ["points", "cameras", "none"])
 def test_tight_pcg_without_a_region_gives_the_cholesky_step(side: str, preconditioner: str, make_problem: Make) -> None:
     problem, _ = make_problem(stereo=True)
-    system, h, g = damped(problem, side, 1e-2, Rules())
-    kernels = NumpyKernels(problem, Rules())
+    system, h, g = damped(problem, side, 1e-2, SolverOptions())
+    kernels = NumpyKernels(problem, SolverOptions())
     kernels.linearise(problem.start)
     options = SolverOptions(
         linear_solver="pcg", preconditioner=preconditioner, t_eps=1e-12, max_linear_iterations=20_000
@@ -168,7 +168,7 @@ def test_tight_pcg_without_a_region_gives_the_cholesky_step(side: str, precondit
 @pytest.mark.parametrize("shape", SHAPES)
 def test_the_four_matrix_forms_give_the_same_equations(shape: dict[str, object], make_problem: Make) -> None:
     problem, _ = make_problem(**shape)
-    lin = Objective(problem, Rules(loss="huber")).linearise(problem.start)
+    lin = Objective(problem, SolverOptions(loss="huber")).linearise(problem.start)
     h, g = FORMS["explicit dense"](problem, lin)
     for name, form in FORMS.items():
         other, gradient = form(problem, lin)
@@ -181,12 +181,12 @@ def test_the_four_matrix_forms_give_the_same_equations(shape: dict[str, object],
 def test_the_adaptive_side_follows_the_conditions(make_problem: Make) -> None:
     """Algorithm 10: a point far away spoils C, and cameras are eliminated with the radius times 3m/9n."""
     problem, _ = make_problem(free_intrinsics=True)
-    demands = Demands(schur="adaptive", space="inc")
+    options = SolverOptions(schur="adaptive", trust_region="inc")
     points = problem.start.points.copy()
     points[0] *= 1e4
     far = dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
     for example, side, factor in ((problem, "points", 1.0), (far, "cameras", 3.0 * 40 / (9 * 4))):
-        kernels = NumpyKernels(example, Rules(), demands)
+        kernels = NumpyKernels(example, options)
         kernels.linearise(example.start)
         d_c, d_p = kernels.diagonals()
         system = kernels.reduce(0.0 * d_c, 0.0 * d_p)
@@ -202,7 +202,7 @@ def test_singular_blocks_leave_their_directions_alone(side: str, make_problem: M
     kept = np.flatnonzero((obs.keyframe != 4) & (obs.point != 7))
     few = {f.name: getattr(obs, f.name)[kept] for f in dataclasses.fields(obs) if len(getattr(obs, f.name))}
     problem = dataclasses.replace(problem, observations=dataclasses.replace(obs, **few))
-    kernels = native_kernels.make(problem, Rules(), "numpy", Demands(schur=side))
+    kernels = native_kernels.make(problem, SolverOptions(kernels="numpy", schur=side))
     kernels.linearise(problem.start)
     d_c, d_p = kernels.diagonals()
     system = kernels.reduce(0.0 * d_c, 0.0 * d_p)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import cameras, native_kernels, reduced, solver
 from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Objective, Rules
-from ba_node.core.options import SolverOptions
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Observations, Problem, State
 from ba_node.core.result import Status
 
@@ -29,12 +29,12 @@ SHAPES = {
     "nothing fixed": {"fixed": 0},
     "most fixed": {"fixed": 4},
 }
-RULES = [
-    Rules(),
-    Rules(loss="huber", loss_scale=1.5),
-    Rules(loss="huber", cheirality="constant"),
-    Rules(cheirality="drop"),
-    Rules(loss="cauchy", loss_scale=1.5, cheirality="constant"),
+COST_MODELS = [
+    SolverOptions(),
+    SolverOptions(loss="huber", loss_scale_px=1.5),
+    SolverOptions(loss="huber", cheirality="constant"),
+    SolverOptions(cheirality="drop"),
+    SolverOptions(loss="cauchy", loss_scale_px=1.5, cheirality="constant"),
 ]
 built = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
 
@@ -46,12 +46,16 @@ def some_behind(problem: Problem) -> Problem:
     return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
-def pair(problem: Problem, rules: Rules) -> tuple[Kernels, Kernels]:
+def made(problem: Problem, options: SolverOptions, kernels: str) -> Kernels:
+    """Return numpy's kernels or those in C++."""
+    return native_kernels.make(problem, dataclasses.replace(options, kernels=kernels))
+
+
+def pair(problem: Problem, options: SolverOptions) -> tuple[Kernels, Kernels]:
     """Return the kernels of a problem in numpy and in C++, linearised at the start."""
-    both = native_kernels.make(problem, rules, "numpy"), native_kernels.make(problem, rules, "native")
-    values = [kernels.linearise(problem.start) for kernels in both]
-    assert values[0] == pytest.approx(values[1], rel=1e-12)
-    return both
+    oracle, kernels = (made(problem, options, name) for name in ("numpy", "native"))
+    assert oracle.linearise(problem.start) == pytest.approx(kernels.linearise(problem.start), rel=1e-12)
+    return oracle, kernels
 
 
 def near(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-11) -> None:
@@ -62,11 +66,11 @@ def near(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-11) -> None:
 
 
 @built
-@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("options", COST_MODELS)
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_native_agrees_with_numpy(shape: dict[str, object], rules: Rules, make_problem: Make) -> None:
+def test_native_agrees_with_numpy(shape: dict[str, object], options: SolverOptions, make_problem: Make) -> None:
     problem = some_behind(make_problem(start_error=0.02, **shape)[0])
-    oracle, kernels = pair(problem, rules)
+    oracle, kernels = pair(problem, options)
     assert kernels.gradient_norm == pytest.approx(oracle.gradient_norm, rel=1e-11)
     assert kernels.objective(problem.start) == pytest.approx(oracle.objective(problem.start), rel=1e-12)
     d_c, d_p = oracle.diagonals()
@@ -86,11 +90,11 @@ def test_native_agrees_with_numpy(shape: dict[str, object], rules: Rules, make_p
 
 
 @built
-@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("options", COST_MODELS)
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_native_polishes_as_numpy_does(shape: dict[str, object], rules: Rules, make_problem: Make) -> None:
+def test_native_polishes_as_numpy_does(shape: dict[str, object], options: SolverOptions, make_problem: Make) -> None:
     problem, _ = make_problem(start_error=0.02, **shape)
-    oracle, kernels = pair(problem, rules)
+    oracle, kernels = pair(problem, options)
     (value_a, state_a), (value_b, state_b) = (k.polish_points(problem.start, 3) for k in (oracle, kernels))
     assert value_b == pytest.approx(value_a, rel=1e-9)
     near(state_a.points, state_b.points, 1e-7)
@@ -102,8 +106,8 @@ def test_native_polishes_as_numpy_does(shape: dict[str, object], rules: Rules, m
 def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make_problem: Make) -> None:
     """Damping, dense Cholesky, and the state after the step with and without polishing; fixed keyframes stay."""
     problem, _ = make_problem(start_error=0.02, **shape)
-    both = pair(problem, Rules(loss="huber"))
-    for polish_steps in (0, 3):
+    both = pair(problem, SolverOptions(loss="huber"))
+    for inner_iterations in (0, 3):
         systems = [kernels.damp(damping, 1e-2) for kernels in both]
         near(systems[0].dense(), systems[1].dense())
         near(systems[0].rhs, systems[1].rhs)
@@ -113,32 +117,34 @@ def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make
             continue
         near(steps[0], steps[1], 1e-6)
         a, b = (
-            kernels.move(problem.start, system, steps[0], polish_steps)
+            kernels.move(problem.start, system, steps[0], inner_iterations)
             for kernels, system in zip(both, systems, strict=True)
         )
         assert b.predicted == pytest.approx(a.predicted, rel=1e-6)
         assert b.damping == pytest.approx(a.damping, rel=1e-6, abs=1e-300)
         assert b.unpolished == pytest.approx(a.unpolished, rel=1e-6)
         assert b.objective == pytest.approx(a.objective, rel=1e-6)
-        assert (b.objective == b.unpolished) == (polish_steps == 0)
+        assert (b.objective == b.unpolished) == (inner_iterations == 0)
         for field in dataclasses.fields(State):
             near(getattr(a.state, field.name), getattr(b.state, field.name), 1e-6)
         np.testing.assert_array_equal(b.state.rotation[problem.fixed], problem.start.rotation[problem.fixed])
 
 
 @built
-@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("options", COST_MODELS)
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_native_linearises_where_polishing_ended(shape: dict[str, object], rules: Rules, make_problem: Make) -> None:
+def test_native_linearises_where_polishing_ended(
+    shape: dict[str, object], options: SolverOptions, make_problem: Make
+) -> None:
     """What polishing kept of its last look is what a linearisation there finds anew."""
     problem = some_behind(make_problem(start_error=0.02, **shape)[0])
-    kernels = native_kernels.make(problem, rules, "native")
+    kernels = native_kernels.make(problem, options)
     kernels.linearise(problem.start)
     system = kernels.damp("diag", 1e-2)
     step = system.solve_dense()
     assert step is not None
     first = kernels.move(problem.start, system, step.copy(), 3).state
-    oracle = native_kernels.make(problem, rules, "numpy")
+    oracle = made(problem, options, "numpy")
 
     def agree() -> None:
         assert kernels.linearise(first) == pytest.approx(oracle.linearise(first), rel=1e-12)
@@ -157,7 +163,7 @@ def test_native_linearises_where_polishing_ended(shape: dict[str, object], rules
 
 @built
 def test_native_knows_once_where_polishing_ended(make_problem: Make) -> None:
-    kernels = native_kernels.make(make_problem()[0], Rules(), "native")
+    kernels = native_kernels.make(make_problem()[0], SolverOptions(kernels="native"))
     assert isinstance(kernels, native_kernels.NativeKernels)
     polished = kernels.polish_points(make_problem()[0].start, 2)[1]
     assert kernels._kernel.linearise_prepared()
@@ -169,7 +175,7 @@ def test_native_knows_once_where_polishing_ended(make_problem: Make) -> None:
 @built
 def test_a_step_that_is_not_finite_has_no_objective(make_problem: Make) -> None:
     problem, _ = make_problem()
-    for kernels in pair(problem, Rules()):
+    for kernels in pair(problem, SolverOptions()):
         system = kernels.damp("diag", 1e-3)
         moved = kernels.move(problem.start, system, np.full(len(system.rhs), np.nan), 3)
         assert np.isnan(moved.unpolished) and np.isnan(moved.objective)
@@ -194,7 +200,7 @@ def test_dense_cholesky_of_any_size(n: int, make_problem: Make) -> None:
     copies["keyframe"] = np.concatenate([obs.keyframe + i * small.n_keyframes for i in range(times)])
     copies["point"] = np.concatenate([obs.point + i * small.n_points for i in range(times)])
     problem = Problem(state, np.arange(count) >= n, small.cameras, Observations(**copies))
-    system = pair(problem, Rules())[1].damp("diag", 1e-3)
+    system = pair(problem, SolverOptions())[1].damp("diag", 1e-3)
     x = system.solve_dense()
     assert x is not None and len(x) == 6 * n
     near(system.dense() @ x, system.rhs, 1e-9)
@@ -238,14 +244,14 @@ def test_native_has_every_camera_model(name: str, make_problem: Make) -> None:
     model, params = cameras.parameters(name, np.array([400.0, 410.0, 320.0, 240.0]), coefficients)
     cams = problem.cameras
     both = dataclasses.replace(cams, model=np.array([model, 0], np.uint8), params=np.stack([params, cams.params[1]]))
-    oracle, kernels = pair(dataclasses.replace(problem, cameras=both), Rules(loss="huber"))
+    oracle, kernels = pair(dataclasses.replace(problem, cameras=both), SolverOptions(loss="huber"))
     systems = [kernel.reduce(*kernel.diagonals()).dense() for kernel in (oracle, kernels)]
     near(systems[0], systems[1])
 
 
 @built
-@pytest.mark.parametrize("rules", RULES)
-def test_native_sees_as_far_round_as_numpy(rules: Rules, make_problem: Make) -> None:
+@pytest.mark.parametrize("options", COST_MODELS)
+def test_native_sees_as_far_round_as_numpy(options: SolverOptions, make_problem: Make) -> None:
     """A fisheye and a plain camera in one rig, points on all sides of both."""
     problem, _ = make_problem(stereo=True, points=120, start_error=0.02)
     coefficients = np.array([0.01, -2e-3, 3e-4, -2e-5])
@@ -257,7 +263,7 @@ def test_native_sees_as_far_round_as_numpy(rules: Rules, make_problem: Make) -> 
     points *= rng.uniform(2.0, 6.0, (120, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
     start = dataclasses.replace(problem.start, points=points)
     problem = dataclasses.replace(problem, cameras=both, start=start)
-    seen = Objective(problem, rules)
+    seen = Objective(problem, options)
     x_cam = seen.in_camera(start)[problem.observations.camera == 0]
     assert np.count_nonzero((x_cam[:, 2] < 0.0) & ~cameras.behind(x_cam, np.array([1], np.uint8))) > 50
     of_fisheye = (problem.observations.camera == 0)[:, None]
@@ -266,7 +272,7 @@ def test_native_sees_as_far_round_as_numpy(rules: Rules, make_problem: Make) -> 
     expected, found = (native_kernels.residual_norms(problem, start, name) for name in ("numpy", "native"))
     np.testing.assert_array_equal(np.isinf(found), np.isinf(expected))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-    oracle, kernels = pair(problem, rules)
+    oracle, kernels = pair(problem, options)
     systems = [kernel.reduce(*kernel.diagonals()).dense() for kernel in (oracle, kernels)]
     near(systems[0], systems[1])
 
@@ -291,16 +297,16 @@ def test_native_numbers_images_of_many_keyframes_and_cameras(make_problem: Make)
     )
     problem = Problem(state, np.tile(small.fixed, 200), more, spread)
     assert problem.n_keyframes * len(more.model) > 2**20
-    oracle, kernels = pair(problem, Rules())
+    oracle, kernels = pair(problem, SolverOptions())
     near(oracle.diagonals()[0], kernels.diagonals()[0])
 
 
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
 def test_polishing_moves_points_only_and_never_makes_one_worse(backend: str, make_problem: Make) -> None:
     problem, _ = make_problem(start_error=0.05)
-    kernels = native_kernels.make(problem, Rules(loss="huber"), backend)
+    kernels = native_kernels.make(problem, SolverOptions(loss="huber", kernels=backend))
     value, state = kernels.polish_points(problem.start, 3)
-    objective = Objective(problem, Rules(loss="huber"))
+    objective = Objective(problem, SolverOptions(loss="huber"))
     assert value == pytest.approx(objective.value(state), rel=1e-12)
     before, after = (
         np.bincount(problem.observations.point, objective.point_rows(s).cost) for s in (problem.start, state)
@@ -317,14 +323,14 @@ def test_rows_kept_while_polishing_are_those_of_the_state(
 ) -> None:
     """After a step the linearisation takes up what polishing has worked out; so it is as good as a fresh one."""
     problem, _ = make_problem(start_error=0.05, **shape)
-    rules = Rules(loss="huber")
-    kernels = NumpyKernels(problem, rules)
+    options = SolverOptions(loss="huber")
+    kernels = NumpyKernels(problem, options)
     kernels.linearise(problem.start)
     system = kernels.damp("diag", 1e-4)
     x = system.solve_dense()
     assert x is not None
     moved = kernels.move(problem.start, system, x, steps)
-    fresh = NumpyKernels(problem, rules)
+    fresh = NumpyKernels(problem, options)
     assert kernels.linearise(moved.state) == pytest.approx(fresh.linearise(moved.state), rel=1e-13)
     for name in ("b", "c", "e", "gradient_c", "gradient_p"):
         near(getattr(kernels._equations, name), getattr(fresh._equations, name))
@@ -332,8 +338,8 @@ def test_rows_kept_while_polishing_are_those_of_the_state(
 
 def test_rows_of_one_surrogate_do_not_serve_the_next(make_problem: Make) -> None:
     problem, _ = make_problem(start_error=1e-4)
-    rules = Rules(loss="truncated_quadratic")
-    kernels, fresh = NumpyKernels(problem, rules), NumpyKernels(problem, rules)
+    options = SolverOptions(loss="truncated_quadratic")
+    kernels, fresh = NumpyKernels(problem, options), NumpyKernels(problem, options)
     kernels.graduate(0.1)
     kernels.linearise(problem.start)
     system = kernels.damp("diag", 1e-4)
@@ -348,7 +354,7 @@ def test_rows_of_one_surrogate_do_not_serve_the_next(make_problem: Make) -> None
 
 def test_polishing_what_is_at_its_best_changes_nothing(make_problem: Make) -> None:
     problem, _ = make_problem()
-    kernels = NumpyKernels(problem, Rules())
+    kernels = NumpyKernels(problem, SolverOptions())
     value, state = kernels.polish_points(problem.start, 20)
     for _ in range(20):
         before, (value, state) = value, kernels.polish_points(state, 20)
@@ -364,7 +370,7 @@ def test_large_systems_are_solved_without_a_dense_s(
     """With the limit for dense S at zero the solve takes the sparse and the matrix-free way to the same minimum."""
     problem, _ = make_problem(stereo=True, points=60)
     options = dataclasses.replace(
-        SolverOptions(), backend=backend, linear_solver=linear_solver, t_eps=1e-6, function_tolerance=1e-14
+        SolverOptions(), kernels=backend, linear_solver=linear_solver, t_eps=1e-6, function_tolerance=1e-14
     )
     dense = solver.solve(problem, options)
     monkeypatch.setattr(reduced, "DENSE_LIMIT", 0)
@@ -376,7 +382,7 @@ def test_large_systems_are_solved_without_a_dense_s(
 def test_native_solves_end_where_numpy_ends(make_problem: Make) -> None:
     problem, _ = make_problem(stereo=True, depth=True)
     ends = [
-        solver.solve(problem, dataclasses.replace(SolverOptions(), backend=b, function_tolerance=1e-14))
+        solver.solve(problem, dataclasses.replace(SolverOptions(), kernels=b, function_tolerance=1e-14))
         for b in ("numpy", "native")
     ]
     assert ends[1].objective_after == pytest.approx(ends[0].objective_after, rel=1e-10)
@@ -384,15 +390,15 @@ def test_native_solves_end_where_numpy_ends(make_problem: Make) -> None:
 
 def test_native_is_refused_where_it_lacks_something(make_problem: Make) -> None:
     problem, _ = make_problem()
-    rules = Rules(parameterisation="global")
+    options = SolverOptions(parameterisation="global", kernels="native")
     with pytest.raises(native_kernels.KernelsError, match="native"):
-        native_kernels.make(problem, rules, "native")
-    result = solver.solve(problem, dataclasses.replace(SolverOptions(), rules=rules, backend="native"))
-    assert result.status == Status.FAILED and "backend native" in result.reason
+        native_kernels.make(problem, options)
+    result = solver.solve(problem, options)
+    assert result.status == Status.FAILED and "kernels native" in result.reason
 
 
 def test_without_a_compiler_numpy_takes_over(make_problem: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native, "kernels", None)
     problem, _ = make_problem()
-    assert isinstance(native_kernels.make(problem, Rules()), NumpyKernels)
+    assert isinstance(native_kernels.make(problem, SolverOptions()), NumpyKernels)
     assert solver.solve(problem, SolverOptions()).status.usable

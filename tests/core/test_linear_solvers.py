@@ -13,11 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import linear, linear_costs, native_kernels, solver
 from ba_node.core.kernels import System
 from ba_node.core.linear_costs import Factor, Sizes
-from ba_node.core.objective import Rules
-from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Observations, Problem, State
 from ba_node.core.reduced import ReducedSolver, preconditioner
 from tests.core.conftest import Spec, make
@@ -43,7 +42,7 @@ def ring(problem: Problem, reach: int) -> Problem:
 
 def systems(problem: Problem, damping: float, backend: str = "native") -> tuple[System, tuple[np.ndarray, np.ndarray]]:
     """Return the system of the start with Marquardt damping, and the diagonal of H."""
-    kernels = native_kernels.make(problem, Rules(), backend)
+    kernels = native_kernels.make(problem, SolverOptions(kernels=backend))
     kernels.linearise(problem.start)
     d_c, d_p = kernels.diagonals()
     system = kernels.reduce(damping * np.maximum(d_c, 1e-6), damping * np.maximum(d_p, 1e-6))

@@ -10,8 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from ba_node.config import SolverOptions
 from ba_node.core.loss import LOSSES
-from ba_node.core.objective import Objective, Rules, reprojection_errors
+from ba_node.core.objective import Objective, reprojection_errors
 from ba_node.core.problem import Problem, State
 
 SHAPES = [
@@ -59,7 +60,7 @@ def test_jacobian_agrees_with_central_differences(
     parameterisation: str, shape: dict[str, bool], make_problem: Make
 ) -> None:
     problem, _ = make_problem(**shape)
-    objective = Objective(problem, Rules(parameterisation=parameterisation))
+    objective = Objective(problem, SolverOptions(parameterisation=parameterisation))
     lin, obs, h = objective.linearise(problem.start), problem.observations, 1e-6
     size = lin.d_keyframe.shape[2]
     relative = []
@@ -80,7 +81,7 @@ def test_taylor_remainder_falls_with_slope_two(
     parameterisation: str, shape: dict[str, bool], make_problem: Make
 ) -> None:
     problem, _ = make_problem(**shape)
-    objective = Objective(problem, Rules(parameterisation=parameterisation))
+    objective = Objective(problem, SolverOptions(parameterisation=parameterisation))
     keyframes, points = random_step(problem, 3)
     base, slope = whitened(objective, problem.start), product(objective, problem.start, (keyframes, points))
     taus = 2.0 ** -np.arange(8, 15)
@@ -102,7 +103,7 @@ def test_gradient_is_that_of_the_robust_objective(
 ) -> None:
     """g = J' W r, by two routes: the linearisation, and central differences of the objective alone."""
     problem, _ = make_problem(start_error=0.02, **shape)
-    objective = Objective(problem, Rules(loss=loss, loss_scale=1.5))
+    objective = Objective(problem, SolverOptions(loss=loss, loss_scale_px=1.5))
     objective.graduation = graduation
     lin = objective.linearise(problem.start)
     assert lin.objective == pytest.approx(objective.value(problem.start), rel=1e-14)
@@ -130,16 +131,18 @@ class TestPointsBehind:
         return dataclasses.replace(problem, start=dataclasses.replace(truth, points=points))
 
     def test_constant_costs_but_does_not_pull(self, problem: Problem) -> None:
-        lin = Objective(problem, Rules(loss="huber", cheirality="constant")).linearise(problem.start)
+        lin = Objective(problem, SolverOptions(loss="huber", cheirality="constant")).linearise(problem.start)
         behind = np.flatnonzero(problem.observations.point % 2 == 0)
         assert not lin.d_point[behind].any() and not lin.residual[behind].any()
-        in_front = Objective(problem, Rules(loss="huber", cheirality="drop")).value(problem.start)
+        in_front = Objective(problem, SolverOptions(loss="huber", cheirality="drop")).value(problem.start)
         # Huber at 1: Psi(100) = 2 * 100 - 1.
         assert lin.objective - in_front == pytest.approx(0.5 * 199.0 * len(behind), rel=1e-12)
 
     def test_keep_counts_the_plain_residual(self, problem: Problem) -> None:
-        objective = Objective(problem, Rules(cheirality="keep"))
-        assert objective.value(problem.start) > Objective(problem, Rules(cheirality="drop")).value(problem.start)
+        objective = Objective(problem, SolverOptions(cheirality="keep"))
+        assert objective.value(problem.start) > Objective(problem, SolverOptions(cheirality="drop")).value(
+            problem.start
+        )
         assert np.isfinite(objective.linearise(problem.start).d_point).all()
 
     def test_errors_are_nan(self, problem: Problem) -> None:
@@ -151,5 +154,7 @@ class TestPointsBehind:
         points = problem.start.points.copy()
         points[0] = -problem.start.rotation[0].T @ problem.start.translation[0]
         state = dataclasses.replace(problem.start, points=points)
-        lin = Objective(dataclasses.replace(problem, start=state), Rules(cheirality=cheirality)).linearise(state)
+        lin = Objective(dataclasses.replace(problem, start=state), SolverOptions(cheirality=cheirality)).linearise(
+            state
+        )
         assert np.isfinite(lin.objective) and np.isfinite(lin.d_keyframe).all() and np.isfinite(lin.d_point).all()

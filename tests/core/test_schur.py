@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ba_node.config import SolverOptions
 from ba_node.core import dense_products, linear
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import ReducedSystem, Structure, inverse_cholesky3, normal_equations
 
@@ -40,7 +41,7 @@ def dense_jacobian(problem: Problem, objective: Objective) -> tuple[np.ndarray, 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_reduced_step_is_the_dense_step(shape: dict[str, object], mu: float, make_problem: Make) -> None:
     problem, _ = make_problem(**shape)
-    objective = Objective(problem, Rules(loss="huber"))
+    objective = Objective(problem, SolverOptions(loss="huber"))
     jacobian, residual = dense_jacobian(problem, objective)
     n_c = jacobian.shape[1] - 3 * problem.n_points
     hessian, gradient = jacobian.T @ jacobian, jacobian.T @ residual
@@ -61,7 +62,7 @@ def test_reduced_step_is_the_dense_step(shape: dict[str, object], mu: float, mak
 def test_all_forms_of_s_agree(shape: dict[str, object], make_problem: Make) -> None:
     problem, _ = make_problem(**shape)
     structure = Structure(problem)
-    equations = normal_equations(structure, Objective(problem, Rules()).linearise(problem.start))
+    equations = normal_equations(structure, Objective(problem, SolverOptions()).linearise(problem.start))
     d_c, d_p = equations.diagonals()
     system = ReducedSystem(structure, equations, 1e-3 * d_c, 1e-3 * d_p)
     dense = system.dense()
@@ -110,7 +111,7 @@ def test_a_window_takes_dense_products_and_few_common_points_do_not(make_problem
 def test_tight_pcg_and_sparse_cholesky_give_the_cholesky_step(shape: dict[str, object], make_problem: Make) -> None:
     problem, _ = make_problem(**shape)
     structure = Structure(problem)
-    equations = normal_equations(structure, Objective(problem, Rules()).linearise(problem.start))
+    equations = normal_equations(structure, Objective(problem, SolverOptions()).linearise(problem.start))
     d_c, d_p = equations.diagonals()
     system = ReducedSystem(structure, equations, 1e-3 * d_c, 1e-3 * d_p)
     exact = linear.cholesky(system.dense(), system.rhs).x

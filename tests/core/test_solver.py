@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ba_node.config import SolverOptions
 from ba_node.core import methods
-from ba_node.core.objective import Objective, Rules
-from ba_node.core.options import SolverOptions
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.result import Iteration, Result, Status
 from ba_node.core.solver import solve
@@ -51,9 +51,9 @@ def test_exact_data_is_fitted_exactly(method: str, shape: dict[str, object], mak
 def test_the_minimum_is_a_minimum(make_problem: Make) -> None:
     """At the end no random step lowers the robust objective: a route that uses no derivative."""
     problem, _ = make_problem(stereo=True)
-    rules = Rules(loss="huber")
-    result = solve(problem, dataclasses.replace(SolverOptions(), rules=rules, function_tolerance=1e-14))
-    objective = Objective(problem, rules)
+    options = SolverOptions(loss="huber", function_tolerance=1e-14)
+    result = solve(problem, options)
+    objective = Objective(problem, options)
     rng = np.random.default_rng(0)
     for size in (1e-3, 1e-4, 1e-5):
         keyframes = size * rng.normal(size=(problem.n_keyframes, 6)) * ~problem.fixed[:, None]
@@ -75,7 +75,7 @@ def test_huber_is_nearer_to_the_truth_than_squares_with_outliers(make_problem: M
     problem = dataclasses.replace(problem, observations=dataclasses.replace(problem.observations, uv=uv))
     errors = {}
     for loss in ("squared", "huber"):
-        result = solve(problem, dataclasses.replace(SolverOptions(), rules=Rules(loss=loss), max_iterations=60))
+        result = solve(problem, dataclasses.replace(SolverOptions(), loss=loss, max_iterations=60))
         check(result)
         errors[loss] = float(np.sqrt(np.mean((result.state.translation - truth.translation) ** 2)))
     assert errors["huber"] < 0.25 * errors["squared"], errors
@@ -84,7 +84,7 @@ def test_huber_is_nearer_to_the_truth_than_squares_with_outliers(make_problem: M
 def test_global_and_local_parameterisation_end_at_the_same_minimum(make_problem: Make) -> None:
     problem, _ = make_problem(stereo=True)
     ends = [
-        solve(problem, dataclasses.replace(SolverOptions(), rules=Rules(parameterisation=p), function_tolerance=1e-14))
+        solve(problem, dataclasses.replace(SolverOptions(), parameterisation=p, function_tolerance=1e-14))
         for p in ("local", "global")
     ]
     assert ends[0].objective_after == pytest.approx(ends[1].objective_after, rel=1e-9)
@@ -127,8 +127,7 @@ class TestDegenerate:
     def test_all_points_behind(self, method: str, cheirality: str, make_problem: Make) -> None:
         problem, truth = make_problem()
         start = dataclasses.replace(truth, points=truth.points * [1.0, 1.0, -1.0])
-        chosen = methods.options(method)
-        options = dataclasses.replace(chosen, rules=dataclasses.replace(chosen.rules, cheirality=cheirality))
+        options = dataclasses.replace(methods.options(method), cheirality=cheirality)
         check(solve(dataclasses.replace(problem, start=start), options))
 
     @pytest.mark.parametrize("method", list(methods.METHODS))
@@ -210,7 +209,7 @@ class TestLadybug:
         return bal.to_problem(bal.read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt"))
 
     def test_start_objective(self, problem: Problem) -> None:
-        assert round(Objective(problem, Rules()).value(problem.start), 2) == 850912.46
+        assert round(Objective(problem, SolverOptions()).value(problem.start), 2) == 850912.46
 
     @pytest.mark.slow
     def test_local_dinm(self, problem: Problem) -> None:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import solver
 from ba_node.core.native_kernels import NativeKernels
-from ba_node.core.objective import Rules
-from ba_node.core.options import SolverOptions
 from ba_node.core.problem import Problem, State
 
 Make = Callable[..., tuple[Problem, State]]
@@ -31,7 +30,7 @@ def large(shape: str, make_problem: Make) -> Problem:
 
 def quantities(problem: Problem, threads: int) -> dict[str, object]:
     """Return everything that the kernels compute."""
-    kernels = NativeKernels(problem, Rules(loss="huber"), threads)
+    kernels = NativeKernels(problem, SolverOptions(loss="huber", threads=threads))
     assert kernels._kernel.n_chunks > 4, "too small: one piece is all that a thread needs"
     out: dict[str, object] = {"value": kernels.linearise(problem.start), "norm": kernels.gradient_norm}
     system = kernels.damp("diag", 1e-3)
@@ -57,8 +56,8 @@ def test_every_quantity_is_the_same_for_any_number_of_threads(shape: str, thread
 @pytest.mark.parametrize("threads", [0, 2, 3])
 def test_whole_solves_are_the_same_for_any_number_of_threads(shape: str, threads: int, make_problem: Make) -> None:
     problem = large(shape, make_problem)
-    one = solver.solve(problem, SolverOptions(backend="native"))
-    more = solver.solve(problem, SolverOptions(backend="native", threads=threads))
+    one = solver.solve(problem, SolverOptions(kernels="native"))
+    more = solver.solve(problem, SolverOptions(kernels="native", threads=threads))
     assert len(one.trace) > 3
     assert one.trace == more.trace
     assert _bits(dataclasses.astuple(one.state)) == _bits(dataclasses.astuple(more.state))
@@ -68,7 +67,7 @@ def test_whole_solves_are_the_same_for_any_number_of_threads(shape: str, threads
 def test_an_iteration_asks_for_no_memory(shape: str, make_problem: Make) -> None:
     """Neither the kernels for any, nor Python for as much as one array over the points."""
     problem = large(shape, make_problem)
-    kernels = NativeKernels(problem, Rules(loss="huber"), 2)
+    kernels = NativeKernels(problem, SolverOptions(loss="huber", threads=2))
     state, known = problem.start, []
     tracemalloc.start()
     for _ in range(4):

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import cameras, geometry, objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.core.triangulation import parallax, rays_of, triangulate
@@ -105,7 +106,7 @@ def test_parallax_of_many_views_is_at_least_half_the_largest_angle() -> None:
 def test_a_measured_depth_places_a_point_from_one_view(backend: str) -> None:
     problem = make_problem(5)
     first = take(problem, (problem.observations.camera == 0) & (problem.observations.keyframe == 0))
-    depth = objective.Objective(first, objective.Rules()).in_camera(first.start)[:, 2]
+    depth = objective.Objective(first, SolverOptions()).in_camera(first.start)[:, 2]
     obs = dataclasses.replace(first.observations, depth_m=depth, depth_sigma_m=0.02 * depth)
     found = triangulate(rays_of(dataclasses.replace(first, observations=obs)), problem.n_points, backend)
     assert found.measured.all()
@@ -161,7 +162,7 @@ def test_identical_rays_do_not_raise(backend: str) -> None:
 def test_kernels_agree(offset: float) -> None:
     problem = make_problem(9, n_pt=200, noise_px=2.0, offset=offset)
     rng = np.random.default_rng(9)
-    depth = objective.Objective(problem, objective.Rules()).in_camera(problem.start)[:, 2]
+    depth = objective.Objective(problem, SolverOptions()).in_camera(problem.start)[:, 2]
     depth *= np.where(rng.random(len(depth)) < 0.1, rng.uniform(0.9, 1.1, len(depth)), np.nan)
     obs = dataclasses.replace(problem.observations, depth_m=depth, depth_sigma_m=0.02 * depth)
     # One to eight views of each, and some with none; rays in any order.

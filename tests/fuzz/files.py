@@ -28,7 +28,6 @@ from ba_node.io.bal import BalProblem, read_bal, write_bal
 from ba_node.io.map_file import load_map, write_map
 from ba_node.io.mcap import BagReader
 from ba_node.io.parameters import configure, parameters_yaml
-from ba_node.io.ply import read_ply, write_ply
 from ba_node.io.trajectory import read_tum, write_tum
 from ba_node.offline.recording import read_truth, record
 from experiments.robustness.faults import MONO, SOUND, spoiled
@@ -95,7 +94,6 @@ READERS: dict[str, Reader] = {
     "bal_bz2": _packed(".bz2", bz2.compress),
     "bal_gz": _packed(".gz", gzip.compress),
     "bal_bz2_raw": lambda path: read_bal(path.rename(path.with_suffix(".bz2"))),
-    "ply": read_ply,
     "yaml": lambda path: configure(path, {}),
     "map": lambda path: load_map(path, Config().scene),
     "map_members": read_plain_map,
@@ -119,12 +117,11 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
     estimate = backend.solve()
     assert estimate is not None
     write_tum(folder / "a.tum", estimate.trajectory)
-    write_ply(folder / "a.ply", estimate.cloud, "map")
     write_map(folder / "a.npz", backend.snapshot())
     _write_sqlite(folder / "a.mcap", folder / "b")
     rng = np.random.default_rng(0)
     write_bal(folder / "a.txt", _bal(rng))
-    read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "ply", "npz", "txt")}
+    read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "npz", "txt")}
     yaml = parameters_yaml(Config()).encode()
     metadata = (folder / "b" / "metadata.yaml").read_bytes()
     return {
@@ -137,7 +134,6 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
         "bal_bz2": [read["txt"]],
         "bal_gz": [read["txt"]],
         "bal_bz2_raw": [bz2.compress(read["txt"])],
-        "ply": [read["ply"]],
         "yaml": [yaml, b"a: &a [1, 2]\nb: *a\nsolver: {max_iterations: 3}\n"],
         "map": [read["npz"]],
         "map_members": [_members(folder / "a.npz")],

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ba_node.core.objective import Objective, Rules, reprojection_errors
+from ba_node.config import SolverOptions
+from ba_node.core.objective import Objective, reprojection_errors
 from ba_node.io.bal import BalError, BalProblem, from_state, read_bal, to_problem, write_bal
 
 if TYPE_CHECKING:
@@ -188,7 +189,7 @@ def test_ladybug_objective_by_the_core(shared_data: Path) -> None:
     bal = read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt")
     problem = to_problem(bal)
     problem.check()
-    value = Objective(problem, Rules(cheirality="keep")).value(problem.start)
+    value = Objective(problem, SolverOptions(cheirality="keep")).value(problem.start)
     assert f"{value:.2f}" == "850912.46", value
     errors = reprojection_errors(problem, problem.start)
     in_front = np.isfinite(errors).all(axis=1)

@@ -183,6 +183,26 @@ def test_a_folder_is_for_one_process(tmp_path: Path) -> None:
         assert names(folder) == [], "a lock leaves nothing behind"
 
 
+def test_a_folder_that_was_made_for_nothing_goes_again(tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    for folder in (tmp_path / "a" / "b", tmp_path / "old"):
+        with pytest.raises(FileNotFoundError), locked_folder(folder):
+            (folder / "none").unlink()
+        assert names(tmp_path) == ["old"]
+    (tmp_path / "old" / "result").touch()
+    with pytest.raises(FileNotFoundError), locked_folder(tmp_path / "old"):
+        (tmp_path / "none").unlink()
+    assert names(tmp_path) == ["old"]
+
+
+def test_a_folder_where_a_file_is_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    for folder in (tmp_path / "a", tmp_path / "a" / "b" / "c"):
+        with pytest.raises(NotADirectoryError, match="is no folder: results need one") as caught, locked_folder(folder):
+            pytest.fail("there is no such folder")
+        assert caught.value.filename == str(tmp_path / "a")
+
+
 def test_only_regular_files_are_opened_to_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", Path("/dev/zero"), Path("/dev/stdin")):

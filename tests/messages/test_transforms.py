@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ba_node.core import geometry
-from ba_node.estimate import Correction, Estimate
+from ba_node.estimate import Correction, Estimate, Transform
 from ba_node.io.ros_types import ROSBAGS_FACTORY as FACTORY
 from ba_node.messages.transforms import StaticTree, covariance_messages, tf_message
-from ba_node.window.correction import Transform
 
 
 def test_tf_says_where_odom_stands_in_the_map() -> None:

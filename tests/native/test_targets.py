@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from ba_node import native
+from ba_node.config import SolverOptions
 from ba_node.core import native_kernels
 from ba_node.core.consensus import agreeing
 from ba_node.core.factors import RelativePoses
 from ba_node.core.linear import PcgLimits
 from ba_node.core.native_factors import NativeFactorSum
-from ba_node.core.objective import Rules
 from ba_node.core.problem import Problem
 from ba_node.core.triangulation import rays_of, triangulate
 from tests.core.conftest import Spec, make
@@ -53,7 +53,7 @@ def solution(x: np.ndarray | None) -> np.ndarray:
 
 def of_kernels(problem: Problem) -> Quantities:
     """Return everything that the kernels say about a problem at its start, and after one step."""
-    kernels = native_kernels.make(problem, Rules(loss="huber", loss_scale=1.5), "native")
+    kernels = native_kernels.make(problem, SolverOptions(loss="huber", loss_scale_px=1.5, kernels="native"))
     kernel = kernels._kernel  # type: ignore[attr-defined]
     out: Quantities = {"objective": np.array(kernels.linearise(problem.start))}
     out["d_c"], out["d_p"] = kernels.diagonals()

@@ -43,6 +43,23 @@ def test_each_thing_is_a_line() -> None:
     ]
 
 
+def test_a_cause_is_said_once() -> None:
+    setup = {"setup": "depth_m in millimetres (over 5 pairs): change depth_m"}
+    reason = "the set-up contradicts the tracks: depth_m in millimetres"
+    nothing = {"keyframes_refined": 0, "unrefined": reason, "solves_by_status": {"HELD": 8, "SKIPPED": 1}}
+    told = "nothing was refined: 8 of 9 solves held; the front-end's poses stand"
+    assert attention(_report(warnings=setup, **nothing)) == [setup["setup"], told]
+    held = {"held": "a solution was held: too little parallax"}
+    assert attention(_report(warnings=held, **{**nothing, "unrefined": "too little parallax"})) == [held["held"], told]
+    assert attention(_report(**{**nothing, "unrefined": "one keyframe only", "solves_by_status": {"SKIPPED": 9}})) == [
+        "nothing was refined: one keyframe only; the front-end's poses stand"
+    ]
+
+
+def test_keyframes_that_were_left_are_no_fault_by_themselves() -> None:
+    assert attention(_report(keyframes_refined=38, unrefined="keyframes 0 to 11: no parallax")) == []
+
+
 def test_a_result_that_is_worse_than_its_input_is_said() -> None:
     worse = {"median_px": {"input": 0.4, "refined": 0.9}, "bounded_px": {"input": 1.0, "refined": 1.02}}
     assert attention(_report(**worse)) == [

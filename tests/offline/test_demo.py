@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
+from tests.ply import read_ply
 
 pytest.importorskip("ba_msgs")
 demo = pytest.importorskip("ba_node.offline.demo", reason="needs ROS 2")

@@ -19,7 +19,6 @@ from ba_node.estimate import Poses
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.bal import read_bal
 from ba_node.io.mcap import BagReader
-from ba_node.io.ply import read_ply
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
@@ -28,6 +27,7 @@ from ba_node.offline.bal_timeline import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
+from tests.ply import read_ply
 
 BAGS = sorted((Path(__file__).resolve().parents[2] / "bags").glob("*.mcap"))
 REPRODUCIBLE = ("trajectory.tum", "trajectory_input.tum", "points.ply", "refined.mcap", "effective.yaml")

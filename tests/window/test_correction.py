@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from ba_node.config import FramesConfig
 from ba_node.core import geometry
-from ba_node.window.correction import MapCorrection, Move, Transform
+from ba_node.estimate import Transform
+from ba_node.window.correction import MapCorrection, Move
 
 S = 1_000_000_000
 IDENTITY = Transform(np.eye(3), np.zeros(3))

@@ -10,7 +10,6 @@ longer the current one: after a reset, another map, or a new session.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import threading
 import time
@@ -22,21 +21,20 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import GoalEvent, GoalStatus
 from rclpy.qos import QoSProfile
 
-from ba_node.core.methods import METHODS
-from ba_node.core.result import Status
+from ba_node.config import find
+from ba_node.estimate import Status
 from ba_node.messages.commands import ACTION_TYPES
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Owed
-from ba_node.window import full, quality
 
 if TYPE_CHECKING:
-    from ba_node.backend import Backend
-    from ba_node.core.result import Iteration
-    from ba_node.estimate import Estimate
+    from ba_node.backend import Backend, Optimization
+    from ba_node.estimate import Estimate, Iteration
 
 _NAME = "optimize"
+_METHODS = find("solver.method").choices
 _GONE = "the map was reset or replaced meanwhile"
 # Feedback comes in bursts where iterations are short.
 _FEEDBACK_DEPTH = 100
@@ -100,8 +98,8 @@ class Optimize(Component):
             reason = CLEANED_UP
         elif self._goal is not None and not self._goal.owed.given:
             reason = "another goal is at work: cancel it, or wait for its result"
-        elif request.method and request.method not in METHODS:
-            reason = f"method = {request.method!r}: choose one of {', '.join(METHODS)}"
+        elif request.method and request.method not in _METHODS:
+            reason = f"method = {request.method!r}: choose one of {', '.join(_METHODS)}"
         elif not (math.isfinite(request.time_budget_s) and request.time_budget_s >= 0.0):
             reason = f"time_budget_s = {request.time_budget_s}: expected seconds, or 0 for no limit"
         return reason
@@ -135,55 +133,53 @@ class Optimize(Component):
     def _copy(self, backend: Backend, goal: _Goal) -> None:
         """Copy the map, on the solver's thread."""
         with goal.owed.at_work():
-            taken = full.copy(backend.scene, backend.config)
+            taken = backend.begin_optimization()
             if isinstance(taken, str):
                 goal.end(Status.SKIPPED, taken)
                 return
             # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
             threading.Thread(target=self._solve, args=(backend, goal, taken), name=_NAME, daemon=False).start()
 
-    def _solve(self, backend: Backend, goal: _Goal, taken: full.Copy) -> None:
+    def _solve(self, backend: Backend, goal: _Goal, taken: Optimization) -> None:
         """Solve the copy, on a thread of its own."""
         with goal.owed.at_work():
-            solved = self._solved(backend, goal, taken)
-            goal.result = _figures(taken, solved)
+            taken = self._solved(backend, goal, taken)
+            goal.result = taken.statistics()
             if goal.stop:
                 goal.end(Status.SKIPPED, goal.stop)
             else:
-                self.host.inbox.post(lambda backend: self._merge(backend, goal, taken, solved))
+                self.host.inbox.post(lambda backend: self._merge(backend, goal, taken))
 
-    def _solved(self, backend: Backend, goal: _Goal, taken: full.Copy) -> full.Solved:
+    def _solved(self, backend: Backend, goal: _Goal, taken: Optimization) -> Optimization:
         request = goal.handle.request
         out_of_time = False
 
         def watch(row: Iteration) -> bool:
             nonlocal out_of_time
             self.host.relay.call(lambda: self._tell(goal, row, goal.elapsed_s))
-            if backend.scene is not taken.scene:
+            if not backend.is_current(taken):
                 goal.stop = goal.stop or _GONE
             out_of_time = 0.0 < request.time_budget_s <= goal.elapsed_s
             return not (goal.stop or goal.owed.given or out_of_time)
 
-        chosen = full.options(self.host.config.solver, request.method, request.max_iterations)
-        solved = taken.solve(chosen, clock=time.perf_counter, on_iteration=watch)
-        if out_of_time and solved.result.status is Status.MAX_ITERATIONS:
-            text = f"stopped after {request.time_budget_s:g} s"
-            return solved._replace(result=dataclasses.replace(solved.result, reason=text))
-        return solved
+        choices = (self.host.config.solver, request.method, request.max_iterations)
+        taken.solve(*choices, clock=time.perf_counter, on_iteration=watch)
+        if out_of_time and taken.status is Status.MAX_ITERATIONS:
+            return taken.with_result(reason=f"stopped after {request.time_budget_s:g} s")
+        return taken
 
-    def _merge(self, backend: Backend, goal: _Goal, taken: full.Copy, solved: full.Solved) -> Estimate | None:
+    def _merge(self, backend: Backend, goal: _Goal, taken: Optimization) -> Estimate | None:
         """Put the result in, on the solver's thread; what it returns is published."""
         with goal.owed.at_work():
-            merged = None if goal.stop or goal.owed.given else backend.merge(taken, solved)
-            result = solved.result
+            merged = None if goal.stop or goal.owed.given else backend.merge(taken)
             if merged is None:
-                lost = result.status.usable
-                reason = (goal.stop or backend.refusal or _GONE) if lost else result.reason
+                lost = taken.status.usable
+                reason = (goal.stop or backend.refusal or _GONE) if lost else taken.reason
                 held = lost and not goal.stop and backend.refusal
-                goal.end(Status.HELD if held else Status.SKIPPED if lost else result.status, reason)
+                goal.end(Status.HELD if held else Status.SKIPPED if lost else taken.status, reason)
                 return None
             estimate, goal.result["followed_keyframes"] = merged
-            goal.end(result.status, result.reason)
+            goal.end(taken.status, taken.reason)
             return estimate
 
     def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:
@@ -229,10 +225,3 @@ def _end_state(handle: Any, event: Any) -> int:
 
 def _never(_handle: Any) -> None:
     raise AssertionError("goals are executed by the threads of this module")
-
-
-def _figures(taken: full.Copy, solved: full.Solved) -> dict[str, Any]:
-    """Return what the result tells of a solve."""
-    figures = quality.figures(taken.selection, solved.result, solved.norms)
-    names = ("method", "iterations", "objective_before", "objective_after", "rms_px_before", "rms_px_after")
-    return {name: figures[name] for name in (*names, "keyframes", "landmarks", "observations")}

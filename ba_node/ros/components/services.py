@@ -22,10 +22,8 @@ from ba_node.ros.rclpy_compat.deferred import LateService, Owed
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ba_node import archive
-    from ba_node.backend import Backend
+    from ba_node.backend import Backend, MapContent
     from ba_node.estimate import Estimate
-    from ba_node.scene.map_content import MapContent
 
 _PAUSED = "paused"
 
@@ -43,7 +41,7 @@ class Services(Component):
 
     def _reset(self, _request: Any, answer: Owed) -> None:
         def reset(backend: Backend) -> Estimate:
-            keyframes = len(backend.scene.keyframes)
+            keyframes = backend.map.keyframe_count
             backend.reset()
             text = f"forgot {keyframes} keyframes; the next keyframe begins a new map"
             answer.give_later(success=True, message=text)
@@ -78,7 +76,7 @@ class Services(Component):
             text = f"cannot write {path}: {error.strerror or error}; nothing was saved"
             answer.give_later(success=False, message=text)
             return
-        counts = _counts(content)
+        counts = content.sizes()
         answer.give_later(success=True, message=f"{path}: {_told(counts)}", **counts)
 
     def _load(self, request: Any, answer: Owed) -> None:
@@ -96,10 +94,9 @@ class Services(Component):
 
         def take_over(backend: Backend) -> Estimate:
             backend.take_over(known)
-            counts = _known(known)
-            session = known.scene.session_id or 0
-            text = f"{path}: {_told(counts)} of session {session}"
-            answer.give_later(success=True, message=text, **counts, session_id=session)
+            counts = known.sizes()
+            text = f"{path}: {_told(counts)} of session {backend.map.session_id}"
+            answer.give_later(success=True, message=text, **counts, session_id=backend.map.session_id)
             return backend.estimate()
 
         self._post(answer, take_over)
@@ -133,23 +130,6 @@ class Services(Component):
                 action()
 
         threading.Thread(target=guarded, name="map file", daemon=daemon).start()
-
-
-def _counts(content: MapContent) -> dict[str, int]:
-    return {
-        "keyframes": len(content.arrays["keyframes/keyframe_id"]),
-        "landmarks": len(content.arrays["landmarks/track_id"]),
-        "observations": len(content.arrays["sightings/keyframe"]),
-    }
-
-
-def _known(known: archive.Known) -> dict[str, int]:
-    scene = known.scene
-    return {
-        "keyframes": len(scene.keyframes),
-        "landmarks": len(scene.landmarks),
-        "observations": len(scene.sightings),
-    }
 
 
 def _told(counts: dict[str, int]) -> str:

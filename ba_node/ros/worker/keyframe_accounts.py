@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from ba_node.scene.scene import Scene
+    from ba_node.backend import CurrentMap
 
 Key = tuple[int, int]
 
@@ -55,31 +55,29 @@ class Ledger:
         self._unrefined.discard((session_id, keyframe_id))
         self.rejected += 1
 
-    def settle(self, scene: Scene, refined: Collection[int], held: Collection[Key] = ()) -> None:
+    def settle(self, current: CurrentMap, refined: Collection[int], held: Collection[Key] = ()) -> None:
         """Close the accounts of a solve.
 
         Args:
-            scene: the map after it.
+            current: the map after it.
             refined: ids of those that took part, if it is usable.
             held: session and id of those that the map does not have yet.
         """
         n_solved = 0
         for key in [key for key in self._unsolved if key not in held]:
-            row = scene.find_keyframe(key[1]) if key[0] == scene.session_id else None
-            if row is None:
+            solved = current.is_solved(*key)
+            if solved is None:
                 self.forgotten += 1
-            elif scene.keyframes.solved[row]:
+            elif solved:
                 n_solved += 1
             else:
                 continue
             del self._unsolved[key]
         self.solved += min(n_solved, 1)
         self.coalesced += max(n_solved - 1, 0)
-        here = {key for key in self._unrefined if key[0] == scene.session_id and key not in held}
+        here = {key for key in self._unrefined if key[0] == current.session_id and key not in held}
         took_part = {key for key in here if key[1] in refined}
         self.refined += len(took_part)
         self._unrefined = {
-            key
-            for key in self._unrefined - took_part
-            if key in held or (key[0] == scene.session_id and scene.find_keyframe(key[1]) is not None)
+            key for key in self._unrefined - took_part if key in held or current.is_solved(*key) is not None
         }

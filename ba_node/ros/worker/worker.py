@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ba_node.backend import Backend
-    from ba_node.core.result import Iteration
+    from ba_node.estimate import Iteration
     from ba_node.ros.worker.inbox import Arrival, Inbox
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
@@ -181,12 +181,12 @@ class Worker:
 
     def _solve(self) -> None:
         start_s = self._clock()
-        before = int(self._backend.scene.keyframes.solved.sum())
+        before = self._backend.map.solved_count
         arrived_s = self._arrival_s(start_s)
         self._budget.begin(arrived_s, 1e-3 * self._backend.config.node.latency_budget_ms)
         estimate = self._backend.solve(on_iteration=self._goes_on)
         self._budget.end()
-        n_solved = int(self._backend.scene.keyframes.solved.sum()) - before
+        n_solved = self._backend.map.solved_count - before
         lag = self._lag.update(start_s, self._clock(), n_solved, estimate, self._backend.config)
         if lag:
             self._put(Notice("falling_behind", lag))
@@ -209,7 +209,7 @@ class Worker:
         report, ledger = estimate.report, self._ledger
         refined = set(estimate.refined.keyframe_id.tolist()) if report.status.usable else set()
         held = {(one.session_id, one.keyframe_id) for one in self._backend.held}
-        ledger.settle(self._backend.scene, refined, held)
+        ledger.settle(self._backend.map, refined, held)
         budget_ms = self._backend.config.node.latency_budget_ms
         spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
         report = dataclasses.replace(

@@ -11,7 +11,6 @@ import numpy as np
 import ba_node
 from ba_node.core.geometry import so3_log
 from ba_node.core.methods import METHODS
-from ba_node.core.objective import Rules
 from ba_node.core.result import Iteration
 from ba_node.core.solver import solve
 from experiments.benchmarks.problem_file import case_problem, write_state
@@ -23,8 +22,10 @@ def main() -> None:
     args, case = arguments(__doc__)
     options = dataclasses.replace(
         METHODS["auto"],
-        rules=Rules(loss=args.loss, loss_scale=args.scale, cheirality="keep"),
-        backend=args.config or "native",
+        loss=args.loss,
+        loss_scale_px=args.scale,
+        cheirality="keep",
+        kernels=args.config or "native",
         threads=args.threads,
         max_iterations=args.iterations,
         function_tolerance=args.tolerance,

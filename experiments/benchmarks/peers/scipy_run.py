@@ -10,8 +10,9 @@ import scipy.optimize
 import scipy.sparse
 from numpy.typing import NDArray
 
+from ba_node.config import SolverOptions
 from ba_node.core.geometry import so3_log
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from ba_node.core.problem import State
 from experiments.benchmarks.problem_file import Case, case_problem, write_state
 from experiments.benchmarks.trace import Recorder, arguments
@@ -29,7 +30,7 @@ class _Functions:
     def __init__(self, case: Case, huber: float | None) -> None:
         self.problem = case_problem(case)
         self.huber = huber
-        self.objective = Objective(self.problem, Rules(cheirality="keep"))
+        self.objective = Objective(self.problem, SolverOptions(cheirality="keep"))
         self.size = case.size
         self.free = np.flatnonzero(~self.problem.fixed)
         obs = self.problem.observations

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ba_node.core.objective import Objective, Rules
+from ba_node.config import SolverOptions
+from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem
 from experiments.benchmarks.floor import work
 from experiments.benchmarks.generators import loop, sphere, window
@@ -23,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def rms_px(problem: Problem) -> float:
-    errors = Objective(problem, Rules()).errors(problem.start)
+    errors = Objective(problem, SolverOptions()).errors(problem.start)
     assert np.isfinite(errors).all(), "a point starts behind its camera"
     return float(np.sqrt(np.mean(errors**2)))
 

@@ -55,7 +55,7 @@ def test_a_table_whose_times_are_compared_uses_one_kind_of_kernels(experiment: E
     if not any(QUANTITIES[name].is_time for name in experiment.columns):
         return
     compared = [case.task for case in experiment.cases if not case.label.endswith("C++")]
-    backends = {task.options().backend for task in compared if isinstance(task, Run)}
+    backends = {task.options().kernels for task in compared if isinstance(task, Run)}
     assert len(backends) <= 1, backends
 
 

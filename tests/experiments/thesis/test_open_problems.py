@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ba_node.config import SolverOptions
 from ba_node.core import linear, reduced, scaling
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.objective import Objective, Rules
+from ba_node.core.objective import Objective
 from ba_node.core.solver import solve
 from ba_node.io.bal import to_problem
 from ba_node.offline.solver_settings import solver_options
@@ -42,14 +43,14 @@ def test_m_as_it_stands_is_that_of_the_matrix_without_scaling(kind: str) -> None
     options = solver_options("dinm", [f"preconditioner={kind}"])
     found = {}
     for kernels in (UnscaledPreconditioner, NumpyKernels):
-        made = kernels(problem, options.rules, options.demands)
+        made = kernels(problem, options)
         made.linearise(problem.start)
         system = made.damp("identity", 10.0)
         scale = 1.0 / system.gather(*scaling.scaled_space("inc", made.diagonals()))
         r = np.random.default_rng(0).normal(size=len(system.rhs))
         found[kernels] = reduced.preconditioner(kind, system, scale)(r)
         plain = system.dense()
-    own = NumpyKernels(problem, options.rules, options.demands)
+    own = NumpyKernels(problem, options)
     own.linearise(problem.start)
     standing = reduced.preconditioner(kind, own.damp("identity", 10.0), np.ones_like(scale))(r)
     np.testing.assert_allclose(found[UnscaledPreconditioner], standing, rtol=1e-6)
@@ -60,7 +61,7 @@ def test_m_as_it_stands_is_that_of_the_matrix_without_scaling(kind: str) -> None
 class TestCure:
     def test_points_that_nothing_holds_leave_the_equations(self) -> None:
         problem = posed(SMALL).problem
-        rules = Rules(loss="truncated_quadratic", loss_scale=20.0)
+        rules = SolverOptions(loss="truncated_quadratic", loss_scale_px=20.0)
         plain, cured = NumpyKernels(problem, rules), Cured(problem, rules)
         assert plain.linearise(problem.start) == cured.linearise(problem.start), "the objective counts all"
         left = lone(problem, Objective(problem, rules).linearise(problem.start))
@@ -71,7 +72,7 @@ class TestCure:
 
     def test_mu_has_a_floor(self) -> None:
         problem = posed(SMALL).problem
-        cured = Cured(problem, Rules())
+        cured = Cured(problem, SolverOptions())
         cured.linearise(problem.start)
         assert (cured.damp("identity", 1e-30).dense() == cured.damp("identity", MU_FLOOR).dense()).all()
 
@@ -103,7 +104,7 @@ class TestCalibration:
     def test_shared_steps_are_those_of_the_tied_equations(self) -> None:
         """By another route: columns of f, k1 and k2 of the dense J added up over the images."""
         problem = one_calibration(posed(ONE).problem)
-        h, g = FORMS["explicit dense"](problem, Objective(problem, Rules()).linearise(problem.start))
+        h, g = FORMS["explicit dense"](problem, Objective(problem, SolverOptions()).linearise(problem.start))
         n, rest = problem.n_keyframes, 3 * problem.n_points
         tie = np.zeros((9 * n + rest, 6 * n + 3 + rest))
         for k in range(n):
@@ -112,7 +113,7 @@ class TestCalibration:
         tie[9 * n :, 6 * n + 3 :] = np.eye(rest)
         h = np.asarray(h) + np.eye(len(g))
         expected = tie @ np.linalg.solve(tie.T @ h @ tie, -tie.T @ g)
-        kernels = SharedIntrinsics(problem, Rules())
+        kernels = SharedIntrinsics(problem, SolverOptions())
         kernels.linearise(problem.start)
         system = kernels.damp("identity", 1.0)
         x = system.solve_dense()
@@ -127,7 +128,7 @@ class TestCalibration:
         assert given.truth is not None
         options = solver_options("lma_cd", ["linear_solver=dense", "function_tolerance=1e-12", "max_iterations=100"])
         shared_problem = one_calibration(given.problem)
-        kernels = SharedIntrinsics(shared_problem, options.rules, options.demands)
+        kernels = SharedIntrinsics(shared_problem, options)
         known = solve(known_calibration(given.problem, given.truth), options)
         shared, free = solve(shared_problem, options, kernels=kernels), solve(shared_problem, options)
         own = shared.state.intrinsics
@@ -163,7 +164,7 @@ def test_a_system_by_other_kernels_is_solved_with_them() -> None:
             return super().damp(kind, mu)
 
     options = solver_options("lma_cd", ["max_iterations=3"])
-    result = solve(problem, options, kernels=Counted(problem, options.rules, options.demands))
+    result = solve(problem, options, kernels=Counted(problem, options))
     assert len(asked) == 3 and result.objective_after == solve(problem, options).objective_after
     assert linear.cholesky(np.eye(2), np.ones(2)).x is not None
 

@@ -1,10 +1,9 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Front-ends of others: the examples of docs/front_end.md, and ba_adapter, into the node over a real middleware."""
+"""Front-ends of others: those of examples/, and ba_adapter, into the node over a real middleware."""
 
 from __future__ import annotations
 
-import array
 import contextlib
 import os
 import re
@@ -19,9 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 
-from ba_node.core import geometry
 from ba_node.messages.factory import header_message, pose_message
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -30,72 +27,22 @@ from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 
-ROOT = Path(__file__).resolve().parents[3]
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 STUBS = Path(__file__).resolve().parent / "stubs"
 FACTORY = RclpyFactory()
 StartNode = Callable[..., Any]
 MakePeer = Callable[..., Any]
 
 
-def _example(language: str) -> str:
-    """Return the code of a language in the page."""
-    (code,) = re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "front_end.md").read_text(), re.DOTALL)
-    return str(code)
-
-
-@pytest.fixture(scope="module")
-def mono() -> SyntheticData:
-    options = SyntheticOptions(seed=4, keyframes=6, length_m=10.0, path="line", baseline_m=0.0, outlier_share=0.0)
-    return generate(options)
-
-
-def test_the_python_example_feeds_the_node(start_node: StartNode, make_peer: MakePeer, mono: SyntheticData) -> None:
-    names: dict[str, Any] = {}
-    exec(compile(_example("python"), "docs/front_end.md", "exec"), names)
-    start_node()
-    peer = make_peer()
-    peer.listen("report", "refined_keyframes")
-    context = rclpy.Context()
-    rclpy.init(args=[], context=context)
-    front_end = names["FrontEnd"](*mono.rig.intrinsics[0].tolist(), context=context)
-    try:
-        peer.publishers = {"keyframes": front_end.keyframes, "feature_tracks": front_end.tracks}
-        peer.connect()
-        for keyframe, (image,) in zip(mono.keyframes, mono.tracks, strict=True):
-            stamp = header_message(FACTORY, keyframe.stamp_ns, "").stamp
-            ids, u, v = (
-                array.array(code, values.tolist())
-                for code, values in (("Q", image.track_id), ("f", image.uv[:, 0]), ("f", image.uv[:, 1]))
-            )
-            # Without a rig the camera is the body.
-            place = mono.rig.position[0], geometry.matrix_from_quaternion(mono.rig.orientation[0])
-            turn = geometry.matrix_from_quaternion(keyframe.orientation)
-            turn, at = geometry.compose(turn, keyframe.position, place[1], place[0])
-            pose = at.tolist(), geometry.quaternion_from_matrix(turn).tolist()
-            front_end.send(keyframe.keyframe_id, stamp, *pose, ids, u, v)
-        wanted = set(range(len(mono.keyframes)))
-        peer.until(lambda: _refined(peer) >= wanted, f"keyframes {sorted(wanted)}")
-    finally:
-        front_end.destroy_node()
-        rclpy.try_shutdown(context=context)
-
-
-def test_the_examples_are_short() -> None:
-    for language in ("python", "cpp"):
-        lines = [line for line in _example(language).splitlines() if line.strip()]
-        assert len(lines) <= 36, f"{language}: {len(lines)} lines"
-
-
-MAIN = """
-int main() {
-  FrontEnd front_end({500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0});
-  ba_msgs::msg::Keyframe keyframe;
-  keyframe.keyframe_id = 1;
-  ba_msgs::msg::FeatureTracks tracks;
-  tracks.track_id = {7};
-  front_end.send(keyframe, tracks);
-}
-"""
+def test_the_python_example_feeds_the_node(start_node: StartNode) -> None:
+    node = start_node()
+    command = [sys.executable, str(EXAMPLES / "front_end.py")]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert run.returncode == 0, run.stdout + run.stderr
+    before, after = (float(value) for value in re.findall(r": ([0-9.]+) m from the truth", run.stdout))
+    assert after < 0.8 * before, run.stdout
+    assert "20 of 20 keyframes came back" in run.stdout
+    assert node.stop() == 0
 
 
 def test_the_cpp_example_compiles_against_the_messages(tmp_path: Path) -> None:
@@ -104,9 +51,9 @@ def test_the_cpp_example_compiles_against_the_messages(tmp_path: Path) -> None:
     compiler = shutil.which(os.environ.get("CXX", "c++"))
     if prefix is None or compiler is None:
         pytest.skip("no C++ headers of ba_msgs, or no C++ compiler")
-    (tmp_path / "front_end.cpp").write_text(_example("cpp") + MAIN)
+    source = str(EXAMPLES / "front_end.cpp")
     include = [f"-I{folder}" for folder in (prefix / "include").iterdir() if folder.is_dir()]
-    command = [compiler, "-std=c++17", "-Wall", "-Werror", "front_end.cpp", "-o", "front_end", f"-I{STUBS}", *include]
+    command = [compiler, "-std=c++17", "-Wall", "-Werror", source, "-o", "front_end", f"-I{STUBS}", *include]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
     assert subprocess.run([tmp_path / "front_end"], check=False).returncode == 0
@@ -116,7 +63,7 @@ def test_the_cpp_example_builds_with_rclcpp(tmp_path: Path) -> None:
     header = next((p for p in _prefixes() if (p / "include" / "rclcpp").is_dir()), None)
     if header is None:
         pytest.skip("rclcpp is not installed here (the wheels bring rclpy alone)")
-    (tmp_path / "front_end.cpp").write_text(_example("cpp") + "\nint main() { return 0; }\n")
+    shutil.copy(EXAMPLES / "front_end.cpp", tmp_path)
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(front_end CXX)\nfind_package(rclcpp REQUIRED)\n"
         "find_package(ba_msgs REQUIRED)\nadd_executable(front_end front_end.cpp)\n"

@@ -6,7 +6,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,25 @@ from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.worker import Account, Notice, Output, Worker
+
+
+class FakeMap:
+    """What the worker asks of the map."""
+
+    session_id = 0
+
+    def __init__(self, backend: FakeBackend) -> None:
+        self._backend = backend
+
+    @property
+    def solved_count(self) -> int:
+        return len(self._backend.window) - len(self._backend.unsolved)
+
+    def is_solved(self, session_id: int, keyframe_id: int) -> bool | None:
+        known = [keyframe for keyframe in self._backend.window if keyframe.keyframe_id == keyframe_id]
+        if session_id != 0 or not known:
+            return None
+        return all(known[0] is not other for other in self._backend.unsolved)
 
 
 class FakeBackend:
@@ -41,9 +59,7 @@ class FakeBackend:
         self.fail: str = ""
         self.status = Status.CONVERGED
         self.config = Config()
-        self.scene: Any = SimpleNamespace(
-            keyframes=SimpleNamespace(solved=np.zeros(0, bool)), session_id=0, find_keyframe=self._row
-        )
+        self.map = FakeMap(self)
         self.while_solving: Callable[[Callable[[Any], bool]], None] = lambda _: None
 
     @property
@@ -69,17 +85,6 @@ class FakeBackend:
         self.added.append(measurement)
         self.unsolved.append(measurement)
         self.window.append(measurement)
-        self._mark()
-
-    def _mark(self) -> None:
-        """Keep the table of the scene: which keyframes a solve was made for."""
-        self.scene.keyframes.solved = np.array(
-            [all(keyframe is not other for other in self.unsolved) for keyframe in self.window]
-        )
-
-    def _row(self, keyframe_id: int) -> int | None:
-        ids = [keyframe.keyframe_id for keyframe in self.window]
-        return ids.index(keyframe_id) if keyframe_id in ids else None
 
     @property
     def due(self) -> tuple[int, int] | None:
@@ -96,7 +101,6 @@ class FakeBackend:
         self.while_solving(on_iteration)
         newest = self.unsolved[: self.at_once][-1]
         self.unsolved = self.unsolved[self.at_once :]
-        self._mark()
         n = len(self.window)
         poses = Poses(
             np.array([k.keyframe_id for k in self.window], np.uint64),
@@ -322,7 +326,6 @@ def test_every_keyframe_is_accounted_for() -> None:
     (report,) = reports(rig.step())
     assert (report.received, report.solved, report.coalesced, report.waiting) == (10, 2, 2, 2)
     rig.backend.window.remove(rig.backend.unsolved.pop())
-    rig.backend._mark()
     (report,) = reports(rig.step())
     assert (report.solved, report.coalesced, report.waiting, report.dropped_keyframes) == (3, 2, 0, 4), (
         "12 is forgotten"

@@ -42,11 +42,11 @@ Enum named(const std::array<const char*, N>& names, const std::string& name, con
   throw py::value_error(std::string(what) + " '" + name + "': the C++ kernels have " + known);
 }
 
-inline Loss loss_named(const py::object& name) {
-  return named<Loss>(std::array{"squared", "huber", "cauchy"}, name.cast<std::string>(), "loss");
+inline Loss loss_named(const std::string& name) {
+  return named<Loss>(std::array{"squared", "huber", "cauchy"}, name, "loss");
 }
-inline Cheirality cheirality_named(const py::object& name) {
-  return named<Cheirality>(std::array{"keep", "constant", "drop"}, name.cast<std::string>(), "cheirality");
+inline Cheirality cheirality_named(const std::string& name) {
+  return named<Cheirality>(std::array{"keep", "constant", "drop"}, name, "cheirality");
 }
 inline Preconditioner preconditioner_named(const std::string& name) {
   return named<Preconditioner>(std::array{"none", "schur_block", "schur_diag", "b_block", "b_diag"}, name,

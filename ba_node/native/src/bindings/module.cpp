@@ -89,13 +89,14 @@ Array<bool> agreeing(const py::object& rays, py::ssize_t n_points, double gate) 
   return agrees;
 }
 
-Kernel* make_kernel(const py::object& problem, const py::object& cost, const std::tuple<Ints, Ints>& factor_pairs,
-                    int threads) {
+// cost: loss, its scale and cheirality.
+Kernel* make_kernel(const py::object& problem, const std::tuple<std::string, double, std::string>& cost,
+                    const std::tuple<Ints, Ints>& factor_pairs, int threads) {
   const ProblemArrays arrays(problem);
+  const auto& [loss, scale, cheirality] = cost;
   KernelArguments arguments;
   arguments.problem = arrays.view();
-  arguments.cost = {loss_named(cost.attr("loss")), cost.attr("loss_scale").cast<double>(),
-                    cheirality_named(cost.attr("cheirality"))};
+  arguments.cost = {loss_named(loss), scale, cheirality_named(cheirality)};
   arguments.start = arrays.start.view();
   const auto& [row, column] = factor_pairs;
   arguments.factors.row.assign(row.data(), row.data() + row.size());
@@ -246,7 +247,7 @@ RelativePoseFactors* make_relative_poses(const py::object& factors, const Ints& 
   view.rotation = rotation.data();
   view.translation = translation.data();
   view.root_information = root_information.data();
-  view.loss = loss_named(factors.attr("loss"));
+  view.loss = loss_named(factors.attr("loss").cast<std::string>());
   view.loss_scale = factors.attr("loss_scale").cast<double>();
   return target->make_relative_poses(view);
 }

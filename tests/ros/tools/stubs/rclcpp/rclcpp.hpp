@@ -1,11 +1,12 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 
-// As much of rclcpp as the example of docs/front_end.md uses, with the same signatures: where rclcpp is not installed,
-// the example is still held against the real messages.
+// As much of rclcpp as examples/front_end.cpp uses, with the same signatures: where rclcpp is not installed, the
+// example is still held against the real messages.
 
 #pragma once
 
+#include <builtin_interfaces/msg/time.hpp>
 #include <cstddef>
 #include <memory>
 #include <string>
@@ -28,11 +29,22 @@ class Publisher {
 class Node {
  public:
   explicit Node(const std::string&) {}
+  builtin_interfaces::msg::Time now() { return builtin_interfaces::msg::Time(); }  // there: a Time that converts to it
 
   template <typename Message>
   typename Publisher<Message>::SharedPtr create_publisher(const std::string&, const QoS&) {
     return std::make_shared<Publisher<Message>>();
   }
 };
+
+class WallRate {
+ public:
+  explicit WallRate(double) {}
+  bool sleep() { return true; }
+};
+
+inline void init(int, char**) {}
+inline bool ok() { return true; }
+inline bool shutdown() { return true; }
 
 }  // namespace rclcpp

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status, Transform
 from ba_node.scene import snapshot
 from ba_node.scene.map_content import MapContent, prefixed, require, require_all, within
 from ba_node.scene.tables import Column
-from ba_node.window.correction import MapCorrection, Transform
+from ba_node.window.correction import MapCorrection
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -60,6 +60,15 @@ class Known:
     settled: bool
     delivered: tuple[int, ...]
     solve_count: int
+
+    def sizes(self) -> dict[str, int]:
+        """Return how many keyframes, landmarks and observations there are."""
+        scene = self.scene
+        return {
+            "keyframes": len(scene.keyframes),
+            "landmarks": len(scene.landmarks),
+            "observations": len(scene.sightings),
+        }
 
 
 def pack(known: Known) -> MapContent:
@@ -142,10 +151,6 @@ def _report_from(content: MapContent) -> SolveReport:
             name = facts.fact(field.name, str)
             require(name in Status.__members__, f"status = {name!r}, expected one of {', '.join(Status.__members__)}")
             values[field.name] = Status[name]
-        elif field.name == "warnings":
-            lines = facts.fact(field.name, list)
-            require(all(type(line) is str for line in lines), f"warnings = {lines!r}, expected texts")
-            values[field.name] = tuple(lines)
         else:
             default = field.default
             values[field.name] = facts.fact(field.name, (int, float) if type(default) is float else type(default))

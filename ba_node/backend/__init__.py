@@ -1,0 +1,30 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
+
+from ba_node.backend.archive import Known
+from ba_node.backend.backend import FINISHED_KEPT, Admitted, Backend, Check
+from ba_node.backend.current_map import CurrentMap
+from ba_node.backend.optimization import Optimization
+from ba_node.backend.replay import MapEnded
+from ba_node.backend.summary import MapSummary
+from ba_node.check.diagnosis import Diagnosis, Row
+from ba_node.check.two_view import available as can_examine
+from ba_node.scene.map_content import MapContent, MapError
+
+__all__ = [
+    "FINISHED_KEPT",
+    "Admitted",
+    "Backend",
+    "Check",
+    "CurrentMap",
+    "Diagnosis",
+    "Known",
+    "MapContent",
+    "MapEnded",
+    "MapError",
+    "MapSummary",
+    "Optimization",
+    "Row",
+    "can_examine",
+]

@@ -1,0 +1,402 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Take measurements in, give refined estimates out: what the node and the offline tools both use.
+
+A keyframe is complete when as many cameras delivered tracks for it as for the keyframes before it, when a newer one
+came, or when :meth:`Backend.flush` says so. The node drains its inbox and then solves once, for the newest::
+
+    for measurement in waiting:
+        backend.add(measurement)
+    if backend.ready:
+        publish(backend.solve())
+
+A replay solves once for every keyframe, however the messages are spaced, just before the next one begins::
+
+    for told in backend.replay(recording):
+        if isinstance(told, Estimate):
+            write(told)
+
+When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
+stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
+due again if it was not refined without them. A higher session id begins a new map with the same rig; the last estimate
+of the one before is kept in ``finished``. So do keyframes far older than the newest, as when a recording is played
+again; their session id stays as the front-end has it. A keyframe that is odd is held until others tell what it was, see
+``scene/sessions.py``; then several are taken in at once.
+
+Nothing here reads a clock: the caller passes one, for the report alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter, deque
+from typing import TYPE_CHECKING
+
+from ba_node.backend import archive
+from ba_node.backend.completion import Completion
+from ba_node.backend.current_map import CurrentMap
+from ba_node.backend.optimization import Optimization
+from ba_node.backend.replay import MapEnded, replay
+from ba_node.backend.summary import MapSummary, summary_of
+from ba_node.check.examine import examine
+from ba_node.check.tracks import tracks_of
+from ba_node.check.watch import Check, SetUpWatch
+from ba_node.estimate import Estimate, Extras, SolveReport
+from ba_node.measurements import CameraRig, Keyframe, Measurement
+from ba_node.scene import ingest
+from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
+from ba_node.scene.frame_names import check_name
+from ba_node.scene.scene import Scene
+from ba_node.scene.sessions import Sessions
+from ba_node.window import full, guard, quality
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from ba_node.check.diagnosis import Diagnosis
+    from ba_node.config import Config
+    from ba_node.core.problem import Cameras
+    from ba_node.estimate import Iteration
+    from ba_node.scene.map_content import MapContent
+
+__all__ = ["FINISHED_KEPT", "Admitted", "Backend", "Check"]
+
+FINISHED_KEPT = 8
+_REFUSED_KEPT = 1000
+
+
+def _no_clock() -> float:
+    return 0.0
+
+
+class Backend:
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise on no data whatever.
+
+    Attributes:
+        map: the current map.
+        finished: session id and last estimate of the sessions before, oldest first, the last few.
+        solve_count: solves since the beginning.
+        jumps: sessions that began although the front-end did not raise the session id.
+        jump_note: the last of these in words.
+        refused: the last keyframes that were turned away.
+        extras: what the next solve is to work out beside the estimate.
+        setup: the check of the set-up; while it gives a reason, every solve is held.
+        refusal: why the last solve of everything was held, in words; empty if it was not.
+    """
+
+    def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
+        """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
+        self.map = CurrentMap(config, Scene(config.scene), 0)
+        self.finished: list[tuple[int, Estimate]] = []
+        self.solve_count = 0
+        self.jumps = 0
+        self.jump_note = ""
+        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
+        self.extras = Extras()
+        self.setup = SetUpWatch()
+        self.refusal = ""
+        self._clock = clock
+        self._sessions = Sessions()
+
+    @property
+    def config(self) -> Config:
+        """Return all parameters; they change with :meth:`configure`."""
+        return self.map.config
+
+    @property
+    def map_index(self) -> int:
+        """Return the number of the current map; it rises when another takes its place, whatever the session ids."""
+        return self.map.index
+
+    @property
+    def scene(self) -> Scene:
+        """Return the tables of the current map."""
+        return self.map.scene
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Return what was turned away in this session, by reason (``rejections.REASONS``)."""
+        return self.scene.log.rejected
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what somebody has to know or mend, in words."""
+        return tuple(self.scene.log.warnings.values())
+
+    @property
+    def report(self) -> SolveReport:
+        """Return the report of the last solve, with what has been turned away since."""
+        counts = dict(sorted(self.rejected.items()))
+        return dataclasses.replace(
+            self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.warnings
+        )
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the stamp of the newest keyframe, 0 before the first."""
+        return self.map.stamp_ns
+
+    @property
+    def notices(self) -> Counter[str]:
+        """Return what was unusual but used in this session, by kind (``rejections.NOTICES``)."""
+        return self.scene.log.notices
+
+    @property
+    def rejection_notes(self) -> deque[str]:
+        """Return the last rejections in words, oldest first."""
+        return self.scene.log.notes
+
+    @property
+    def ready(self) -> bool:
+        """Return True if a complete keyframe has not been solved yet."""
+        return len(self.map.completion.due(self.scene)) > 0
+
+    @property
+    def due(self) -> tuple[int, int] | None:
+        """Return session and id of the newest keyframe that the next solve is for, None if it is for none."""
+        rows = self.map.due()
+        if self.scene.session_id is None or not len(rows):
+            return None
+        return self.scene.session_id, int(self.scene.keyframes.keyframe_id[rows[-1]])
+
+    def configure(self, config: Config) -> None:
+        """Take new parameters, from the next solve and the next measurement on."""
+        self.map.config = config
+        self.scene.config = config.scene
+
+    @property
+    def held(self) -> list[Keyframe]:
+        """Return the keyframes that wait for others to tell what they are."""
+        return self._sessions.held
+
+    def completes(self, what: Measurement | Admitted) -> bool:
+        """Return True if adding this would begin a new keyframe (or session) while the last one is unsolved."""
+        if isinstance(what, CameraRig) or self.scene.keyframes.solved.all():
+            return False
+        admitted = (what,) if isinstance(what, Admitted) else self._sessions.decide(self.scene, what).admitted
+        return any(self._is_new(one) for one in admitted)
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in a measurement; what cannot be used is counted in ``rejected``."""
+        for admitted in self.admit(measurement):
+            self.take(admitted)
+
+    def admit(self, measurement: Measurement) -> tuple[Admitted, ...]:
+        """Return what is to be taken in now, in order: nothing while a keyframe is held, several once that is over."""
+        decision = self._sessions.decide(self.scene, measurement)
+        self._sessions.commit(measurement, decision)
+        return self._decided(decision)
+
+    def admit_rest(self) -> tuple[Admitted, ...]:
+        """Return what is to be taken in of all that is held, as nothing more will come."""
+        decision = self._sessions.end(self.scene)
+        self._sessions.commit(None, decision)
+        return self._decided(decision)
+
+    def take(self, admitted: Admitted) -> None:
+        """Take in what :meth:`admit` returned."""
+        measurement = admitted.measurement
+        if isinstance(measurement, CameraRig) and self.config.frames.poses_of == "camera":
+            measurement = ingest.seen_from_first(measurement)
+        if admitted.begins is not None:
+            assert isinstance(measurement, Keyframe)
+            self._begin(measurement.session_id, admitted.begins)
+        if not isinstance(measurement, Keyframe):
+            self.scene.add(measurement)
+            return
+        is_new = self._is_new(admitted)
+        self.scene.add(measurement)
+        if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
+            self.refused.append(measurement)
+            return
+        check_name(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
+        self.map.completion.begin(self.scene, measurement.keyframe_id)
+
+    def flush(self, final: bool = False) -> None:
+        """Call the newest keyframe complete with what has come, and let a session begin that the front-end asked for.
+
+        Args:
+            final: nothing more will come: give up on what waits for its keyframe or for the rig.
+        """
+        self.map.completion.closed = True
+        if final:
+            rest = self.admit_rest()
+        else:
+            decision = self._sessions.settle(self.scene)
+            self._sessions.commit(None, decision)
+            rest = self._decided(decision)
+        for admitted in rest:
+            self.take(admitted)
+        if rest:
+            self.map.completion.closed = True
+        if final:
+            self.scene.end_pending()
+
+    def solve(self, on_iteration: Callable[[Iteration], bool] | None = None) -> Estimate | None:
+        """Refine the newest window; None while there is no keyframe.
+
+        Args:
+            on_iteration: called with each iteration; returning False ends the solve after it.
+
+        Returns:
+            The estimate. After a failed or skipped solve poses and points are as before, and the report says why.
+        """
+        if len(self.scene.keyframes) == 0:
+            return None
+        wrong = self.setup.look(self.scene) if self.config.guard.check_setup else ""
+        self.solve_count += 1
+        return self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
+
+    def replay(self, stream: Iterable[Measurement]) -> Iterator[Estimate | Keyframe | MapEnded]:
+        """Take in a stream to its end, with a solve for every keyframe, just before the next one begins.
+
+        Yields:
+            Every estimate; every keyframe that the map has now, as it came; and what became of a map when another one
+            took its place, before the first keyframe of that.
+        """
+        return replay(self, stream)
+
+    def take_check(self, check: Check) -> Estimate | None:
+        """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
+        if check.scene is not self.scene or not self.setup.take(check):
+            return None
+        self.map.hold_all(self.solve_count, self.setup.reason(self.scene))
+        return self.estimate()
+
+    def examine(self) -> Diagnosis | None:
+        """Return what the tracks of the map tell about the set-up; None if there is nothing to look at.
+
+        Raises:
+            ImportError: OpenCV is missing.
+        """
+        tracks = tracks_of(self.scene)
+        return None if tracks is None else examine(tracks)
+
+    def summary(self, scene: Scene | None = None) -> MapSummary:
+        """Return what there is to tell of the map, or of one that it has taken the place of."""
+        return summary_of(scene or self.scene, self.config)
+
+    def estimate(self) -> Estimate:
+        """Return all that is known, with the report of the last solve."""
+        return self.map.estimate()
+
+    def optimize(self) -> Estimate | None:
+        """Refine all keyframes and points that are kept; return what is known then, None if nothing came of it."""
+        begun = self.begin_optimization()
+        if isinstance(begun, str):
+            return None
+        begun.solve(self.config.solver)
+        merged = self.merge(begun)
+        return merged[0] if merged else None
+
+    def begin_optimization(self) -> Optimization | str:
+        """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
+        taken = full.copy(self.scene, self.config)
+        return taken if isinstance(taken, str) else Optimization(taken)
+
+    def is_current(self, optimization: Optimization) -> bool:
+        """Return True if a solve of everything is of the current map."""
+        return optimization.snapshot.scene is self.scene
+
+    def merge(self, optimization: Optimization) -> tuple[Estimate, int] | None:
+        """Put the result of a solve of everything into the map, see ``window/full.py``.
+
+        Returns:
+            What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
+        """
+        taken, result = optimization.snapshot, optimization.result
+        self.refusal = ""
+        if not result.status.usable or not result.state.is_finite():
+            return None
+        found = taken.outcome(result.state, self.config)
+        verdict = guard.judge(self.config, taken.selection, found)
+        self.refusal = self.setup.reason(self.scene) or ("" if verdict.odd else verdict.reason)
+        if self.refusal:
+            self.map.hold(f"a solve of everything: {self.refusal}")
+            return None
+        assert found.state is not None
+        followed = full.put(self.scene, self.config, taken, found.state)
+        if followed is None:
+            return None
+        self.solve_count += 1
+        newest = int(self.scene.order[-1])
+        figures = quality.figures(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
+        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **figures)
+        self.map.correct(newest)
+        return self.estimate(), followed
+
+    def reset(self) -> None:
+        """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
+        self.finished = []
+        self._sessions.reset()
+        self._renew(None, self.scene.next_cameras or self.scene.cameras)
+        self.map.report = SolveReport(reason="reset: the map is empty")
+
+    def snapshot(self) -> MapContent:
+        """Return a copy of all that is known, for a file; see docs/map_format.md."""
+        return archive.pack(
+            archive.Known(
+                self.scene,
+                self.finished,
+                self.map.report,
+                self.map.correction,
+                self.map.completion.row(self.scene),
+                self.map.completion.closed,
+                tuple(self.map.completion.delivered),
+                self.solve_count,
+            )
+        )
+
+    def take_over(self, known: archive.Known) -> None:
+        """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
+
+        Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.
+        """
+        known.scene.config = self.config.scene
+        self.map = CurrentMap(self.config, known.scene, self.map_index + 1)
+        self.map.report, self.map.correction = known.report, known.correction
+        self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
+        self.finished = known.finished[-FINISHED_KEPT:]
+        newest = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
+        self.map.completion = Completion(newest, known.settled, known.delivered)
+        self.solve_count = max(self.solve_count, known.solve_count)
+
+    def _decided(self, decision: Decision) -> tuple[Admitted, ...]:
+        for refusal in decision.refused:
+            self.scene.refuse(refusal)
+            if isinstance(refusal.measurement, Keyframe):
+                self.refused.append(refusal.measurement)
+        return decision.admitted
+
+    def _is_new(self, admitted: Admitted) -> bool:
+        """Return True if a keyframe (or a session) begins with it."""
+        one = admitted.measurement
+        if not isinstance(one, Keyframe) or admitted.begins is not None:
+            return admitted.begins is not None
+        of_current = self.scene.session_id in (None, one.session_id)
+        return of_current and self.scene.find_keyframe(one.keyframe_id) is None
+
+    def _begin(self, session_id: int, begin: Begin) -> None:
+        before = self.scene
+        waiting = Scene(self.config.scene, session_id)
+        if before.session_id == session_id:
+            waiting.take_waiting(before)
+        if len(before.keyframes) and not begin.replaces:
+            assert before.session_id is not None
+            before.end_pending()
+            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.rejected.items())))
+            self.finished.append((before.session_id, self.map.estimate()))
+            del self.finished[:-FINISHED_KEPT]
+        self._renew(session_id, before.next_cameras or before.cameras)
+        self.scene.pending = waiting.pending
+        if begin.replaces:
+            refuse_lone(before, self.scene.log)
+        if begin.kind:
+            self.scene.log.warn(begin.kind, begin.text)
+            self.jumps += 1
+            self.jump_note = begin.text
+
+    def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
+        scene = Scene(self.config.scene, session_id)
+        scene.cameras, scene.refused_rig = cameras, self.scene.refused_rig
+        self.map = CurrentMap(self.config, scene, self.map_index + 1)

@@ -1,0 +1,249 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""One map and what solves have made of it; another takes its place when a session begins."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ba_node import window
+from ba_node.backend.completion import Completion, end_of_solve, reached
+from ba_node.core import geometry
+from ba_node.estimate import Correction, Estimate, Extras, SolveReport, Status, Transform
+from ba_node.measurements import Keyframe
+from ba_node.window import extras, quality
+from ba_node.window.attempt import attempt
+from ba_node.window.correction import MapCorrection
+from ba_node.window.known import cloud_of, poses_of, taking_part_of
+from ba_node.window.trust import Trust
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.config import Config
+    from ba_node.core.problem import State
+    from ba_node.estimate import Iteration
+    from ba_node.scene.scene import Scene
+    from ba_node.scene.tables import IntArray
+
+# The front-end's frame where neither it nor the parameters name one.
+_ODOM_FRAME = "odom"
+
+
+class CurrentMap:
+    """The map of one session, with the report, the correction map -> odom and the trust that belong to it.
+
+    Attributes:
+        config: all parameters.
+        scene: what is known.
+        index: number of the map.
+        completion: which keyframes are complete.
+        report: of the last solve.
+        correction: map from odom.
+    """
+
+    def __init__(self, config: Config, scene: Scene, index: int) -> None:
+        """Take up a scene of which nothing was solved."""
+        self.config, self.scene, self.index = config, scene, index
+        self.completion = Completion()
+        self.report = SolveReport(reason="not solved yet")
+        self.correction = MapCorrection()
+        self._trust = Trust()
+
+    @property
+    def session_id(self) -> int:
+        """Return the session, 0 before the first message that names one."""
+        return self.scene.session_id or 0
+
+    @property
+    def keyframe_count(self) -> int:
+        """Return how many keyframes there are."""
+        return len(self.scene.keyframes)
+
+    @property
+    def solved_count(self) -> int:
+        """Return how many keyframes were solved and need no other solve."""
+        return int(np.count_nonzero(self.scene.keyframes.solved))
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the stamp of the newest keyframe, 0 before the first."""
+        return int(self.scene.keyframes.stamp_ns[self.scene.order[-1]]) if len(self.scene.order) else 0
+
+    @property
+    def odom_frame(self) -> str:
+        """Return the name of the front-end's fixed frame."""
+        return self.config.frames.odom_frame or self.scene.frame_id or _ODOM_FRAME
+
+    def is_solved(self, session_id: int, keyframe_id: int) -> bool | None:
+        """Return whether a keyframe was solved; None if it is not known here."""
+        row = self.scene.find_keyframe(keyframe_id) if session_id == self.scene.session_id else None
+        return None if row is None else bool(self.scene.keyframes.solved[row])
+
+    def refined_keyframes(self) -> set[int]:
+        """Return the ids of the keyframes that took part in a usable solve."""
+        table = self.scene.keyframes
+        return set(table.keyframe_id[table.refined].tolist())
+
+    def input_keyframes(self) -> list[Keyframe]:
+        """Return the keyframes as the front-end sent them, in order of arrival."""
+        table = self.scene.keyframes
+        orientation = geometry.quaternion_from_matrix(table.input_rotation)
+        rows = zip(table.keyframe_id.tolist(), table.stamp_ns.tolist(), table.input_position, orientation, strict=True)
+        return [
+            Keyframe(self.session_id, key, stamp_ns, self.scene.frame_id, position, quaternion)
+            for key, stamp_ns, position, quaternion in rows
+        ]
+
+    def due(self) -> IntArray:
+        """Return the rows of complete keyframes that were not solved and that the next solve refines, oldest first."""
+        due = self.completion.due(self.scene)
+        return reached(self.scene, due, self._end(due))
+
+    def solve(
+        self,
+        solve_count: int,
+        wrong: str,
+        wanted: Extras,
+        clock: Callable[[], float],
+        on_iteration: Callable[[Iteration], bool] | None,
+    ) -> Estimate:
+        """Refine the newest window.
+
+        Args:
+            solve_count: number of this solve.
+            wrong: why all solutions are held; empty if they are not.
+            wanted: what to work out beside the estimate.
+            clock: seconds, for the report alone.
+            on_iteration: called with each iteration; returning False ends the solve after it.
+        """
+        due = self.completion.due(self.scene)
+        end = self._end(due)
+        taking_part = window.rows_of(self.scene, self.config, end)
+        extra: dict[str, Any] = {}
+        selection, state = None, None
+        if wrong:
+            self.hold_all(solve_count, wrong)
+        else:
+            selection, state = self._solve((solve_count, int(taking_part[-1])), end, clock, on_iteration)
+        if selection is not None:
+            taking_part = taking_part_of(self.scene, selection)
+            if state is not None:
+                self.correct(int(taking_part[-1]))
+                extra = extras.work_out(wanted, self.scene, self.config, selection, state, taking_part)
+        self.scene.keyframes.solved[reached(self.scene, due, end)] = True
+        return dataclasses.replace(self.estimate(taking_part), **extra)
+
+    def _solve(
+        self,
+        which: tuple[int, int],
+        end: int,
+        clock: Callable[[], float],
+        on_iteration: Callable[[Iteration], bool] | None,
+    ) -> tuple[window.Selection | None, State | None]:
+        """Solve the newest window and report; return what was solved, and the solution if it was taken.
+
+        ``which`` is the number of the solve and the row of its newest keyframe, for the report.
+        """
+        tried = attempt(self.scene, self.config, end, self._trust, clock=clock, on_iteration=on_iteration)
+        if isinstance(tried, str):
+            self.report = dataclasses.replace(self.base_report(*which), reason=tried)
+            return None, None
+        selection, (norms, state, _) = tried.selection, tried.found
+        for stray in selection.strays:
+            text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
+            if text:
+                self.scene.log.warn("stray", text)
+        if tried.held:
+            self.hold(tried.held)
+            state = None
+        elif state is not None:
+            norms = window.put(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
+            self.scene.keyframes.refined[list(tried.without)] = False
+        figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
+        if tried.held:
+            figures |= {"status": Status.HELD, "reason": tried.held}
+        self.report = dataclasses.replace(self.base_report(*which), **figures, solve_time_s=tried.solve_time_s)
+        return selection, state
+
+    def hold(self, reason: str) -> None:
+        """Say that a solution is held; give up what was taken of a young map if many are."""
+        text = f"a solution was held, the front-end's poses stand: {reason}"
+        if self._trust.lost and self._young():
+            self.scene.forget_solutions()
+            self.correction = MapCorrection()
+            text = f"solutions are held, and what was taken before is given up: {reason}"
+        self.scene.log.warn("held", text)
+
+    def _young(self) -> bool:
+        """Return True while no more was refined than two windows hold."""
+        return int(np.count_nonzero(self.scene.keyframes.refined)) <= 2 * self.config.window.max_keyframes
+
+    def hold_all(self, solve_count: int, reason: str) -> None:
+        """Report that the set-up is wrong; the front-end's poses stand, and its frame is the map's."""
+        newest = int(self.scene.order[-1])
+        report = self.base_report(solve_count, newest)
+        self.report = dataclasses.replace(report, status=Status.HELD, reason=reason)
+        self.correction = MapCorrection()
+        self.correct(newest)
+
+    def correct(self, row: int) -> None:
+        """Let the correction map -> odom follow what was found at a keyframe, and tell its size in the report."""
+        self.scene.settle_poses()
+        table = self.scene.keyframes
+        found = Transform(*self.scene.corrections(np.array(row)))
+        body = Transform(table.input_rotation[row], table.input_position[row])
+        move = self.correction.update(self.config.frames, found, body, int(table.stamp_ns[row]))
+        self.report = dataclasses.replace(
+            self.report, correction_m=move.distance_m, correction_rad=move.angle_rad, correction_held=move.held
+        )
+
+    def base_report(self, solve_count: int, newest: int) -> SolveReport:
+        """Return what a report tells of any solve, by the row of its newest keyframe."""
+        return SolveReport(
+            session_id=self.session_id,
+            solve_count=solve_count,
+            newest_keyframe_id=int(self.scene.keyframes.keyframe_id[newest]),
+            method=self.config.solver.method,
+            rejected=dict(sorted(self.scene.log.rejected.items())),
+            warnings=tuple(self.scene.log.warnings.values()),
+        )
+
+    def rms_px(self, state: str = "refined") -> float:
+        """Return the root mean square reprojection error per coordinate over all observations of the map, px.
+
+        Outliers count too; tracks with fewer than two views do not, nor do points without a position.
+
+        Args:
+            state: ``refined``, or ``input`` for the front-end's poses and guesses (without a guess: triangulated).
+        """
+        return quality.rms_px(self.scene, self.config, state)
+
+    def estimate(self, refined: IntArray | None = None) -> Estimate:
+        """Return all that is known, the refined keyframes being those in some rows, or all."""
+        scene = self.scene
+        scene.settle_poses()
+        trajectory = poses_of(scene, scene.order)
+        return Estimate(
+            stamp_ns=self.stamp_ns,
+            frame_id=self.config.frames.map_frame,
+            refined=trajectory[scene.places()[scene.order if refined is None else refined]],
+            trajectory=trajectory,
+            cloud=cloud_of(scene, scene.landmark_order),
+            report=self.report,
+            correction=self._published(),
+            map_index=self.index,
+        )
+
+    def _published(self) -> Correction | None:
+        transform = self.correction.published
+        if transform is None:
+            return None
+        orientation = geometry.quaternion_from_matrix(transform.rotation)
+        return Correction(self.odom_frame, transform.translation, orientation)
+
+    def _end(self, due: IntArray) -> int:
+        return end_of_solve(self.scene, due, self.config.window.max_keyframes)

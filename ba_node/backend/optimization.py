@@ -1,0 +1,98 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Solve everything that is kept: on a snapshot of the map, on any thread, while the back-end goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from ba_node.estimate import Status
+from ba_node.window import full, quality
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ba_node.config import SolverConfig
+    from ba_node.core.result import Result
+    from ba_node.estimate import Iteration
+
+_TOLD = (
+    "method",
+    "iterations",
+    "objective_before",
+    "objective_after",
+    "rms_px_before",
+    "rms_px_after",
+    "keyframes",
+    "landmarks",
+    "observations",
+)
+
+
+def _no_clock() -> float:
+    return 0.0
+
+
+class Optimization:
+    """One solve of everything: made by ``Backend.begin_optimization``, and put into the map by ``Backend.merge``.
+
+    Attributes:
+        snapshot: the problem of what was kept when it was made.
+        solved: what came of it, None before :meth:`solve`.
+    """
+
+    def __init__(self, snapshot: full.Copy) -> None:
+        """Take a snapshot."""
+        self.snapshot = snapshot
+        self.solved: full.Solved | None = None
+
+    def solve(
+        self,
+        config: SolverConfig,
+        method: str = "",
+        max_iterations: int = 0,
+        *,
+        clock: Callable[[], float] = _no_clock,
+        on_iteration: Callable[[Iteration], bool] | None = None,
+    ) -> None:
+        """Solve; the map is not touched.
+
+        Args:
+            config: parameters of the solver.
+            method: in place of that of the parameters, if it is not empty.
+            max_iterations: likewise, if it is not 0.
+            clock: seconds, for the report alone.
+            on_iteration: called with each iteration; returning False ends the solve after it.
+        """
+        chosen = full.options(config, method, max_iterations)
+        self.solved = self.snapshot.solve(chosen, clock=clock, on_iteration=on_iteration)
+
+    @property
+    def result(self) -> Result:
+        """Return what the solver gave back."""
+        assert self.solved is not None, "solve() comes first"
+        return self.solved.result
+
+    @property
+    def status(self) -> Status:
+        """Return why the solve stopped."""
+        return self.result.status
+
+    @property
+    def reason(self) -> str:
+        """Return the same in words."""
+        return self.result.reason
+
+    def with_result(self, **changes: Any) -> Optimization:
+        """Return the same with another result of the solver: other words, for example, for why it stopped."""
+        assert self.solved is not None, "solve() comes first"
+        other = Optimization(self.snapshot)
+        other.solved = self.solved._replace(result=dataclasses.replace(self.result, **changes))
+        return other
+
+    def statistics(self) -> dict[str, Any]:
+        """Return how the solve went, by the names of a report."""
+        assert self.solved is not None, "solve() comes first"
+        figures = quality.figures(self.snapshot.selection, self.result, self.solved.norms)
+        return {name: figures[name] for name in _TOLD}

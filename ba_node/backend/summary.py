@@ -1,0 +1,73 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Count what is in a map, and say how well it explains its observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.window import quality
+
+if TYPE_CHECKING:
+    from ba_node.config import Config
+    from ba_node.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class MapSummary:
+    """What there is to tell of a map.
+
+    Attributes:
+        session_id: the session, None before the first message that names one.
+        frame_id: name of the front-end's fixed frame, empty if it has none.
+        cameras: number of cameras; 0 before a rig came that can be used.
+        refused_rig: why the last rig that was refused was, empty if none was.
+        keyframes: number of keyframes.
+        refined: those that took part in a usable solve.
+        landmarks: number of tracks.
+        observations: number of observations.
+        outliers: those that sit out the next solve.
+        residuals: of the states ``input`` and ``refined``, figures as of ``window.quality.summary``.
+        rejected: what was turned away, by reason.
+        notices: what was unusual but used, by kind.
+        rejection_notes: the last rejections in words, oldest first.
+        warnings: what somebody has to know or mend, by kind.
+    """
+
+    session_id: int | None
+    frame_id: str
+    cameras: int
+    refused_rig: str
+    keyframes: int
+    refined: int
+    landmarks: int
+    observations: int
+    outliers: int
+    residuals: dict[str, dict[str, float | int | None]]
+    rejected: dict[str, int]
+    notices: dict[str, int]
+    rejection_notes: list[str]
+    warnings: dict[str, str]
+
+
+def summary_of(scene: Scene, config: Config) -> MapSummary:
+    """Return the summary of a scene."""
+    return MapSummary(
+        session_id=scene.session_id,
+        frame_id=scene.frame_id,
+        cameras=0 if scene.cameras is None else len(scene.cameras.model),
+        refused_rig=scene.refused_rig,
+        keyframes=len(scene.keyframes),
+        refined=int(np.count_nonzero(scene.keyframes.refined)),
+        landmarks=len(scene.landmarks),
+        observations=len(scene.sightings),
+        outliers=int(np.count_nonzero(scene.sightings.outlier)),
+        residuals={state: quality.summary(scene, config, state) for state in quality.STATES},
+        rejected=dict(sorted(scene.log.rejected.items())),
+        notices=dict(sorted(scene.log.notices.items())),
+        rejection_notes=list(scene.log.notes),
+        warnings=dict(scene.log.warnings),
+    )

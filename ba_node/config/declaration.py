@@ -1,0 +1,184 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Declare an option: a field of a dataclass with its default, unit, range, choices and meaning.
+
+Everything else (YAML, descriptors of the node, docs, help, ``--set``) is a loop over :func:`declared`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
+from typing import Any, get_type_hints
+
+Value = bool | int | float | str
+
+
+class ConfigError(ValueError):
+    """An option that is unknown, of the wrong type, out of range, or in conflict with another."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One value of an option that is chosen by name.
+
+    Attributes:
+        name: how it is asked for.
+        doc: what it is.
+        source: equation, algorithm or table of the thesis; empty if it is not from there.
+        aliases: other names for it.
+    """
+
+    name: str
+    doc: str = ""
+    source: str = ""
+    aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One declared option.
+
+    Attributes:
+        name: for example ``max_iterations``; that of a parameter of the node has its group in front,
+            ``solver.max_iterations``.
+        kind: bool, int, float or str.
+        default: value when nothing is set.
+        doc: what it does, one sentence.
+        unit: physical unit, empty if it has none.
+        minimum: smallest allowed number, None if unbounded.
+        maximum: largest allowed number, None if unbounded.
+        allowed: what it may be, if it is chosen by name; empty if not.
+        aliases: other names of the option.
+        live: True if a change takes effect at the next solve, False if only at start.
+    """
+
+    name: str
+    kind: type
+    default: Value
+    doc: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    allowed: tuple[Choice, ...] = ()
+    aliases: tuple[str, ...] = ()
+    live: bool = True
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Return the names that it may be, empty if it is not chosen by name."""
+        return tuple(choice.name for choice in self.allowed)
+
+    @property
+    def title(self) -> str:
+        """Return what messages call it."""
+        return f"{'parameter' if '.' in self.name else 'option'} {self.name}"
+
+    def check(self, value: object) -> Value:
+        """Return the value in the declared type, or raise ConfigError. An int is accepted for a float."""
+        if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.kind:
+            raise ConfigError(
+                f"{self.title} = {value!r}: expected {self.kind.__name__},"
+                f" got {type(value).__name__} (default {self.default!r})"
+            )
+        if self.allowed and value not in self.choices:
+            raise ConfigError(f"{self.title} = {value!r}: choose one of {', '.join(self.choices)}")
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            self._check_range(value)
+        assert isinstance(value, (bool, int, float, str))
+        return value
+
+    def _check_range(self, value: float) -> None:
+        low = -math.inf if self.minimum is None else self.minimum
+        high = math.inf if self.maximum is None else self.maximum
+        if not math.isfinite(value) or not low <= value <= high:
+            raise ConfigError(
+                f"{self.title} = {value!r}: expected a number in [{low:g}, {high:g}]"
+                f"{' ' + self.unit if self.unit else ''}"
+            )
+
+    def read(self, text: str) -> Value:
+        """Return the value that a text from the command line stands for; the alias of a choice stands for its name.
+
+        Raises:
+            ConfigError: it cannot be read, or is none that the option may have.
+        """
+        value: Value = text
+        if self.kind is bool:
+            if text.lower() not in ("true", "false"):
+                raise ConfigError(f"{self.title} = {text!r}: expected true or false")
+            value = text.lower() == "true"
+        elif self.kind is not str:
+            try:
+                value = self.kind(text)
+            except ValueError:
+                raise ConfigError(f"{self.title} = {text!r}: expected {self.kind.__name__}") from None
+        return self.check(next((choice.name for choice in self.allowed if value in choice.aliases), value))
+
+
+def option(default: Value, doc: str, *, choices: Iterable[str | Choice] = (), **details: Any) -> Any:
+    """Declare a field of a dataclass as an option; ``details`` are attributes of Parameter.
+
+    ``node`` among them says that the option is a parameter of the node too, and which attributes differ there.
+    """
+    allowed = tuple(Choice(choice) if isinstance(choice, str) else choice for choice in choices)
+    return field(default=default, metadata={"default": default, "doc": doc, "allowed": allowed, **details})
+
+
+def declared(cls: type, group: str = "", *, live: bool = True) -> tuple[Parameter, ...]:
+    """Return the options of a dataclass in order.
+
+    Args:
+        cls: the dataclass; fields that are not made by :func:`option` are left out.
+        group: of parameters of the node, whose name comes before theirs; empty for options of something else.
+        live: whether a change takes effect at the next solve, where the declaration does not say.
+    """
+    kinds = get_type_hints(cls)
+    found = []
+    for item in fields(cls):
+        if not item.metadata:
+            continue
+        details = {"live": live, **item.metadata}
+        of_node = details.pop("node", {})
+        if group:
+            details |= of_node
+        found.append(Parameter(name=f"{group}.{item.name}" if group else item.name, kind=kinds[item.name], **details))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Base of options that raise ConfigError when they are made with a wrong value."""
+
+    def __post_init__(self) -> None:
+        for parameter in declared(type(self)):
+            # An int given for a float is kept as the float that check() returns.
+            object.__setattr__(self, parameter.name, parameter.check(getattr(self, parameter.name)))
+
+
+def split_assignment(text: str, example: str) -> tuple[str, str]:
+    """Return name and value of ``name=value``, or raise ConfigError with an example of what is expected."""
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise ConfigError(f"{text!r}: expected name=value, for example {example}")
+    return name, value
+
+
+# Likeness of two names, 0 to 1, from which on the one may be meant by the other.
+_ALIKE = 0.75
+
+
+def unknown(name: str, known: Iterable[str]) -> str:
+    """Return what to say of a parameter that does not exist: which others are like it, if any."""
+    names, key = list(known), name.rpartition(".")[2]
+    near = [other for other in names if "." not in name and other.rpartition(".")[2] == key]
+    near = near or difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
+    if not near:
+        keys = {other.rpartition(".")[2]: other for other in names}
+        near = [keys[other] for other in difflib.get_close_matches(key, keys, n=1, cutoff=_ALIKE)]
+    what = f"did you mean {' or '.join(map(repr, near))}?" if near else "ba params lists all"
+    return f"parameter {name!r} does not exist; {what}"
