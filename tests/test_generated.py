@@ -51,13 +51,6 @@ def test_shipped_yaml_holds_the_defaults() -> None:
     assert configure(ROOT / "config" / "ba_node.yaml", {}) == Config()
 
 
-def test_topics_are_latched_as_documented(generator: ModuleType) -> None:
-    qos = pytest.importorskip("ba_node.ros.qos", exc_type=ImportError)
-    latched = tuple(topic for topic, (service, _) in generator.OUTPUTS.items() if service == "latched")
-    assert latched == qos.LATCHED_OUTPUTS
-    assert tuple(t for t, (service, _) in generator.INPUTS.items() if "latched" in service) == qos.LATCHED_INPUTS
-
-
 def test_every_method_is_described() -> None:
     text = (ROOT / "docs" / "methods.md").read_text()
     assert [name for name in METHODS if f"`{name}`" not in text] == []

@@ -16,14 +16,13 @@ import yaml
 
 from ba_node.estimate import SolveReport
 from ba_node.io.parameters import NODE_NAME
-from ba_node.messages.conversion import OUTPUT_TYPES
 from ba_node.messages.markers import NAMESPACES
 from ba_node.messages.outputs import POINT_DTYPE
-from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
+from ba_node.messages.topics import TOPICS as DECLARED
+from ba_node.messages.topics import Delivery
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
-TOPICS = {f"/{NODE_NAME}/{topic}": kind for topic, kind in (OUTPUT_TYPES | SIDE_TYPES).items()} | SHARED_TYPES
-LATCHED = {"path", "points", "markers"}
+TOPICS = {topic.given_name.replace("~", f"/{NODE_NAME}"): topic for topic in DECLARED.values()}
 # The message that a display of rviz shows.
 SHOWS = {
     "PointCloud2": "sensor_msgs/msg/PointCloud2",
@@ -52,9 +51,9 @@ def strings(node: Any) -> Iterator[str]:
 @pytest.mark.parametrize("display", displays(), ids=lambda display: display["Name"])
 def test_rviz_shows_what_is_published(display: dict[str, Any]) -> None:
     topic = display["Topic"]["Value"]
-    assert TOPICS[topic] == SHOWS[display["Class"].split("/")[1]]
+    assert TOPICS[topic].type_name == SHOWS[display["Class"].split("/")[1]]
     kept = display["Topic"]["Durability Policy"] == "Transient Local"
-    assert kept == (topic.rsplit("/", 1)[1] in LATCHED)
+    assert kept == (TOPICS[topic].delivery is Delivery.LATCHED)
 
 
 def test_rviz_shows_every_namespace_and_an_existing_field() -> None:

@@ -19,9 +19,7 @@ from pathlib import Path
 from ba_node.config import Config, SolverOptions, Value, declared
 from ba_node.core.methods import METHODS
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
-from ba_node.messages.commands import ACTION_TYPES, SERVICE_TYPES
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
-from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
+from ba_node.messages.topics import ACTIONS, SERVICES, TOPICS, Command, Direction, Topic
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
 from experiments.robustness.page import page as robustness_page
@@ -34,45 +32,6 @@ BEGIN, END = "<!-- begin: written by `{made_by}` -->\n", "<!-- end -->\n"
 ROOT = Path(__file__).resolve().parent.parent
 LICENCE = "# Copyright 2026 The ba_node Authors\n# SPDX-License-Identifier: Apache-2.0\n"
 MADE_BY = "python tools/generate_docs.py"
-
-INPUTS = {
-    "keyframes": ("reliable", "Pose of the body at every keyframe, as the front-end has it."),
-    "feature_tracks": ("reliable", "What one camera saw in one keyframe; one message a camera."),
-    "landmark_guesses": ("reliable", "Optional: first positions of points."),
-    "camera_rig": ("latched", "Cameras and where they sit on the body. Sent once is enough."),
-    "camera_info": ("latched or not", "Instead of a rig: one camera at the body's origin."),
-}
-OUTPUTS = {
-    "refined_keyframes": ("reliable", "Poses of the window after each solve, by id."),
-    "pose": ("reliable", "The same, one message a keyframe with the keyframe's stamp."),
-    "path": ("latched", "Poses of all keyframes kept, newest `output.path_max_poses`."),
-    "points": ("latched", "The map: x, y, z (m), rms_px (float32), views (uint32)."),
-    "report": (
-        "reliable",
-        "How each solve went, failed and skipped ones too; without a solve, what was turned away.",
-    ),
-}
-SIDE_OUTPUTS = {
-    "pose_with_covariance": (
-        "reliable",
-        (
-            "As `~/pose`, with a covariance against what the solve held fixed; with a robust loss its standard"
-            " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed."
-        ),
-    ),
-    "markers": ("latched", "Frusta, links between keyframes, residual colours. Only while subscribed."),
-}
-SHARED_OUTPUTS = {
-    "/tf": ("reliable", "`map -> odom`, see docs/frames.md. Needs tf2_msgs."),
-    "/diagnostics": ("reliable", "How the node fares, once a second, see docs/diagnostics.md."),
-}
-SERVICES = {
-    "reset": "Forget the map and begin anew; the cameras stay.",
-    "pause": "`data: true`: ignore keyframes, tracks and guesses, and count them; `data: false`: go on.",
-    "save_map": "Write all that is known to a file, see docs/map_format.md.",
-    "load_map": "Put what a file holds in the place of all that is known.",
-}
-ACTIONS = {"optimize": "Refine all keyframes and points that are kept; feedback after each iteration."}
 
 TOPICS_INTRO = """\
 # Topics
@@ -108,20 +67,14 @@ defaults, the same as `config/ba_node.yaml`.
 def topics_markdown() -> str:
     """Return docs/topics.md."""
     parts = [TOPICS_INTRO]
-    for title, prefix, types, about in (
-        ("Inputs", "", INPUT_TYPES, INPUTS),
-        ("Outputs", "~/", OUTPUT_TYPES | SIDE_TYPES, OUTPUTS | SIDE_OUTPUTS),
-        ("Outputs that all of ROS shares", "", SHARED_TYPES, SHARED_OUTPUTS),
-    ):
-        if types.keys() != about.keys():
-            raise SystemExit(f"tools/generate_docs.py describes {sorted(about)}, the node has {sorted(types)}")
-        lines = [f"## {title}\n", "| topic | type | quality of service | what |", "|---|---|---|---|"]
-        lines += [
-            f"| `{prefix}{topic}` | `{kind}` | {about[topic][0]} | {about[topic][1]} |" for topic, kind in types.items()
-        ]
-        parts.append("\n".join(lines) + "\n")
-    parts.append(_commands("Services", SERVICE_TYPES, SERVICES))
-    parts.append(_commands("Action", ACTION_TYPES, ACTIONS))
+    own = [topic for topic in TOPICS.values() if not topic.is_shared]
+    parts += [
+        _topics("Inputs", [topic for topic in own if topic.direction is Direction.TAKEN]),
+        _topics("Outputs", [topic for topic in own if topic.direction is not Direction.TAKEN]),
+        _topics("Topics that all of ROS shares", [topic for topic in TOPICS.values() if topic.is_shared]),
+        _commands("Services", SERVICES),
+        _commands("Action", ACTIONS),
+    ]
     for title, folder in (("Messages", "msg"), ("Service types", "srv"), ("Action types", "action")):
         parts.append(f"## {title}\n")
         parts += [_interface(path) for path in sorted((ROOT / "msg_defs" / folder).glob(f"*.{folder}"))]
@@ -230,11 +183,20 @@ def _fields(title: str, section: str) -> str:
     return f"{head}| field | type | meaning |\n|---|---|---|\n{rows}"
 
 
-def _commands(title: str, types: dict[str, str], about: dict[str, str]) -> str:
+def _topics(title: str, topics: list[Topic]) -> str:
+    """Return a table of topics; with a column of directions where these differ."""
+    directions = len({topic.direction is Direction.TAKEN for topic in topics}) > 1
+    heads = ["topic", "type", *(["direction"] if directions else []), "quality of service", "what"]
+    lines = [f"## {title}\n", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for topic in topics:
+        cells = [f"`{topic.given_name}`", f"`{topic.type_name}`", topic.delivery.value, topic.text]
+        lines.append(f"| {' | '.join(cells[:2] + [topic.direction.value] * directions + cells[2:])} |")
+    return "\n".join(lines) + "\n"
+
+
+def _commands(title: str, commands: dict[str, Command]) -> str:
     """Return a table of services or actions."""
-    if types.keys() != about.keys():
-        raise SystemExit(f"tools/generate_docs.py describes {sorted(about)}, the node has {sorted(types)}")
-    rows = "\n".join(f"| `~/{name}` | `{kind}` | {about[name]} |" for name, kind in types.items())
+    rows = "\n".join(f"| `~/{name}` | `{command.type_name}` | {command.text} |" for name, command in commands.items())
     return f"## {title}\n\n| name | type | what |\n|---|---|---|\n{rows}\n"
 
 

@@ -42,7 +42,7 @@ class Optimization:
         solved: what came of it, None before :meth:`solve`.
     """
 
-    def __init__(self, snapshot: full.Copy) -> None:
+    def __init__(self, snapshot: full.Snapshot) -> None:
         """Take a snapshot."""
         self.snapshot = snapshot
         self.solved: full.Solved | None = None

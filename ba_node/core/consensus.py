@@ -7,7 +7,7 @@ a point far away. A candidate costs ``sum min(r^2, gate^2)`` over all rays of th
 *MLESAC*, CVIU 2000), r being the angle between ray and candidate in sigmas; behind the camera it costs the gate. The
 cheapest wins, directions before places and earlier before later. All pairs of rays are tried up to 45, that is of 10
 rays; of more rays 45 pairs that are spread over them, the same at every call. Two rays place a point less well than all
-that agree with them, so these triangulate it, and then all rays are judged once more.
+that agree with them, so these triangulate it, and then all rays are classified once more.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.config import SolverOptions
-from ba_node.core import scaling
-from ba_node.core.kernels import Kernels, Moved, System
+from ba_node.core import linear_costs, scaling
+from ba_node.core.kernels import Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.native_factors import NativeFactorSum
@@ -79,26 +79,23 @@ class NativeKernels:
         self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
-        self._system = _NativeSystem(self._kernel, self.size)
+        self._system = NativeSystem(self._kernel, self.size)
         # Where steps lead, in turn: the state that a step starts from is one of them.
         self._states = [_like(problem.start), _like(problem.start)]
-        self._moved: Moved | None = None
-
-    def graduate(self, graduation: float) -> None:
-        """Do nothing: these kernels have no truncated quadratic."""
+        self._stepped: StepResult | None = None
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        moved, self._moved = self._moved, None
-        # Polishing has seen all of it where it ended.
-        if moved is not None and state is moved.state and self._kernel.linearise_prepared():
-            value = moved.objective
+        stepped, self._stepped = self._stepped, None
+        # The inner iterations have seen all of it where they ended.
+        if stepped is not None and state is stepped.state and self._kernel.linearise_prepared():
+            value = stepped.objective
         else:
-            moved, value = None, self._kernel.linearise(state)
+            stepped, value = None, self._kernel.linearise(state)
         if self._factors is not None:
             terms = self._factors.linearise(state)
             self._kernel.add_factors(terms.diagonal, terms.gradient, terms.pairs.blocks)
-            value += terms.value if moved is None else 0.0
+            value += terms.value if stepped is None else 0.0
         self.gradient_norm = self._kernel.gradient_norm
         return value
 
@@ -107,12 +104,12 @@ class NativeKernels:
         d_c, d_p = self._kernel.diagonals()
         return d_c, d_p
 
-    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NativeSystem:
         """Add damping to the diagonals and eliminate the points."""
         self._kernel.factor(damping_c, damping_p)
         return self._system.renew()
 
-    def damp(self, kind: str, mu: float) -> System:
+    def damp(self, kind: str, mu: float) -> NativeSystem:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate the points."""
         if kind == "inc":
             d_c, d_p = scaling.diagonals(kind, self.diagonals())
@@ -120,26 +117,26 @@ class NativeKernels:
         self._kernel.damp(kind == "diag", 0.0 if kind == "none" else mu)
         return self._system.renew()
 
-    def move(self, state: State, _system: System, x: FloatArray, polish_steps: int) -> Moved:
-        """Take the step whose part in the system is x, and polish the points after it; see Kernels."""
+    def step(self, state: State, _system: System, x: FloatArray, inner_iterations: int) -> StepResult:
+        """Take the step whose part in the system is x, and the inner iterations after it; see Kernels."""
         target = self._states[self._states[0] is state]
-        predicted, damping, value, polished = self._kernel.step(state, x, polish_steps, target)
+        predicted, damping, value, inner = self._kernel.step(state, x, inner_iterations, target)
         if self._factors is not None and np.isfinite(value):
             factors = self._factors.value(target)
-            value, polished = value + factors, polished + factors
-        moved = Moved(target, predicted, damping, value, polished)
-        self._moved = moved if polish_steps and np.isfinite(polished) else None
-        return moved
+            value, inner = value + factors, inner + factors
+        stepped = StepResult(target, predicted, damping, value, inner)
+        self._stepped = stepped if inner_iterations and np.isfinite(inner) else None
+        return stepped
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
         value: float = self._kernel.objective(state)
         return value + self._value_of_factors(state)
 
-    def polish_points(self, state: State, steps: int) -> tuple[float, State]:
-        """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
-        self._moved = None
-        _before, value, points = self._kernel.inner_iterations(state, steps)
+    def iterate_points(self, state: State, iterations: int) -> tuple[float, State]:
+        """Improve every point alone by up to so many damped Newton steps; return the objective and the state."""
+        self._stepped = None
+        _before, value, points = self._kernel.inner_iterations(state, iterations)
         value += self._value_of_factors(state)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
 
@@ -153,7 +150,7 @@ def _like(state: State) -> State:
     return State(*(np.empty(array.shape) for array in arrays))
 
 
-class _NativeSystem:
+class NativeSystem:
     """The kernel's current reduced system; valid until the next linearisation or reduction."""
 
     side = "points"
@@ -167,7 +164,7 @@ class _NativeSystem:
         # These are written in every iteration; S only where it is asked for.
         self._x, self._dense = np.empty(n), np.empty((0, 0))
 
-    def renew(self) -> System:
+    def renew(self) -> NativeSystem:
         """Return the system after another reduction."""
         self._kernel.rhs(self.rhs)
         return self
@@ -199,6 +196,22 @@ class _NativeSystem:
         edges, pairs = self._kernel.pairs()
         return Sizes(len(self.rhs), self._size, edges, pairs)
 
+    def choose(self, asked: str) -> LinearSolver:
+        """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
+        sizes = self.sizes()
+        if asked in ("dense", "pcg"):
+            return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), None, None))
+        exact = asked == "cholesky"
+        limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=exact)
+        factor = self.factor_size(linear_costs.max_blocks(sizes.block), limit)
+        if asked != "sparse" or not factor.complete:
+            asked = linear_costs.cheapest(sizes, factor, exact=exact)
+        return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), sizes, factor))
+
+    def pcg_tries(self) -> int:
+        """Return how many steps of PCG to try before an exact solution."""
+        return linear_costs.pcg_tries(self.sizes())
+
     def factor_size(self, max_blocks: int, max_products: float) -> Factor:
         """Return the size of the sparse factor; found at the first call with limits that it meets."""
         complete, blocks, products = self._kernel.analyse(max_blocks, max_products)
@@ -209,7 +222,7 @@ class _NativeSystem:
         x: FloatArray | None = self._kernel.solve_sparse()
         return x
 
-    def pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
+    def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
         found, steps, on_boundary = self._kernel.pcg(scale, kind, limits, formed, self._x)
         return Solution(self._x if found else None, steps, on_boundary)
@@ -217,10 +230,6 @@ class _NativeSystem:
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d)."""
         return (self._kernel.diagonal_blocks(),)
-
-    def own_blocks(self) -> tuple[FloatArray, ...]:
-        """Refuse: PCG makes its preconditioner inside the kernels."""
-        raise KernelsError("the C++ kernels give no blocks of B away; take backend numpy")
 
     def gather(self, of_keyframes: FloatArray, _of_points: FloatArray) -> FloatArray:
         """Return what belongs to the unknowns of S out of values for all unknowns."""

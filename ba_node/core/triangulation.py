@@ -112,7 +112,7 @@ def rays_of(problem: Problem) -> Rays:
 
 
 def triangulate(rays: Rays, n_points: int, backend: str = "auto") -> Triangulation:
-    """Return the point of each group of rays. Nothing is judged here: see the parallax before believing one.
+    """Return the point of each group of rays. No ray is rejected here: look at the parallax before using a point.
 
     Args:
         rays: in any order.

@@ -17,9 +17,8 @@ import numpy as np
 
 from ba_node.io.bag_errors import BagError
 from ba_node.measurements import CameraRig
-from ba_node.messages.conversion import INPUT_TYPES
+from ba_node.messages.topics import CAMERAS, INPUT_TYPES
 
-CAMERAS = ("camera_rig", "camera_info")
 # Numbers of a camera that differ by less than this, relative or px, are the same: they may have gone through a text.
 _SAME = 1e-3
 

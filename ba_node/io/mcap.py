@@ -17,12 +17,13 @@ from ba_node.io.bag_errors import BagError, EmptyBagError
 from ba_node.io.bag_files import PACKED, find_files, unpack_file
 from ba_node.io.bag_index import MAX_CHUNK_BYTES, Message, merge_by_time
 from ba_node.io.bag_source import BagChannel, Source, open_source
-from ba_node.io.bag_topics import CAMERAS, NO_CHOICE, Chooser, Chosen, TopicChoice
+from ba_node.io.bag_topics import NO_CHOICE, Chooser, Chosen, TopicChoice
 from ba_node.io.bag_writer import BagWriter
 from ba_node.io.ros_types import ROSBAGS_FACTORY, TypeMismatchError
 from ba_node.io.unpack import ZSTD_MAGIC, unpack
 from ba_node.measurements import CameraRig, Measurement
-from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
+from ba_node.messages.conversion import measurement_from_message
+from ba_node.messages.topics import CAMERA_TYPES, CAMERAS, INPUT_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -109,9 +110,10 @@ class BagReader:
 
     def late_cameras(self) -> list[tuple[str, bytes]]:
         """Return topic and bytes of the first message of each camera topic that comes after others of the inputs."""
-        kinds = [INPUT_TYPES[name] for name in CAMERAS]
-        cameras = [topic for topic, kind in self.topics.items() if kind in kinds]
-        others = [topic for topic, kind in self.topics.items() if kind in INPUT_TYPES.values() and kind not in kinds]
+        cameras = [topic for topic, kind in self.topics.items() if kind in CAMERA_TYPES]
+        others = [
+            topic for topic, kind in self.topics.items() if kind in INPUT_TYPES.values() and kind not in CAMERA_TYPES
+        ]
         first = next((time for _, _, time, _ in self.messages(others)), None) if others else None
         found = [next(self.messages([topic]), None) for topic in cameras]
         return [(raw[0], raw[3]) for raw in found if raw is not None and first is not None and raw[2] > first]
@@ -158,7 +160,7 @@ class BagReader:
         numbers = {n for n, c in enumerate(self._channels) if (c.topic, c.type_name) in wanted}
         for number in sorted(numbers):
             self._check(number)
-        cameras = {n for n in numbers if self._channels[n].type_name in [INPUT_TYPES[name] for name in CAMERAS]}
+        cameras = {n for n in numbers if self._channels[n].type_name in CAMERA_TYPES}
         return self._measurements(numbers, self._first_cameras(cameras))
 
     def _measurements(self, numbers: Collection[int], first: Message | None) -> Iterator[tuple[str, int, Measurement]]:
@@ -207,7 +209,7 @@ class BagReader:
             raise BagError(f"{self.path}: {error}") from None
         missing = [INPUT_TYPES[name] for name in ("keyframes", "feature_tracks") if name not in chosen.taken]
         if not cameras_known and not chosen.taken.keys() & set(CAMERAS):
-            missing.append(f"{INPUT_TYPES['camera_rig']} or {INPUT_TYPES['camera_info']}")
+            missing.append(" or ".join(CAMERA_TYPES))
         if missing:
             listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there)) or "none"
             raise BagError(
@@ -341,7 +343,7 @@ class BagReader:
 
     def _other_cameras(self, topic: str, *sources: Source) -> bool:
         """Return True if files say different things of the cameras on a topic."""
-        if self.topics[topic] not in [INPUT_TYPES[name] for name in CAMERAS]:
+        if self.topics[topic] not in CAMERA_TYPES:
             return False
         found = set()
         for source in sources:

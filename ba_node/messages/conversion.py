@@ -24,7 +24,8 @@ from ba_node.messages.factory import (
     pose_message,
     stamp_ns_from_message,
 )
-from ba_node.messages.outputs import OUTPUT_TYPES, output_messages
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,15 +45,6 @@ __all__ = [
     "stamp_ns_from_message",
     "tracks_message",
 ]
-
-INPUT_TYPES = {
-    "keyframes": "ba_msgs/msg/Keyframe",
-    "feature_tracks": "ba_msgs/msg/FeatureTracks",
-    "landmark_guesses": "ba_msgs/msg/LandmarkGuesses",
-    "camera_rig": "ba_msgs/msg/CameraRig",
-    "camera_info": "sensor_msgs/msg/CameraInfo",
-}
-
 
 _NO_LENS = Lens(np.zeros(4), np.zeros(0), np.zeros(2, np.int64))
 

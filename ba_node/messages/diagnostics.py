@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ba_node.estimate import SolveReport, Status
 from ba_node.messages.factory import MessageFactory, header_message
-from ba_node.messages.topics import SHARED_TYPES
+from ba_node.messages.topics import DIAGNOSTICS, TOPICS
 
 if TYPE_CHECKING:
     from ba_node.config import Config, DiagnosticsConfig
@@ -112,7 +112,7 @@ def diagnostics_message(factory: MessageFactory, findings: list[Finding], node: 
         )
         for finding in findings
     ]
-    return factory.make(SHARED_TYPES["/diagnostics"], header=header_message(factory, stamp_ns, ""), status=statuses)
+    return factory.make(TOPICS[DIAGNOSTICS].type_name, header=header_message(factory, stamp_ns, ""), status=statuses)
 
 
 def _inputs(health: Health, limits: DiagnosticsConfig, silence_s: float) -> Finding:

@@ -12,19 +12,13 @@ import numpy as np
 from ba_node.estimate import Cloud, Estimate, SolveReport
 from ba_node.messages.factory import MessageFactory, float32, header_message
 from ba_node.messages.serialised import cloud_message, path_message, pose_messages
+from ba_node.messages.topics import OUTPUT_TYPES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ba_node.config import OutputConfig
 
-OUTPUT_TYPES = {
-    "refined_keyframes": "ba_msgs/msg/RefinedKeyframes",
-    "pose": "geometry_msgs/msg/PoseStamped",
-    "path": "nav_msgs/msg/Path",
-    "points": "sensor_msgs/msg/PointCloud2",
-    "report": "ba_msgs/msg/SolverReport",
-}
 # One point as it is published and as it is written to a file: five little-endian words.
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rms_px", "<f4"), ("views", "<u4")])
 

@@ -12,7 +12,7 @@ import numpy as np
 from ba_node.core import geometry
 from ba_node.estimate import Transform
 from ba_node.messages.factory import MessageFactory, header_message, pose_message
-from ba_node.messages.topics import SHARED_TYPES, SIDE_TYPES
+from ba_node.messages.topics import TF, TOPICS
 
 if TYPE_CHECKING:
     from ba_node.estimate import Correction, Estimate
@@ -33,7 +33,7 @@ def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, 
         child_frame_id=correction.odom_frame,
         transform=transform,
     )
-    return factory.make(SHARED_TYPES["/tf"], transforms=[stamped])
+    return factory.make(TOPICS[TF].type_name, transforms=[stamped])
 
 
 def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any]:
@@ -42,7 +42,7 @@ def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any
     poses, covariance = estimate.refined, np.nan_to_num(estimate.covariance, nan=0.0)
     return [
         factory.make(
-            SIDE_TYPES["pose_with_covariance"],
+            TOPICS["pose_with_covariance"].type_name,
             header=header_message(factory, int(poses.stamp_ns[k]), estimate.frame_id),
             pose=factory.make(
                 "geometry_msgs/msg/PoseWithCovariance",

@@ -16,9 +16,9 @@ from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.conversion import INPUT_TYPES, guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
 from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message
-from ba_node.messages.topics import TF_STATIC
+from ba_node.messages.topics import INPUT_TYPES, TF_STATIC
 from ba_node.messages.transforms import StaticTree
 
 TRUTH_TOPIC = "ground_truth/pose"

@@ -30,14 +30,14 @@ from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
-from ba_node.messages.conversion import output_messages
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import LATCHED_OUTPUTS
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.session_record import SessionRecord
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
 # leave a file that grows with the square of its length.
-_WHOLE_MAP = ("path", "points")
 _GROWTH = 0.02
 
 
@@ -195,7 +195,7 @@ class _Run:
         if not self.sessions and self.backend.map.keyframe_count:
             # A loaded map to which the recording added nothing.
             self._begin(self.backend.estimate())
-        self._close(self.backend.summary())
+        self._close(self.backend.map.summary())
 
     def _map_ended(self, ended: MapEnded) -> None:
         self._close(ended.summary)
@@ -211,7 +211,7 @@ class _Run:
             self._written = len(estimate.trajectory)
             self._write(estimate, _AllTopics())
         else:
-            self._write(estimate, _AllTopics(without=_WHOLE_MAP))
+            self._write(estimate, _AllTopics(without=LATCHED_OUTPUTS))
 
     def _begin(self, estimate: Estimate) -> None:
         session_id = self.backend.map.session_id
@@ -224,14 +224,14 @@ class _Run:
         if record is not None and not record.closed:
             record.close(summary)
             if len(record.last.trajectory) > self._written:
-                self._write(record.last, _WHOLE_MAP)
+                self._write(record.last, LATCHED_OUTPUTS)
         self._inputs = {}
 
     def _write(self, estimate: Estimate, wanted: Any) -> None:
         timeless = dataclasses.replace(estimate, report=estimate.report.without_times())
         for topic, kind, message in output_messages(ROSBAGS_FACTORY, timeless, self._config.output, wanted):
             time_ns = max(0, estimate.stamp_ns)
-            self._writer.write(f"/{NODE_NAME}/{topic}", kind, message, time_ns, latched=topic in _WHOLE_MAP)
+            self._writer.write(f"/{NODE_NAME}/{topic}", kind, message, time_ns, latched=topic in LATCHED_OUTPUTS)
 
 
 class _AllTopics:

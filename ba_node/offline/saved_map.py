@@ -35,7 +35,7 @@ class SavedMap:
 
     def facts(self) -> list[tuple[str, str]]:
         """Return name and value of what there is to tell."""
-        summary, report, poses = self.backend.summary(), self.estimate.report, self.estimate.trajectory
+        summary, report, poses = self.backend.map.summary(), self.estimate.report, self.estimate.trajectory
         span = (poses.stamp_ns[-1] - poses.stamp_ns[0]) / _NS_PER_S if len(poses) else 0.0
         way = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())
         rows = [

@@ -25,6 +25,7 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from ba_node.messages.topics import CAMERAS, Delivery, Topic
 from ba_node.ros.worker.worker import Notice
 
 if TYPE_CHECKING:
@@ -32,8 +33,7 @@ if TYPE_CHECKING:
 
 # Bursts that one solve sends: one pose for each keyframe of a window.
 OUTPUT_DEPTH = 1000
-LATCHED_OUTPUTS = ("path", "points")
-LATCHED_INPUTS = ("camera_rig", "camera_info")
+SENSOR_DATA = qos_profile_sensor_data
 OVERRIDES = "qos_overrides."
 _NAMES_S = 1.0
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
@@ -66,23 +66,16 @@ def latched(depth: int = 1) -> Any:
     )
 
 
-def for_input(topic: str, depth: int) -> tuple[Any, ...]:
-    """Return the profiles to subscribe to an input with, one subscription for each.
+def profile(topic: Topic, depth: int = OUTPUT_DEPTH) -> Any:
+    """Return the profile to publish a topic with, or to subscribe to it.
 
     A latched subscription alone does not match a camera driver, which publishes camera_info volatile and often best
-    effort; a best-effort one alone misses what was latched before the node came. Cameras are taken from both.
+    effort; one with ``SENSOR_DATA`` alone misses what was latched before the node came. Cameras are taken from both.
     """
-    if topic in LATCHED_INPUTS:
-        return latched(), qos_profile_sensor_data
-    return (reliable(depth),)
+    return reliable(depth) if topic.delivery is Delivery.RELIABLE else latched()
 
 
-def for_output(topic: str) -> Any:
-    """Return the profile to publish an output with."""
-    return latched() if topic in LATCHED_OUTPUTS else reliable(OUTPUT_DEPTH)
-
-
-def sensor_data() -> dict[str, Any]:
+def at_peace() -> dict[str, Any]:
     """Return the options of the second subscription to the cameras: not overridden, and at peace with any publisher."""
     events = SubscriptionEventCallbacks(use_default_callbacks=False)
     return {"event_callbacks": events, "qos_overriding_options": None}
@@ -100,7 +93,7 @@ def for_subscription(node: Any, topic: str, log: Callable[[Notice], None]) -> di
         text = f"{name}: {event.total_count_change} messages of {peers} were lost ({event.total_count} so far)"
         log(Notice(f"lost {name}", text))
 
-    if topic in LATCHED_INPUTS:
+    if topic in CAMERAS:
         # A driver that publishes volatile does not match this subscription but the other one, and is welcome.
         events = SubscriptionEventCallbacks(message_lost=lost, use_default_callbacks=False)
     else:

@@ -96,7 +96,7 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
     sigma = np.asarray(tracks.sigma_px, float) if len(tracks.sigma_px) else np.ones(n)
     depth = np.array(tracks.depth_m, float) if len(tracks.depth_m) else np.full(n, np.nan)
     ids = np.asarray(tracks.track_id).astype(np.uint64)
-    if _nothing_to_judge(ids, uv, sigma, depth):
+    if _nothing_to_check(ids, uv, sigma, depth):
         return dataclasses.replace(tracks, track_id=ids, uv=uv, sigma_px=sigma, depth_m=depth)
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & ~np.isinf(depth)
     with np.errstate(invalid="ignore"):
@@ -200,7 +200,7 @@ def seen_from_first(rig: CameraRig) -> CameraRig:
     )
 
 
-def _nothing_to_judge(ids: IdArray, uv: FloatArray, sigma: FloatArray, depth: FloatArray) -> bool:
+def _nothing_to_check(ids: IdArray, uv: FloatArray, sigma: FloatArray, depth: FloatArray) -> bool:
     """Return True for most messages: ids that rise, sane pixels and sigmas, no depth or only sane ones."""
     if not len(ids) or not (ids[1:] > ids[:-1]).all():
         return False

@@ -28,6 +28,7 @@ from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import FeatureTracks
 from ba_node.messages import conversion
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, output_messages
+from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.tools.domain import free_domain, isolation
@@ -74,9 +75,7 @@ class Peer:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.inputs = {
-            topic: self.node.create_publisher(
-                message_class(kind), topic, qos.latched() if topic in qos.LATCHED_INPUTS else qos.reliable(1000)
-            )
+            topic: self.node.create_publisher(message_class(kind), topic, qos.profile(TOPICS[topic]))
             for topic, kind in INPUT_TYPES.items()
             if topic != "camera_info"
         }
@@ -84,7 +83,7 @@ class Peer:
         self.received_s: dict[int, float] = {}
         self.calls_ms: list[float] = []
         for topic in topics:
-            cls, profile = message_class(OUTPUT_TYPES[topic]), qos.for_output(topic)
+            cls, profile = message_class(OUTPUT_TYPES[topic]), qos.profile(TOPICS[topic])
             if topic == "report":
                 self.node.create_subscription(cls, "ba_node/report", self._note, profile)
             else:
@@ -178,7 +177,7 @@ def conversion_times() -> list[str]:
     node = Node("converter", start_parameter_services=False, enable_rosout=False)
     lines = []
     for topic, kind in OUTPUT_TYPES.items():
-        publisher = node.create_publisher(message_class(kind), f"~/{topic}", qos.for_output(topic))
+        publisher = node.create_publisher(message_class(kind), f"~/{topic}", qos.profile(TOPICS[topic]))
 
         def build_and_publish(topic: str = topic, publisher: Any = publisher) -> None:
             for _, _, message in output_messages(_FACTORY, estimate, OutputConfig(), {topic}):

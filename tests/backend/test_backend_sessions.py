@@ -133,7 +133,7 @@ def test_a_clock_that_is_set_back_begins_a_session_with_nothing_lost(first: str)
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [8]
     assert played.ids == all_ids()[8:]
     assert not played.rejected
-    assert len(played.scene.sightings) == sum(len(t.track_id) for both in data().tracks[8:] for t in both)
+    assert len(played.scene.observations) == sum(len(t.track_id) for both in data().tracks[8:] for t in both)
     assert len(played.estimates) == N, "one solve for each keyframe"
     alone = Played(joined(parts[8:]))
     # Guesses that come before their keyframe belong to the session that it is not yet known to begin.

@@ -282,7 +282,7 @@ def test_a_held_solve_leaves_the_map_as_it_was() -> None:
     replay(backend, stream[:-3])
     table, points = backend.scene.keyframes, backend.scene.landmarks
     rows = np.flatnonzero(table.refined)
-    before = [table.position[rows].copy(), points.position.copy(), backend.scene.sightings.outlier.copy()]
+    before = [table.position[rows].copy(), points.position.copy(), backend.scene.observations.outlier.copy()]
     correction = backend.estimate().correction
     backend.configure(ALONE.with_values({"guard.min_inlier_share": 1.0}))
     last = replay(backend, stream[-3:])[-1]
@@ -290,7 +290,7 @@ def test_a_held_solve_leaves_the_map_as_it_was() -> None:
     assert "observations agree" in last.report.reason
     assert np.array_equal(table.position[rows], before[0])
     np.testing.assert_array_equal(points.position[: len(before[1])], before[1])
-    assert np.array_equal(backend.scene.sightings.outlier[: len(before[2])], before[2])
+    assert np.array_equal(backend.scene.observations.outlier[: len(before[2])], before[2])
     assert backend.scene.keyframes.solved.all()
     assert not backend.scene.keyframes.refined[-1]
     assert correction is not None and last.correction is not None

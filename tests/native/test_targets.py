@@ -60,19 +60,20 @@ def of_kernels(problem: Problem) -> Quantities:
     system = kernels.reduce(1e-3 * out["d_c"] + 1e-3, 1e-3 * out["d_p"] + 1e-3)
     out |= {"rhs": system.rhs.copy(), "S": system.dense().copy(), "sparse S": system.sparse().toarray()}
     out["x"] = solution(system.solve_dense())
+    assert isinstance(system, native_kernels.NativeSystem)
     system.factor_size(10**6, 1e9)
     out["sparse x"] = solution(system.solve_sparse())
     ones = np.ones_like(out["d_c"])
     for kind in ("none", "schur_block", "schur_diag", "b_block", "b_diag"):
         for formed in (True, False):
             # So few steps that rounding has no room to grow, and no test of when to stop is met.
-            found = system.pcg(kind, ones, PcgLimits(t_eps=1e-300, max_iterations=4), formed=formed)
+            found = system.solve_pcg(kind, ones, PcgLimits(t_eps=1e-300, max_iterations=4), formed=formed)
             assert found is not None
             out[f"pcg {kind} {formed}"] = solution(found.x)
     out["product"] = kernel.product(out["x"])
     out["diagonal blocks"] = kernel.diagonal_blocks()
     _, out["step_p"], reduction = system.back_substitute(out["x"])
-    moved = kernels.move(problem.start, system, out["x"], 2)
+    moved = kernels.step(problem.start, system, out["x"], 2)
     state = moved.state
     out |= {
         "moved points": state.points.copy(),

@@ -26,7 +26,7 @@ from rclpy.parameter import Parameter as RclpyParameter
 
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages import conversion
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.tools.domain import free_domain, isolation
@@ -130,7 +130,7 @@ class Peer:
         """Make a publisher for each input but camera_info."""
         for topic, kind in INPUT_TYPES.items():
             if topic != "camera_info":
-                profile = qos.latched() if topic in qos.LATCHED_INPUTS else qos.reliable(depth)
+                profile = qos.profile(TOPICS[topic], depth)
                 self.publishers[topic] = self.node.create_publisher(message_class(kind), topic, profile)
 
     def listen(self, *topics: str) -> None:
@@ -138,7 +138,7 @@ class Peer:
         for topic in topics or OUTPUT_TYPES:
             take = self.received[topic].append
             cls = message_class(OUTPUT_TYPES[topic])
-            self.node.create_subscription(cls, f"ba_node/{topic}", take, qos.for_output(topic))
+            self.node.create_subscription(cls, f"ba_node/{topic}", take, qos.profile(TOPICS[topic]))
 
     def connect(self) -> None:
         """Wait until the node hears every publisher and is heard by every subscription."""

@@ -7,12 +7,13 @@ when the node is configured, and they are destroyed when the node is cleaned up.
 the entities that it made, run on the executor's thread; what is to run on the solver's thread goes through
 ``host.inbox.post(command)``, and comes back with the next estimate, or as a Notice.
 
-To add one: a class derived from :class:`Component` in a file of its own, and its name in ``node.COMPONENTS``::
+To add one: a class derived from :class:`Component` in a file of its own, its name in ``node.COMPONENTS``, and its topic
+in ``messages/topics.py``::
 
     class Status(Component):
         def __init__(self, host: Host) -> None:
             super().__init__(host)
-            self._publisher = self.publisher(message_class("std_msgs/msg/String"), "~/status", qos.reliable(1))
+            self._publisher = self.publisher(TOPICS["status"])
 
         def take(self, estimate: Estimate, newest: bool) -> None:
             if newest and self._publisher.get_subscription_count():
@@ -27,6 +28,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ba_node.ros import qos
+from ba_node.ros.convert import message_class
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.estimate import Estimate, SolveReport
     from ba_node.measurements import CameraRig
+    from ba_node.messages.topics import Topic
     from ba_node.ros.rclpy_compat.deferred import Relay
     from ba_node.ros.worker.inbox import Inbox
     from ba_node.ros.worker.worker import Account, Notice, Worker
@@ -108,23 +111,26 @@ class Component:
                 replaces the ones before needs only this.
         """
 
-    def publisher(self, kind: Any, topic: str, profile: Any, **options: Any) -> Any:
+    def publisher(self, topic: Topic, profile: Any = None, **options: Any) -> Any:
         """Make a publisher that is destroyed at cleanup. Its profile can be overridden by parameters.
 
         Args:
-            kind: message class.
-            topic: name, relative to the node's namespace or ``~/``.
-            profile: quality of service.
+            topic: of messages/topics.py.
+            profile: quality of service; None for that of the topic.
             options: ``matched``, called when a subscriber comes or goes; others as of rclpy.
-        """
-        matched = options.pop("matched", None)
-        options = qos.for_publisher(self.host.node, topic, self.host.log, matched) | options
-        return self._owned("publisher", kind, topic, profile, **options)
 
-    def subscription(self, kind: Any, topic: str, take: Callable[[Any], None], profile: Any, **options: Any) -> Any:
-        """Make a subscription that is destroyed at cleanup. Its profile can be overridden by parameters."""
-        options = qos.for_subscription(self.host.node, topic, self.host.log) | options
-        return self._owned("subscription", kind, topic, take, profile, **options)
+        Raises:
+            LookupError: there is no message class of its type.
+        """
+        kind, name, matched = message_class(topic.type_name), topic.given_name, options.pop("matched", None)
+        options = qos.for_publisher(self.host.node, name, self.host.log, matched) | options
+        return self._owned("publisher", kind, name, profile or qos.profile(topic), **options)
+
+    def subscription(self, topic: Topic, take: Callable[[Any], None], profile: Any, **options: Any) -> Any:
+        """Make a subscription that is destroyed at cleanup; as :meth:`publisher`."""
+        kind = message_class(topic.type_name)
+        options = qos.for_subscription(self.host.node, topic.name, self.host.log) | options
+        return self._owned("subscription", kind, topic.name, take, profile, **options)
 
     def timer(self, *arguments: Any, **options: Any) -> Any:
         """Make a timer that is destroyed at cleanup. Without ``clock=`` it stands still when /clock does."""

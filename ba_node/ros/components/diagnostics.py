@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
 
-from ba_node.messages.conversion import INPUT_TYPES
 from ba_node.messages.diagnostics import Health, diagnose, diagnostics_message
-from ba_node.messages.topics import SHARED_TYPES
+from ba_node.messages.topics import DIAGNOSTICS, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.convert import RclpyFactory
 
 if TYPE_CHECKING:
     pass
@@ -42,8 +41,7 @@ class Diagnostics(Component):
         self._keyframes, self._heard_s = 0, time.monotonic()
         self._arrived = deque([(self._heard_s, Counter(host.arrived))])
         self._lost = deque([(self._heard_s, self._all_lost())])
-        kind = message_class(SHARED_TYPES["/diagnostics"])
-        self._publisher = self.publisher(kind, "/diagnostics", qos.reliable(_DEPTH))
+        self._publisher = self.publisher(TOPICS[DIAGNOSTICS], qos.reliable(_DEPTH))
         self.timer(_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _tick(self) -> None:

@@ -10,10 +10,10 @@ import time
 from typing import Any
 
 from ba_node.measurements import CameraRig, Measurement
-from ba_node.messages.conversion import INPUT_TYPES, measurement_from_message
+from ba_node.messages.conversion import measurement_from_message
+from ba_node.messages.topics import CAMERAS, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import message_class
 from ba_node.ros.worker.worker import Notice
 
 
@@ -29,19 +29,18 @@ class Inputs(Component):
             receive = functools.partial(self._receive, topic, kind)
             # One solve may take long: as many messages as a window takes must be able to wait.
             depth = max(host.config.node.queue_depth, host.config.window.max_keyframes)
-            first, *second = qos.for_input(topic, depth)
-            self.subscription(message_class(kind), topic, receive, first)
-            for profile in second:
-                self.subscription(message_class(kind), topic, receive, profile, **qos.sensor_data())
+            self.subscription(TOPICS[topic], receive, qos.profile(TOPICS[topic], depth))
+            if topic in CAMERAS:
+                self.subscription(TOPICS[topic], receive, qos.SENSOR_DATA, **qos.at_peace())
 
     def _receive(self, topic: str, kind: str, message: Any) -> None:
         """Hand a message to the worker. What cannot be read is counted; it must not end the node."""
         counted = self.host.counted
         self.host.arrived[topic] += 1
-        if self.host.ignoring and topic not in qos.LATCHED_INPUTS:
+        if self.host.ignoring and topic not in CAMERAS:
             counted.update(self.host.ignoring)
             return
-        if topic in qos.LATCHED_INPUTS and self._came_twice(topic, message):
+        if topic in CAMERAS and self._came_twice(topic, message):
             return
         try:
             measurement: Measurement | None = measurement_from_message(kind, message)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
 
-from ba_node.messages.topics import SHARED_TYPES
+from ba_node.messages.topics import TF, TOPICS
 from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, log
 
 if TYPE_CHECKING:
@@ -38,12 +38,11 @@ class MapTransform(Component):
         self._taken_ns = 0
         self._last_stamp_ns: int | None = None
         try:
-            kind = message_class(SHARED_TYPES["/tf"])
+            self._publisher = self.publisher(TOPICS[TF], qos.reliable(_DEPTH))
         except LookupError:
             self._publisher = None
             self._say("off: tf2_msgs is not installed")
             return
-        self._publisher = self.publisher(kind, "/tf", qos.reliable(_DEPTH))
         self._say("")
         period_s = host.config.frames.publish_period_s
         if period_s > 0.0:

@@ -23,7 +23,7 @@ from rclpy.qos import QoSProfile
 
 from ba_node.config import find
 from ba_node.estimate import Status
-from ba_node.messages.commands import ACTION_TYPES
+from ba_node.messages.topics import ACTIONS
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
@@ -66,7 +66,7 @@ class Optimize(Component):
         """Advertise."""
         super().__init__(host)
         self._goal: _Goal | None = None
-        self._type = message_class(ACTION_TYPES[_NAME])
+        self._type = message_class(ACTIONS[_NAME].type_name)
         self._server = ActionServer(
             host.node,
             self._type,

@@ -9,12 +9,11 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from ba_node.estimate import SolveReport, Status
-from ba_node.messages.conversion import OUTPUT_TYPES, output_messages
-from ba_node.messages.outputs import report_message
-from ba_node.ros import qos
+from ba_node.messages.outputs import output_messages, report_message
+from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS
 from ba_node.ros.components.activity import Activity
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, log
 from ba_node.ros.throttle import Throttle
 from ba_node.ros.worker.latency import Sliding
@@ -47,19 +46,18 @@ class Publishing(Component):
         self._latest: Estimate | None = None
         self._behind: set[str] = set()
         self._outputs: dict[str, Any] = {}
-        for topic, kind in OUTPUT_TYPES.items():
-            matched = self._catch_up if topic in qos.LATCHED_OUTPUTS else None
-            profile = qos.for_output(topic)
-            self._outputs[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, matched=matched)
+        for topic in OUTPUT_TYPES:
+            matched = self._catch_up if topic in LATCHED_OUTPUTS else None
+            self._outputs[topic] = self.publisher(TOPICS[topic], matched=matched)
 
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Publish an estimate."""
         wanted = self._heard()
         if newest:
             self._latest = estimate
-            self._behind = set(qos.LATCHED_OUTPUTS) - wanted
+            self._behind = set(LATCHED_OUTPUTS) - wanted
         else:
-            wanted.difference_update(qos.LATCHED_OUTPUTS)
+            wanted.difference_update(LATCHED_OUTPUTS)
         self._publish(estimate, wanted & _POSES)
         report = self.host.report = self._timed(estimate)
         told = dataclasses.replace(report, rejected={**report.rejected, **self.host.counted})

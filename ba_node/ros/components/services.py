@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ba_node.io.map_file import MapFileError, load_map, write_map
 from ba_node.io.map_folder import MapPathError, path_in_folder
-from ba_node.messages.commands import SERVICE_TYPES
+from ba_node.messages.topics import SERVICES
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.rclpy_compat.deferred import LateService, Owed
@@ -36,8 +36,8 @@ class Services(Component):
         super().__init__(host)
         self._busy: Owed | None = None
         begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}
-        for name, kind in SERVICE_TYPES.items():
-            LateService(self, message_class(kind), f"~/{name}", begin[name])
+        for name, command in SERVICES.items():
+            LateService(self, message_class(command.type_name), f"~/{name}", begin[name])
 
     def _reset(self, _request: Any, answer: Owed) -> None:
         def reset(backend: Backend) -> Estimate:

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from ba_node.estimate import Extras
 from ba_node.messages.markers import marker_array, no_markers
-from ba_node.messages.topics import SIDE_TYPES
+from ba_node.messages.topics import ON_DEMAND, TOPICS
 from ba_node.messages.transforms import covariance_messages
-from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.convert import RclpyFactory
 
 if TYPE_CHECKING:
     from ba_node.backend import Backend
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class SideOutputs(Component):
-    """The topics of ``SIDE_TYPES``. Who subscribes gets the next solve; the last markers are kept for those after."""
+    """The topics of ``ON_DEMAND``. Who subscribes gets the next solve; the last markers are kept for those after."""
 
     def __init__(self, host: Host) -> None:
         """Advertise, and be told who comes and goes."""
@@ -29,9 +28,8 @@ class SideOutputs(Component):
         self._asked = Extras()
         self._drawn_map: int | None = None
         self._publishers: dict[str, Any] = {}
-        for topic, kind in SIDE_TYPES.items():
-            profile = qos.latched() if topic == "markers" else qos.reliable(qos.OUTPUT_DEPTH)
-            self._publishers[topic] = self.publisher(message_class(kind), f"~/{topic}", profile, matched=self._ask)
+        for topic in ON_DEMAND:
+            self._publishers[topic] = self.publisher(TOPICS[topic], matched=self._ask)
 
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Publish what was asked for when the solve began."""
@@ -53,7 +51,7 @@ class SideOutputs(Component):
 
     def _ask(self, _status: object) -> None:
         """Let the solver work out what someone subscribes to, from its next solve on."""
-        if len(self._publishers) < len(SIDE_TYPES):
+        if len(self._publishers) < len(ON_DEMAND):
             return
         extras = Extras(covariance=self._wanted("pose_with_covariance"), view=self._wanted("markers"))
         if extras == self._asked:

@@ -9,8 +9,7 @@ from collections import Counter
 
 from rclpy.clock import Clock, ClockType
 
-from ba_node.messages.conversion import INPUT_TYPES
-from ba_node.ros import qos
+from ba_node.messages.topics import CAMERAS, INPUT_TYPES
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.worker.worker import Notice
 
@@ -55,8 +54,8 @@ class Silence(Component):
     def _where(self, silent: str) -> str:
         """Say of a topic, and of the cameras if none came, who publishes there."""
         parts = [self._publishers(silent)]
-        if not any(self.host.arrived[topic] for topic in qos.LATCHED_INPUTS):
-            parts += ["no cameras came either", *(self._publishers(topic) for topic in qos.LATCHED_INPUTS)]
+        if not any(self.host.arrived[topic] for topic in CAMERAS):
+            parts += ["no cameras came either", *(self._publishers(topic) for topic in CAMERAS)]
         return "; ".join(parts)
 
     def _publishers(self, topic: str) -> str:

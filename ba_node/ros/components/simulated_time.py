@@ -8,10 +8,10 @@ import time
 
 from rclpy.clock import Clock, ClockType
 
+from ba_node.messages.topics import CLOCK
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.worker.worker import Notice
 
-_TOPIC = "/clock"
 _CHECK_S = 0.5
 # Without a change of the time for so long it is said, and again each time this has doubled.
 _PATIENCE_S = 3.0
@@ -41,12 +41,12 @@ class SimulatedTime(Component):
         self.host.clock = self._words(still_s)
         if still_s >= self._next_s:
             self._next_s = 2.0 * still_s
-            self.host.log(Notice(_TOPIC, self.host.clock))
+            self.host.log(Notice(CLOCK, self.host.clock))
 
     def _words(self, still_s: float) -> str:
-        publishers = self.host.node.get_publishers_info_by_topic(_TOPIC)
+        publishers = self.host.node.get_publishers_info_by_topic(CLOCK)
         names = sorted(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in publishers)
-        has = f"{_TOPIC} has {len(names)} publisher{'' if len(names) == 1 else 's'}"
+        has = f"{CLOCK} has {len(names)} publisher{'' if len(names) == 1 else 's'}"
         who = f"{has} ({', '.join(names)})" if names else has
         if self._time_ns:
             return f"use_sim_time is true and the time has stood still for {still_s:.0f} s: {who}"

@@ -7,11 +7,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from ba_node.messages.topics import SHARED_TYPES, TF_STATIC
+from ba_node.messages.topics import TF_STATIC, TOPICS
 from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, log
 from ba_node.ros.worker.worker import Notice
 
@@ -32,12 +31,11 @@ class StaticFrames(Component):
         if host.config.frames.extrinsics != "tf_static":
             return
         try:
-            kind = message_class(SHARED_TYPES["/tf"])
+            self.subscription(TOPICS[TF_STATIC], self._receive, qos.latched(_DEPTH))
         except LookupError:
             text = "frames.extrinsics = tf_static: tf2_msgs is not installed; cameras sit where camera_rig says"
             log(host.node, Severity.WARNING, text)
             return
-        self.subscription(kind, TF_STATIC, self._receive, qos.latched(_DEPTH))
         host.place_cameras = self._place
 
     def _receive(self, message: Any) -> None:

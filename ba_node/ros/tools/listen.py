@@ -15,8 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ba_node.estimate import Poses
-from ba_node.messages.conversion import OUTPUT_TYPES, stamp_ns_from_message
+from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.outputs import POINT_DTYPE
+from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 
@@ -53,12 +54,11 @@ class NodeListener:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         receivers = {"refined_keyframes": self._on_keyframes, "points": self._on_points, "report": self.reports.append}
-        self._subscriptions = [
-            self._node.create_subscription(
-                message_class(OUTPUT_TYPES[topic]), f"{self._node_name}/{topic}", receive, qos.for_output(topic)
-            )
-            for topic, receive in receivers.items()
-        ]
+        self._subscriptions = []
+        for name, receive in receivers.items():
+            topic = TOPICS[name]
+            kind, full_name = message_class(topic.type_name), f"{self._node_name}/{name}"
+            self._subscriptions.append(self._node.create_subscription(kind, full_name, receive, qos.profile(topic)))
         return self
 
     def __exit__(self, *_: object) -> None:

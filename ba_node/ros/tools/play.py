@@ -27,7 +27,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from ba_node.io.mcap import BagReader
-from ba_node.messages.conversion import INPUT_TYPES
+from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 
@@ -44,9 +44,7 @@ _POLL_S = 0.02
 # Fast DDS asks for acknowledgements every 3 s.
 _ACK_TIMEOUT_S = 10.0
 _LATCHED_DEPTH = 10
-CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 _playing: list[Any] = []
-_LATCHED_TYPES = (INPUT_TYPES["camera_rig"], INPUT_TYPES["camera_info"])
 
 
 class PlayError(ValueError):
@@ -170,7 +168,7 @@ class _Time:
     """Publishes the time of the recording, which is the same for all namespaces."""
 
     def __init__(self, node: Any, rate_hz: float) -> None:
-        self._kind = message_class(_CLOCK_TYPE)
+        self._kind = message_class(TOPICS[CLOCK].type_name)
         self._publisher = node.create_publisher(self._kind, CLOCK, qos.reliable(max(1, round(rate_hz))))
         self._last_ns = -1
         self.count = 0
@@ -203,7 +201,7 @@ class _Player:
                 self._skipped[topic] = kind
                 listener.notice(f"{topic} is skipped: {error}")
                 continue
-            profile = qos.latched(_LATCHED_DEPTH) if kind in _LATCHED_TYPES else qos.lossless()
+            profile = qos.latched(_LATCHED_DEPTH) if kind in CAMERA_TYPES else qos.lossless()
             # Without the leading slash, so that a namespace moves it.
             self._publishers[topic] = node.create_publisher(cls, topic.removeprefix("/"), profile)
         if not self._publishers:
@@ -250,7 +248,7 @@ class _Player:
                 self._publish(self._publishers[topic], data)
         start = time.monotonic()
         for done, (topic, _, log_time_ns, data) in enumerate(self._reader.messages(), start=1):
-            latched = self._reader.topics[topic] in _LATCHED_TYPES
+            latched = self._reader.topics[topic] in CAMERA_TYPES
             if topic in self._publishers and (log_time_ns >= begin_ns or latched):
                 self._wait_for(start, max(log_time_ns, begin_ns), begin_ns)
                 self._publish(self._publishers[topic], data)

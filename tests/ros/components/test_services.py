@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from ba_node.estimate import Status
 from ba_node.io.map_file import read_map
-from ba_node.messages.commands import SERVICE_TYPES
+from ba_node.messages.topics import SERVICES
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
@@ -254,7 +254,7 @@ def test_an_answer_does_not_wait_for_a_solve(
 
 def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path) -> None:
     start_node(*INACTIVE)
-    names = {f"/ba_node/{name}" for name in SERVICE_TYPES}
+    names = {f"/ba_node/{name}" for name in SERVICES}
 
     def offered() -> set[str]:
         return names & {name for name, _ in peer.node.get_service_names_and_types()}
@@ -271,7 +271,7 @@ def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: Syntheti
     assert _save(peer, tmp_path / "three.npz").keyframes == 3
     assert _change(peer, Transition.TRANSITION_CLEANUP)
     # The clients of the peer count as such in the graph, so they are asked instead.
-    peer.until(lambda: not any(peer.offers(f"ba_node/{name}") for name in SERVICE_TYPES), "services to go")
+    peer.until(lambda: not any(peer.offers(f"ba_node/{name}") for name in SERVICES), "services to go")
     assert peer.offers("ba_node/change_state")
 
 

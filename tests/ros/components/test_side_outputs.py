@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ba_node.messages.topics import SIDE_TYPES
+from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
@@ -53,7 +53,7 @@ def data() -> SyntheticData:
 
 def watch(peer: Any, topic: str) -> Any:
     profile = qos.latched(100) if topic == "markers" else qos.reliable(1000)
-    cls = message_class(SIDE_TYPES[topic])
+    cls = message_class(TOPICS[topic].type_name)
     return peer.node.create_subscription(cls, f"ba_node/{topic}", peer.received[topic].append, profile)
 
 

@@ -22,7 +22,7 @@ from ba_node.io.bal import read_bal
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
-from ba_node.messages.conversion import INPUT_TYPES
+from ba_node.messages.topics import CAMERAS, INPUT_TYPES
 from ba_node.offline.bal_timeline import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
@@ -65,7 +65,7 @@ def _collect(peer: Any, prefix: str = "") -> dict[str, list[bytes]]:
     received: dict[str, list[bytes]] = {}
     for topic, kind in INPUT_TYPES.items():
         received[topic] = []
-        profile = qos.latched(10) if topic in qos.LATCHED_INPUTS else qos.lossless()
+        profile = qos.latched(10) if topic in CAMERAS else qos.lossless()
         take = received[topic].append
         peer.node.create_subscription(message_class(kind), prefix + topic, take, profile, raw=True)
     return received

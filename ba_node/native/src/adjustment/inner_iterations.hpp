@@ -1,7 +1,7 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Inner iterations: points alone, eight at once; core/polish.py says what they do and is this file's oracle.
+// Inner iterations: points alone, eight at once; core/inner_iterations.py says what they do and is this file's oracle.
 #pragma once
 
 #include <cstdint>
