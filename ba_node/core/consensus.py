@@ -12,7 +12,6 @@ that agree with them, so these triangulate it, and then all rays are classified 
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,8 +54,7 @@ def agreeing(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -> B
         kernels: numpy; otherwise the C++ kernels, where they are built.
     """
     if kernels != "numpy" and native.kernels is not None:
-        columns = {item.name: getattr(rays, item.name) for item in dataclasses.fields(rays)}
-        found: BoolArray = native.kernels.agreeing(**columns, n_points=n_points, gate=gate)
+        found: BoolArray = native.kernels.agreeing(rays, n_points, gate)
         return found
     agrees = np.zeros(len(rays.point), bool)
     order = np.argsort(rays.point, kind="stable")

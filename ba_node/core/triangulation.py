@@ -120,8 +120,7 @@ def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulati
         kernels: numpy; otherwise the C++ kernels, where they are built.
     """
     if kernels != "numpy" and native.kernels is not None:
-        columns = {item.name: getattr(rays, item.name) for item in dataclasses.fields(rays)}
-        return Triangulation(*native.kernels.triangulate(**columns, n_points=n_points))
+        return Triangulation(*native.kernels.triangulate(rays, n_points))
     measured_row = np.isfinite(rays.distance_m)
     measured = np.bincount(rays.point[measured_row], minlength=n_points) > 0
     count = np.bincount(rays.point, minlength=n_points)

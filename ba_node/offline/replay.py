@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ba_node import native
 from ba_node.backend import Backend, MapEnded, MapSummary
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Poses
@@ -125,7 +126,11 @@ def replay(
                 refused = run.sessions[-1].summary.refused_rig or "none came"
                 raise ReplayError(f"{reader.path}: no camera rig that can be used: {refused}")
         truth = read_truth(reader)
-        report = {"bag": reader.path.name, **_write(out, run.sessions, truth)}
+        report = {
+            "bag": reader.path.name,
+            "kernels": native.description(config.solver.kernels),
+            **_write(out, run.sessions, truth),
+        }
         report |= {"topics_taken": reader.taken, "topics_left": reader.left, "cameras_adjusted": run.camera_notes}
         report["bag_warnings"] = dict(reader.warnings)
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
