@@ -65,7 +65,7 @@ def _no_clock() -> float:
 
 
 class Backend:
-    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise on no data whatever.
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data.
 
     Attributes:
         map: the current map.
