@@ -16,6 +16,7 @@ from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.io.mcap import BagReader
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages.report import LatencyReport, QueueReport, Report
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -52,7 +53,8 @@ class Case:
     @property
     def truth(self) -> Poses:
         """Return the true poses, numbered from 0."""
-        return read_tum(self.bag.with_suffix(".truth.tum"))
+        read = read_tum(self.bag.with_suffix(".truth.tum"))
+        return Poses(np.arange(len(read), dtype=np.uint64), read.stamp_ns, read.position, read.orientation)
 
 
 @pytest.fixture(scope="session")
@@ -167,6 +169,16 @@ def report() -> SolveReport:
         outliers=17,
         rejected={"unknown_camera": 2, "malformed": 5},
         solve_time_s=0.025,
+        correction_m=0.25,
+        correction_rad=0.0125,
+        correction_held=True,
+    )
+
+
+@pytest.fixture
+def whole_report(report: SolveReport) -> Report:
+    """Return a report of all three parts, as ``report``."""
+    queue = QueueReport(
         queue_wait_s=0.75,
         dropped=6,
         coalesced=8,
@@ -175,16 +187,18 @@ def report() -> SolveReport:
         dropped_keyframes=11,
         rejected_keyframes=10,
         waiting=1,
+        rejected={"unreadable": 4},
+        warnings=("falling behind",),
+    )
+    latency = LatencyReport(
         latency_p50_s=0.015,
         latency_p95_s=0.031,
         latency_max_s=0.047,
         stamp_latency_p50_s=0.115,
         stamp_latency_p95_s=0.131,
         stamp_latency_max_s=0.147,
-        correction_m=0.25,
-        correction_rad=0.0125,
-        correction_held=True,
     )
+    return Report(report, queue, latency)
 
 
 @pytest.fixture

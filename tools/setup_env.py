@@ -89,7 +89,7 @@ def wanted_stamps(root: Path) -> dict[str, str]:
     packages = digest([*root.glob("requirements/*.txt"), *(path for path in tools if path.is_file())], root)
     interfaces = [path for folder in INTERFACES.values() for path in root.glob(f"{folder}/**/*") if path.is_file()]
     project = [root / name for name in ("setup.py", "setup.cfg", "package.xml")]
-    project += [path for path in root.glob("ba_node/native/src/*") if path.is_file()]
+    project += [path for path in root.glob("ba_node/native/src/**/*") if path.is_file()]
     return {
         "packages": packages,
         "interfaces": digest(interfaces, root, packages),
