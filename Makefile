@@ -7,14 +7,16 @@ PYTHON ?=
 ARGS ?=
 
 RUN := .venv/bin/python
+# Two at a time; each file stays in one process, so that what its tests share is made once.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 STYLED := $(CHECKED) examples
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
 
-.PHONY: help setup demo test fuzz soak sanitize cross wheel bench thesis robustness lint format clean
+.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness lint format clean
 
 help: ## list the commands
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
 
 setup: ## make .venv with ROS 2 Jazzy, ba_msgs and ba_node; the commands below do it by themselves
 	@PYTHON="$(PYTHON)" sh tools/setup.sh
@@ -22,8 +24,11 @@ setup: ## make .venv with ROS 2 Jazzy, ba_msgs and ba_node; the commands below d
 demo: setup ## play a recording into the node over DDS, compare with ground truth, write out/demo/
 	@$(RUN) -m ba_node.cli.main demo --out out/demo $(ARGS)
 
-test: setup ## run the tests
-	@$(RUN) -m pytest $(ARGS)
+test: setup ## run the quick tests (about 5 minutes on two cores; ARGS="-k solver", ARGS="-m slow")
+	@$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: setup ## run all tests, the slow ones too
+	@$(PYTEST) $(ARGS)
 
 fuzz: setup ## give readers and back-end 50 000 broken files and 200 000 broken messages (about 20 minutes)
 	@$(RUN) -m tests.fuzz $(ARGS)

@@ -18,43 +18,18 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from ba_node import __version__
-from ba_node.cli import (
-    check,
-    convert,
-    demo,
-    evaluate,
-    interrupts,
-    params,
-    play,
-    replay,
-    solve,
-    synth,
-)
-from ba_node.cli import map as map_command
+from ba_node.cli import interrupts
 from ba_node.cli.checkout import CheckoutCommand
 
+_INSTALLED = ("replay", "check", "map", "play", "solve", "convert", "evaluate", "synth", "demo", "params")
+_IN_A_CHECKOUT = (
+    CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
+    CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
+    CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
+)
 COMMANDS: dict[str, ModuleType | CheckoutCommand] = {
-    module.__name__.rsplit(".", 1)[1]: module
-    for module in (
-        replay,
-        check,
-        map_command,
-        play,
-        solve,
-        convert,
-        evaluate,
-        synth,
-        demo,
-        params,
-    )
-}
-COMMANDS |= {
-    command.name: command
-    for command in (
-        CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
-        CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
-        CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
-    )
+    **{name: importlib.import_module(f"ba_node.cli.{name}") for name in _INSTALLED},
+    **{command.name: command for command in _IN_A_CHECKOUT},
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130

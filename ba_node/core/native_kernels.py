@@ -57,9 +57,9 @@ def missing(options: SolverOptions) -> str:
     return reason
 
 
-def residual_norms(problem: Problem, state: State, backend: str = "auto") -> FloatArray:
+def residual_norms(problem: Problem, state: State, kernels: str = "auto") -> FloatArray:
     """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see."""
-    if backend != "numpy" and native.kernels is not None and not problem.free_intrinsics:
+    if kernels != "numpy" and native.kernels is not None and not problem.free_intrinsics:
         norms: FloatArray = native.kernels.residual_norms(problem, state)
         return norms
     error = reprojection_errors(problem, state)

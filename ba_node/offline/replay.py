@@ -169,15 +169,15 @@ class _Run:
         self._inputs = {keyframe.keyframe_id: keyframe for keyframe in inputs}
 
     def read(self, measurements: Iterable[Measurement], total: int) -> None:
-        for told in self.backend.replay(self._counting(measurements, total)):
-            if isinstance(told, Estimate):
-                self._record(told)
-            elif isinstance(told, Keyframe):
-                if told.keyframe_id in self._known and told.session_id == self.backend.map.session_id:
-                    self.known_already.add(told.keyframe_id)
-                self._inputs.setdefault(told.keyframe_id, told)
+        for event in self.backend.replay(self._counting(measurements, total)):
+            if isinstance(event, Estimate):
+                self._record(event)
+            elif isinstance(event, Keyframe):
+                if event.keyframe_id in self._known and event.session_id == self.backend.map.session_id:
+                    self.known_already.add(event.keyframe_id)
+                self._inputs.setdefault(event.keyframe_id, event)
             else:
-                self._map_ended(told)
+                self._map_ended(event)
 
     def _counting(self, measurements: Iterable[Measurement], total: int) -> Iterator[Measurement]:
         for done, measurement in enumerate(measurements, start=1):
