@@ -21,7 +21,7 @@ from tests.cases.conftest import Replay, harmless
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "cases"
 OK, ATTENTION = 0, 3
-# Name -> keyframes, exit codes, largest error m, patterns of which each has to be found in what is said.
+# Name -> keyframes, exit codes, largest error m, patterns of which each has to be found in the messages.
 WITH_TRUTH: dict[str, tuple[int, tuple[int, ...], float, tuple[str, ...]]] = {
     "clock_set_back": (40, (OK, ATTENTION), 0.09, ("stamp|clock|session",)),
     "one_stamp_zero": (39, (ATTENTION,), 0.09, ("stamp", "keyframe 17")),
@@ -48,7 +48,7 @@ def truth_of(path: Path) -> Poses:
 @pytest.mark.parametrize("name", WITH_TRUTH)
 def test_no_worse_than_what_came_in(name: str, run: Replay) -> None:
     bag = case(name)
-    keyframes, codes, most_m, told = WITH_TRUTH[name]
+    keyframes, codes, most_m, named = WITH_TRUTH[name]
     outcome = run(bag)
     assert outcome.code in codes, outcome.words
     errors = outcome.errors(truth_of(bag))
@@ -56,7 +56,7 @@ def test_no_worse_than_what_came_in(name: str, run: Replay) -> None:
     for error in errors:
         assert error.published_m <= most_m, f"{error.folder.name}: {error.published_m:.4f} m, at most {most_m} m"
     assert sum(error.keyframes for error in errors) == keyframes
-    outcome.tells(*told)
+    outcome.tells(*named)
 
 
 def test_clock_set_back_leaves_two_maps(run: Replay) -> None:
