@@ -12,9 +12,9 @@ came, or when :meth:`Backend.flush` says so. The node drains its inbox and then 
 
 A replay solves once for every keyframe, however the messages are spaced, just before the next one begins::
 
-    for told in backend.replay(recording):
-        if isinstance(told, Estimate):
-            write(told)
+    for event in backend.replay(recording):
+        if isinstance(event, Estimate):
+            write(event)
 
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
@@ -42,7 +42,6 @@ from ba_node.estimate import Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
-from ba_node.scene.frame_names import check_name
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import full, guard, quality
@@ -205,7 +204,7 @@ class Backend:
         if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
             self.refused.append(measurement)
             return
-        check_name(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
+        ingest.check_frame(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
         self.map.completion.begin(self.scene, measurement.keyframe_id)
 
     def flush(self, final: bool = False) -> None:
@@ -303,8 +302,8 @@ class Backend:
             return None
         self.solve_count += 1
         newest = int(self.scene.order[-1])
-        figures = quality.figures(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
-        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **figures)
+        statistics = quality.statistics(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
+        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
         return self.estimate(), followed
 

@@ -196,10 +196,10 @@ class CurrentMap:
         elif state is not None:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
-        figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
+        statistics = quality.statistics(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:
-            figures |= {"status": Status.HELD, "reason": tried.held}
-        self.report = dataclasses.replace(self.base_report(*which), **figures, solve_time_s=tried.solve_time_s)
+            statistics |= {"status": Status.HELD, "reason": tried.held}
+        self.report = dataclasses.replace(self.base_report(*which), **statistics, solve_time_s=tried.solve_time_s)
         return selection, state
 
     def hold(self, reason: str) -> None:

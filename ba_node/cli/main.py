@@ -62,6 +62,19 @@ class Overview(argparse.HelpFormatter):
         self._action_max_length = 2 + max(map(len, COMMANDS)) + 2
 
 
+class _Version(argparse.Action):
+    """Print the version and which kernels there are; these are asked only then, as to load them takes a while."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **fields: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, **fields)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Print and exit."""
+        native = importlib.import_module("ba_node.native")
+        print(f"ba_node {__version__} (kernels: {native.description()})")
+        parser.exit()
+
+
 def build_parser(command: str) -> argparse.ArgumentParser:
     """Return the parser, with the options of one command."""
     parser = Parser(
@@ -70,7 +83,7 @@ def build_parser(command: str) -> argparse.ArgumentParser:
         epilog="ba COMMAND --help tells more about each.",
         formatter_class=Overview,
     )
-    parser.add_argument("--version", action="version", version=f"ba_node {__version__}")
+    parser.add_argument("--version", action=_Version, help="show the versions of ba_node and of its kernels")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, entry in COMMANDS.items():
         if name != command:
