@@ -13,7 +13,8 @@ from ba_node.backend import FINISHED_KEPT, Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Status
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from ba_node.synthetic import SyntheticData, SyntheticOptions
+from tests.generated import generated
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,7 +25,7 @@ SMALL: dict[str, Any] = {
 
 
 def recording(**options: Any) -> SyntheticData:
-    return generate(SyntheticOptions(**{**SMALL, **options}))
+    return generated(SyntheticOptions(**{**SMALL, **options}))
 
 
 def messages(**options: Any) -> list[Measurement]:
