@@ -275,7 +275,7 @@ def test_a_solve_is_stopped_after_an_iteration() -> None:
 
     taken.solve(CONFIG.solver, "lma_cd", 30, on_iteration=watch)
     assert seen == [0, 1, 2]
-    assert taken.status is Status.MAX_ITERATIONS
+    assert taken.result.status is Status.MAX_ITERATIONS
     assert taken.result.method == "lma_cd"
 
 
