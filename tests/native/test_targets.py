@@ -23,7 +23,7 @@ from ba_node.core import native_kernels
 from ba_node.core.consensus import agreeing
 from ba_node.core.factors import RelativePoses
 from ba_node.core.linear import PcgLimits
-from ba_node.core.native_factors import NativeFactorSum
+from ba_node.core.native_kernels import NativeFactorSum
 from ba_node.core.problem import Problem
 from ba_node.core.triangulation import rays_of, triangulate
 from tests.core.conftest import Spec, make
