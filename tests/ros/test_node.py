@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter as RclpyParameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo
 
+from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Status
@@ -27,6 +28,7 @@ from ba_node.messages import conversion
 from ba_node.messages.conversion import OUTPUT_TYPES
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from tests.ros.harness import solve_until_stopped
 
 pytestmark = pytest.mark.dds
 
@@ -333,10 +335,8 @@ def test_help_is_given_and_a_file_for_another_node_is_told(start_node: StartNode
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_during_a_solve(
-    start_node: StartNode, make_peer: MakePeer, slow_solve: str, number: int
-) -> None:
-    node, peer = start_node(python=slow_solve), make_peer()
+def test_a_signal_ends_it_during_a_solve(start_node: StartNode, make_peer: MakePeer, number: int) -> None:
+    node, peer = start_node(prepare=solve_until_stopped), make_peer()
     peer.advertise()
     peer.connect()
     peer.publish(Keyframe(0, 1, 1, "odom", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
@@ -347,29 +347,23 @@ def test_a_signal_ends_it_during_a_solve(
     assert "Traceback" not in node.err
 
 
-BROKEN_SOLVE = """
-import sys
-from ba_node import backend
+def fail_in_the_second_solve() -> None:
+    backend: Any = Backend
+    solve, calls = Backend.solve, []
 
-solve = backend.Backend.solve
-calls = []
+    def sometimes(self: Any, on_iteration: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise RuntimeError("a fault nobody thought of")
+        return solve(self, on_iteration)
 
-def sometimes(self, on_iteration):
-    calls.append(1)
-    if len(calls) == 2:
-        raise RuntimeError("a fault nobody thought of")
-    return solve(self, on_iteration)
-
-backend.Backend.solve = sometimes
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+    backend.solve = sometimes
 
 
 def test_a_fault_in_a_solve_does_not_end_the_node(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
-    node, peer = start_node(python=BROKEN_SOLVE), make_peer()
+    node, peer = start_node(prepare=fail_in_the_second_solve), make_peer()
     peer.advertise()
     peer.listen("report", "refined_keyframes")
     peer.connect()

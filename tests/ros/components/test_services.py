@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -228,7 +229,7 @@ def _matches(pattern: str, text: str) -> bool:
 def test_an_answer_does_not_wait_for_a_solve(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
 ) -> None:
-    node = start_node(python=gates.script)
+    node = start_node(**gates.options)
     peer.connect()
     _play(peer, scene, *range(3))
     gates.shut("solver")
@@ -278,7 +279,7 @@ def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: Syntheti
 def test_who_waits_at_cleanup_is_answered(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
 ) -> None:
-    node = start_node(python=gates.script)
+    node = start_node(**gates.options)
     peer.connect()
     _play(peer, scene, *range(3))
     gates.shut("solver")
@@ -303,13 +304,13 @@ def test_who_waits_at_cleanup_is_answered(
 def test_a_file_is_written_to_the_end(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
 ) -> None:
-    node = start_node(python=gates.script)
+    node = start_node(**gates.options)
     peer.connect()
     _play(peer, scene, *range(3))
     gates.shut("map file")
     peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
     peer.until(lambda: gates.waits("map file"), "the file")
-    node.process.send_signal(2)
+    node.send_signal(signal.SIGINT)
     peer.until(lambda: "stopped" in node.out, "the end of all but the file")
     time.sleep(0.3)
     assert node.alive
