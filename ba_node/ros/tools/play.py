@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.time import Time
 
@@ -30,16 +29,13 @@ from ba_node.io.mcap import BagReader
 from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
+from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
     from pathlib import Path
 
-_WRONG_OPTIONS = (
-    rclpy_implementation.RCLError,
-    rclpy_implementation.UnknownROSArgsError,
-    InvalidNamespaceException,
-)
+_WRONG_OPTIONS = (*ARGUMENT_ERRORS, InvalidNamespaceException)
 _POLL_S = 0.02
 # Fast DDS asks for acknowledgements every 3 s.
 _ACK_TIMEOUT_S = 10.0
@@ -303,6 +299,6 @@ def _try_to_publish(publisher: Any, data: bytes) -> Exception | None:
     """Publish; return the error if the writer is full, which it reports after 0.1 s."""
     try:
         publisher.publish(data)
-    except rclpy_implementation.RCLError as error:
-        return error  # type: ignore[no-any-return]  # rclpy is not typed
+    except RCLError as error:
+        return error
     return None
