@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ba_node.core import geometry
 from ba_node.core.result import Iteration, Status
+from ba_node.measurements import Keyframe
 
 __all__ = [
     "Cloud",
@@ -45,6 +46,16 @@ class Poses:
     stamp_ns: NDArray[np.int64]
     position: FloatArray
     orientation: FloatArray
+
+    @classmethod
+    def of(cls, keyframes: Sequence[Keyframe]) -> Poses:
+        """Return the poses of keyframes as a front-end has sent them, in their order."""
+        return cls(
+            np.array([keyframe.keyframe_id for keyframe in keyframes], dtype=np.uint64),
+            np.array([keyframe.stamp_ns for keyframe in keyframes], dtype=np.int64),
+            np.array([keyframe.position for keyframe in keyframes]).reshape(-1, 3),
+            np.array([keyframe.orientation for keyframe in keyframes]).reshape(-1, 4),
+        )
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -155,7 +166,7 @@ class WindowView:
     """What there is to see of a solve; rows as in ``Estimate.refined``.
 
     Attributes:
-        free: (n,) True where the pose was free, False where it was held.
+        free: (n,) True where the pose was free, False where it was fixed.
         rms_px: (n,) root mean square residual per coordinate of each keyframe, px; NaN without observations.
         links: (m, 2) pairs of keyframes that see common points.
         shared: (m,) number of their common points.
@@ -190,7 +201,7 @@ class Estimate:
         report: how the solve went.
         correction: of the front-end's fixed frame; None before the first usable solve of a session.
         covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
-            0 for poses that were held. None if it was not asked for, or the solve is not usable.
+            0 for poses that were fixed. None if it was not asked for, or the solve is not usable.
         view: what there is to see; None likewise.
         map_index: number of the map; another one has another, whatever the session ids.
     """

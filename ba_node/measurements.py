@@ -3,7 +3,7 @@
 """Hold what a front-end delivers, as arrays: the neutral form of the input messages.
 
 The node and the offline tools both turn their messages into these (``messages/``); from here
-on nothing knows whether data came over a topic or from a file. Nothing in this module judges
+on nothing knows whether data came over a topic or from a file. Nothing in this module checks
 values: lengths and numbers are checked where they are used, in ``scene/``, which counts what it rejects.
 """
 

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.io.mcap import BagReader
+from ba_node.io.trajectory import read_tum
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.report import LatencyReport, QueueReport, Report
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -28,6 +32,42 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("needs the data sets in ../shared/data, which are not part of the repository")
     return folder
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small recording that once went wrong.
+
+    Attributes:
+        bag: the file.
+    """
+
+    bag: Path
+
+    @property
+    def measurements(self) -> list[Measurement]:
+        """Return all that is in it, in the order of the recording."""
+        with BagReader(self.bag) as reader:
+            return [measurement for _, _, measurement in reader.measurements()]
+
+    @property
+    def truth(self) -> Poses:
+        """Return the true poses, numbered from 0."""
+        read = read_tum(self.bag.with_suffix(".truth.tum"))
+        return Poses(np.arange(len(read), dtype=np.uint64), read.stamp_ns, read.position, read.orientation)
+
+
+@pytest.fixture(scope="session")
+def case() -> Callable[[str], Case]:
+    """Return what gives a recording of ../shared/cases by its name, or skips the test."""
+
+    def find(name: str) -> Case:
+        path = _ROOT.parent / "shared" / "cases" / f"{name}.mcap"
+        if not path.is_file():
+            pytest.skip(f"needs {path.name} in ../shared/cases, which is not part of the repository")
+        return Case(path)
+
+    return find
 
 
 @pytest.fixture

@@ -11,22 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from tools.draw_architecture import LAYERS
+
 PACKAGE = Path(__file__).resolve().parent.parent / "ba_node"
 
-# Lowest first. A module may import modules of the layers before its own, and of its own layer where SAME says so.
-LAYERS: dict[str, tuple[str, ...]] = {
-    "config": ("config", "licence"),
-    "native": ("native",),
-    "core": ("core",),
-    "scene": ("measurements", "estimate", "scene"),
-    "window": ("window", "check"),
-    "backend": ("backend",),
-    "services": ("messages", "io", "evaluation", "synthetic"),
-    "tools": ("ros", "offline", "cli"),
-}
+# A module may import modules of the layers before its own, and of its own layer where SAME says so.
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
 SAME = {
+    "estimate": {"measurements"},
     "scene": {"measurements"},
     "io": {"messages"},
     "offline": {"ros"},
@@ -91,7 +84,7 @@ def test_imports_go_down(path: Path) -> None:
             assert here == "ros", f"{path} imports {name}"
         if parts[0] != "ba_node" or here == "__init__" or parts[1] in (here, "__version__"):
             continue
-        if RANK[here] > RANK["backend"] and here != "thesis":
+        if RANK[here] > RANK["backend"]:
             assert parts[1] not in BEHIND_THE_FACE, f"{path} reaches below the back-end: {name}"
             if parts[1] == "core" and str(path.relative_to(PACKAGE)) not in WITHOUT_BACKEND:
                 assert parts[2] in NUMERICS_FOR_ALL, f"{path} reaches into the core: {name}"
@@ -102,7 +95,7 @@ def test_imports_go_down(path: Path) -> None:
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_nothing_reaches_through_the_face(path: Path) -> None:
     """The tables of a map are its back-end's own: nothing above takes them by ``backend.scene``."""
-    if RANK.get(unit(path), 0) <= RANK["backend"] or unit(path) == "thesis":
+    if RANK.get(unit(path), 0) <= RANK["backend"]:
         return
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Attribute) and node.attr == "scene":

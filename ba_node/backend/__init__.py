@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
 
-from ba_node.backend.archive import Known
+from ba_node.backend.archive import MapState
 from ba_node.backend.backend import FINISHED_KEPT, Admitted, Backend, Check
-from ba_node.backend.current_map import CurrentMap
+from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.optimization import Optimization
 from ba_node.backend.replay import MapEnded
 from ba_node.backend.summary import MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
-from ba_node.check.two_view import available as can_examine
 from ba_node.scene.map_content import MapContent, MapError
 
 __all__ = [
@@ -19,10 +18,10 @@ __all__ = [
     "Check",
     "CurrentMap",
     "Diagnosis",
-    "Known",
     "MapContent",
     "MapEnded",
     "MapError",
+    "MapState",
     "MapSummary",
     "Optimization",
     "Row",

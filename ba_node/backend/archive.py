@@ -38,7 +38,7 @@ _CORRECTION = {"rotation": Column(np.float64, (3, 3)), "translation": Column(np.
 
 
 @dataclass(frozen=True)
-class Known:
+class MapState:
     """All that a back-end knows, parameters apart.
 
     Attributes:
@@ -67,11 +67,11 @@ class Known:
         return {
             "keyframes": len(scene.keyframes),
             "landmarks": len(scene.landmarks),
-            "observations": len(scene.sightings),
+            "observations": len(scene.observations),
         }
 
 
-def pack(known: Known) -> MapContent:
+def pack(known: MapState) -> MapContent:
     """Return a copy of all that is known."""
     content = snapshot.take(known.scene)
     transforms, agreeing, stamp_ns = known.correction.state()
@@ -90,7 +90,7 @@ def pack(known: Known) -> MapContent:
     return MapContent(content.arrays | finished.arrays, content.facts | finished.facts | facts)
 
 
-def unpack(content: MapContent, config: SceneConfig) -> Known:
+def unpack(content: MapContent, config: SceneConfig) -> MapState:
     """Return what the content of a map says, in arrays of its own.
 
     Raises:
@@ -102,7 +102,7 @@ def unpack(content: MapContent, config: SceneConfig) -> Known:
     require(current is None or 0 <= current < n, f"current = {current}, expected one of {n} keyframes")
     require(all(type(count) is int for count in delivered), f"delivered = {delivered}, expected counts")
     require(0 <= solve_count < 2**62, f"solve_count = {solve_count}, expected a count")
-    return Known(
+    return MapState(
         scene,
         [_estimate(content, i, head) for i, head in enumerate(content.fact("finished", list))],
         _report_from(content),

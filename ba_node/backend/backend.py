@@ -12,9 +12,9 @@ came, or when :meth:`Backend.flush` says so. The node drains its inbox and then 
 
 A replay solves once for every keyframe, however the messages are spaced, just before the next one begins::
 
-    for told in backend.replay(recording):
-        if isinstance(told, Estimate):
-            write(told)
+    for event in backend.replay(recording):
+        if isinstance(event, Estimate):
+            write(event)
 
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
@@ -37,15 +37,11 @@ from ba_node.backend.completion import Completion
 from ba_node.backend.current_map import CurrentMap
 from ba_node.backend.optimization import Optimization
 from ba_node.backend.replay import MapEnded, replay
-from ba_node.backend.summary import MapSummary, summary_of
-from ba_node.check.examine import examine
-from ba_node.check.tracks import tracks_of
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.estimate import Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
-from ba_node.scene.frame_names import check_name
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import full, guard, quality
@@ -53,7 +49,6 @@ from ba_node.window import full, guard, quality
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from ba_node.check.diagnosis import Diagnosis
     from ba_node.config import Config
     from ba_node.core.problem import Cameras
     from ba_node.estimate import Iteration
@@ -116,12 +111,12 @@ class Backend:
     @property
     def rejected(self) -> Counter[str]:
         """Return what was turned away in this session, by reason (``rejections.REASONS``)."""
-        return self.scene.log.rejected
+        return self.map.rejected
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what somebody has to know or mend, in words."""
-        return tuple(self.scene.log.warnings.values())
+        return self.map.warnings
 
     @property
     def report(self) -> SolveReport:
@@ -209,7 +204,7 @@ class Backend:
         if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
             self.refused.append(measurement)
             return
-        check_name(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
+        ingest.check_frame(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
         self.map.completion.begin(self.scene, measurement.keyframe_id)
 
     def flush(self, final: bool = False) -> None:
@@ -263,19 +258,6 @@ class Backend:
         self.map.hold_all(self.solve_count, self.setup.reason(self.scene))
         return self.estimate()
 
-    def examine(self) -> Diagnosis | None:
-        """Return what the tracks of the map tell about the set-up; None if there is nothing to look at.
-
-        Raises:
-            ImportError: OpenCV is missing.
-        """
-        tracks = tracks_of(self.scene)
-        return None if tracks is None else examine(tracks)
-
-    def summary(self, scene: Scene | None = None) -> MapSummary:
-        """Return what there is to tell of the map, or of one that it has taken the place of."""
-        return summary_of(scene or self.scene, self.config)
-
     def estimate(self) -> Estimate:
         """Return all that is known, with the report of the last solve."""
         return self.map.estimate()
@@ -291,7 +273,7 @@ class Backend:
 
     def begin_optimization(self) -> Optimization | str:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
-        taken = full.copy(self.scene, self.config)
+        taken = full.take_snapshot(self.scene, self.config)
         return taken if isinstance(taken, str) else Optimization(taken)
 
     def is_current(self, optimization: Optimization) -> bool:
@@ -309,19 +291,19 @@ class Backend:
         if not result.status.usable or not result.state.is_finite():
             return None
         found = taken.outcome(result.state, self.config)
-        verdict = guard.judge(self.config, taken.selection, found)
+        verdict = guard.decide(self.config, taken.selection, found)
         self.refusal = self.setup.reason(self.scene) or ("" if verdict.odd else verdict.reason)
         if self.refusal:
             self.map.hold(f"a solve of everything: {self.refusal}")
             return None
         assert found.state is not None
-        followed = full.put(self.scene, self.config, taken, found.state)
+        followed = full.merge_snapshot(self.scene, self.config, taken, found.state)
         if followed is None:
             return None
         self.solve_count += 1
         newest = int(self.scene.order[-1])
-        figures = quality.figures(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
-        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **figures)
+        statistics = quality.statistics(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
+        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
         return self.estimate(), followed
 
@@ -335,7 +317,7 @@ class Backend:
     def snapshot(self) -> MapContent:
         """Return a copy of all that is known, for a file; see docs/map_format.md."""
         return archive.pack(
-            archive.Known(
+            archive.MapState(
                 self.scene,
                 self.finished,
                 self.map.report,
@@ -347,7 +329,7 @@ class Backend:
             )
         )
 
-    def take_over(self, known: archive.Known) -> None:
+    def take_over(self, known: archive.MapState) -> None:
         """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
 
         Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.

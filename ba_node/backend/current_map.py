@@ -11,18 +11,23 @@ import numpy as np
 
 from ba_node import window
 from ba_node.backend.completion import Completion, end_of_solve, reached
+from ba_node.backend.summary import MapSummary, summary_of
+from ba_node.check import two_view
+from ba_node.check.examine import examine
+from ba_node.check.tracks import tracks_of
 from ba_node.core import geometry
-from ba_node.estimate import Correction, Estimate, Extras, SolveReport, Status, Transform
+from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
 from ba_node.window import extras, quality
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
-from ba_node.window.known import cloud_of, poses_of, taking_part_of
 from ba_node.window.trust import Trust
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Callable
 
+    from ba_node.check.diagnosis import Diagnosis
     from ba_node.config import Config
     from ba_node.core.problem import State
     from ba_node.estimate import Iteration
@@ -31,6 +36,11 @@ if TYPE_CHECKING:
 
 # The front-end's frame where neither it nor the parameters name one.
 _ODOM_FRAME = "odom"
+
+
+def can_examine() -> bool:
+    """Return True where OpenCV is installed, which :meth:`CurrentMap.examine` needs."""
+    return two_view.available()
 
 
 class CurrentMap:
@@ -69,6 +79,16 @@ class CurrentMap:
         return int(np.count_nonzero(self.scene.keyframes.solved))
 
     @property
+    def rejected(self) -> Counter[str]:
+        """Return what was turned away, by reason (``rejections.REASONS``)."""
+        return self.scene.log.rejected
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what somebody has to know or mend, in words."""
+        return tuple(self.scene.log.warnings.values())
+
+    @property
     def stamp_ns(self) -> int:
         """Return the stamp of the newest keyframe, 0 before the first."""
         return int(self.scene.keyframes.stamp_ns[self.scene.order[-1]]) if len(self.scene.order) else 0
@@ -97,6 +117,19 @@ class CurrentMap:
             Keyframe(self.session_id, key, stamp_ns, self.scene.frame_id, position, quaternion)
             for key, stamp_ns, position, quaternion in rows
         ]
+
+    def summary(self) -> MapSummary:
+        """Return what there is to tell of the map."""
+        return summary_of(self.scene, self.config)
+
+    def examine(self) -> Diagnosis | None:
+        """Return what the tracks tell about the set-up; None if there is nothing to look at.
+
+        Raises:
+            ImportError: OpenCV is missing.
+        """
+        tracks = tracks_of(self.scene)
+        return None if tracks is None else examine(tracks)
 
     def due(self) -> IntArray:
         """Return the rows of complete keyframes that were not solved and that the next solve refines, oldest first."""
@@ -130,7 +163,7 @@ class CurrentMap:
         else:
             selection, state = self._solve((solve_count, int(taking_part[-1])), end, clock, on_iteration)
         if selection is not None:
-            taking_part = taking_part_of(self.scene, selection)
+            taking_part = _taking_part_of(self.scene, selection)
             if state is not None:
                 self.correct(int(taking_part[-1]))
                 extra = extras.work_out(wanted, self.scene, self.config, selection, state, taking_part)
@@ -161,12 +194,12 @@ class CurrentMap:
             self.hold(tried.held)
             state = None
         elif state is not None:
-            norms = window.put(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
+            norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
-        figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
+        statistics = quality.statistics(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:
-            figures |= {"status": Status.HELD, "reason": tried.held}
-        self.report = dataclasses.replace(self.base_report(*which), **figures, solve_time_s=tried.solve_time_s)
+            statistics |= {"status": Status.HELD, "reason": tried.held}
+        self.report = dataclasses.replace(self.base_report(*which), **statistics, solve_time_s=tried.solve_time_s)
         return selection, state
 
     def hold(self, reason: str) -> None:
@@ -192,7 +225,7 @@ class CurrentMap:
 
     def correct(self, row: int) -> None:
         """Let the correction map -> odom follow what was found at a keyframe, and tell its size in the report."""
-        self.scene.settle_poses()
+        self.scene.propagate_corrections()
         table = self.scene.keyframes
         found = Transform(*self.scene.corrections(np.array(row)))
         body = Transform(table.input_rotation[row], table.input_position[row])
@@ -208,8 +241,8 @@ class CurrentMap:
             solve_count=solve_count,
             newest_keyframe_id=int(self.scene.keyframes.keyframe_id[newest]),
             method=self.config.solver.method,
-            rejected=dict(sorted(self.scene.log.rejected.items())),
-            warnings=tuple(self.scene.log.warnings.values()),
+            rejected=dict(sorted(self.rejected.items())),
+            warnings=self.warnings,
         )
 
     def rms_px(self, state: str = "refined") -> float:
@@ -225,14 +258,14 @@ class CurrentMap:
     def estimate(self, refined: IntArray | None = None) -> Estimate:
         """Return all that is known, the refined keyframes being those in some rows, or all."""
         scene = self.scene
-        scene.settle_poses()
-        trajectory = poses_of(scene, scene.order)
+        scene.propagate_corrections()
+        trajectory = _poses_of(scene, scene.order)
         return Estimate(
             stamp_ns=self.stamp_ns,
             frame_id=self.config.frames.map_frame,
             refined=trajectory[scene.places()[scene.order if refined is None else refined]],
             trajectory=trajectory,
-            cloud=cloud_of(scene, scene.landmark_order),
+            cloud=_cloud_of(scene, scene.landmark_order),
             report=self.report,
             correction=self._published(),
             map_index=self.index,
@@ -247,3 +280,29 @@ class CurrentMap:
 
     def _end(self, due: IntArray) -> int:
         return end_of_solve(self.scene, due, self.config.window.max_keyframes)
+
+
+def _cloud_of(scene: Scene, rows: IntArray) -> Cloud:
+    """Return those of some landmarks that have a position and two views."""
+    points = scene.landmarks
+    rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
+    return Cloud(points.track_id[rows], points.position[rows], points.rms_px[rows], points.views[rows])
+
+
+def _poses_of(scene: Scene, rows: IntArray) -> Poses:
+    """Return the poses of some keyframes."""
+    table = scene.keyframes
+    return Poses(
+        table.keyframe_id[rows],
+        table.stamp_ns[rows],
+        table.position[rows],
+        geometry.quaternion_from_matrix(table.rotation[rows]),
+    )
+
+
+def _taking_part_of(scene: Scene, selection: window.Selection) -> IntArray:
+    """Return the keyframes of the window and of the problem, oldest first."""
+    marked = np.zeros(len(scene.keyframes), bool)
+    marked[selection.window] = True
+    marked[selection.keyframes] = True
+    return scene.order[marked[scene.order]]

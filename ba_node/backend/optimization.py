@@ -42,7 +42,7 @@ class Optimization:
         solved: what came of it, None before :meth:`solve`.
     """
 
-    def __init__(self, snapshot: full.Copy) -> None:
+    def __init__(self, snapshot: full.Snapshot) -> None:
         """Take a snapshot."""
         self.snapshot = snapshot
         self.solved: full.Solved | None = None
@@ -94,5 +94,5 @@ class Optimization:
     def statistics(self) -> dict[str, Any]:
         """Return how the solve went, by the names of a report."""
         assert self.solved is not None, "solve() comes first"
-        figures = quality.figures(self.snapshot.selection, self.result, self.solved.norms)
-        return {name: figures[name] for name in _TOLD}
+        statistics = quality.statistics(self.snapshot.selection, self.result, self.solved.norms)
+        return {name: statistics[name] for name in _TOLD}

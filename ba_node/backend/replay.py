@@ -46,11 +46,11 @@ def replay(backend: Backend, stream: Iterable[Measurement]) -> Iterator[Estimate
 def _taken(backend: Backend, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
     if backend.completes(admitted):
         yield from _solved(backend)
-    before = backend.scene
+    before = backend.map
     backend.take(admitted)
-    if backend.scene is not before:
+    if backend.map is not before:
         replaced = admitted.begins is not None and admitted.begins.replaces
-        yield MapEnded(backend.summary(before), replaced)
+        yield MapEnded(before.summary(), replaced)
     one = admitted.measurement
     if isinstance(one, Keyframe) and backend.scene.find_keyframe(one.keyframe_id) is not None:
         yield one

@@ -108,7 +108,7 @@ def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:
         scene: what is known.
         newest: keyframes to look at; None for all.
     """
-    table, cameras = scene.sightings, scene.cameras
+    table, cameras = scene.observations, scene.cameras
     order = scene.order if newest is None else scene.order[-newest:]
     place = np.full(len(scene.keyframes), -1)
     place[order] = np.arange(len(order))

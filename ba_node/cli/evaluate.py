@@ -6,13 +6,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ba_node.cli.console import require_folder, table
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Poses
-    from ba_node.io.trajectory import Trajectory
 
 SUMMARY = "compare a trajectory with a reference"
 EXAMPLE = "ba evaluate out/trajectory.tum ground_truth.tum --align se3"
@@ -48,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
     require_folder(args.json)
     require_folder(args.plot)
-    estimate, reference = (_poses(read_tum(path)) for path in (args.estimate, args.reference))
+    estimate, reference = (read_tum(path) for path in (args.estimate, args.reference))
     error = absolute_error(estimate, reference, args.align, args.max_difference)
     rows = []
     for name, unit, of in (("translation", "m", error.translation), ("rotation", "deg", error.rotation)):
@@ -73,17 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
         from ba_node.evaluation.plot import Comparison, draw  # noqa: PLC0415
 
+        by_time = [poses[np.argsort(poses.stamp_ns, kind="stable")] for poses in (estimate, reference)]
         with whole_file(args.plot) as stream:
-            draw(stream, Comparison(None, estimate, reference, np.empty((0, 3)), args.align))
+            draw(stream, Comparison(None, by_time[0], by_time[1], np.empty((0, 3)), args.align))
     return 0
-
-
-def _poses(trajectory: Trajectory) -> Poses:
-    """Return a trajectory by time; its poses are numbered, as the file has no ids."""
-    import numpy as np  # noqa: PLC0415
-
-    from ba_node.estimate import Poses  # noqa: PLC0415
-
-    order = np.argsort(trajectory.stamp_ns, kind="stable")
-    ids = np.arange(len(trajectory), dtype=np.uint64)
-    return Poses(ids, trajectory.stamp_ns[order], trajectory.position[order], trajectory.orientation[order])

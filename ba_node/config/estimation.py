@@ -61,7 +61,7 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class TracksConfig:
-    """How tracks become points, and when an observation is not believed."""
+    """How tracks become points, and when an observation is an outlier."""
 
     min_parallax_deg: float = option(
         1.0,

@@ -161,7 +161,7 @@ class DiagnosticsConfig:
     )
     rms_error_px: float = option(10.0, "The same as an error.", unit="px", minimum=0.0, maximum=1e6)
     inliers_warn_share: float = option(
-        0.7, "Share of observations that are believed below which it warns.", minimum=0.0, maximum=1.0
+        0.7, "Share of inliers among the observations below which it warns.", minimum=0.0, maximum=1.0
     )
     inliers_error_share: float = option(0.3, "The same as an error.", minimum=0.0, maximum=1.0)
     memory_warn_mb: float = option(

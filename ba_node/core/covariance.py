@@ -12,8 +12,8 @@ W are the IRLS weights of the losses at the solution, m the rows of residuals an
 a-posteriori variance of unit weight, near 1 where sigma_px is right. So uncertain points count (they are integrated
 out); factors count in S and in both sums like all else, and everything is relative to what the problem holds fixed.
 
-Where scale is held by a condition ``g'x = 0`` on the step of all keyframes instead of by a fixed pose, S is inverted on
-the directions that the condition leaves: with an orthonormal basis Q of them, ``S^-1 -> Q (Q' S Q)^-1 Q'``.
+Where a condition ``g'x = 0`` on the step of all keyframes fixes scale, and not a fixed pose, S is inverted on the
+directions that the condition leaves: with an orthonormal basis Q of them, ``S^-1 -> Q (Q' S Q)^-1 Q'``.
 
 A direction that nothing determines has no variance. Keyframes that take part in such a direction are unknown (NaN); the
 others keep theirs. S is scaled to a unit diagonal first, so that units do not decide what is rounding.

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Improve points alone, keyframes held: the inner iterations after a step of the keyframes.
+"""Improve points alone, keyframes fixed: the inner iterations after a step of the keyframes.
 
 Each point has its own 3 x 3 damped normal equations (Marquardt) and its own objective. A point whose step does not
 lower its objective goes back to where it was, and stays: no point can make the whole worse. Only observations of points
@@ -29,8 +29,8 @@ _MIN_PROMISE = 1e-8
 
 
 @dataclass(frozen=True)
-class Polished:
-    """What polishing did.
+class InnerIterations:
+    """What the inner iterations did.
 
     Attributes:
         state: of which only the points differ.
@@ -45,7 +45,7 @@ class Polished:
     rows: PointRows
 
 
-def polish_points(objective: Objective, structure: Structure, state: State, steps: int) -> Polished:
+def iterate_points(objective: Objective, structure: Structure, state: State, steps: int) -> InnerIterations:
     """Take up to ``steps`` damped Newton steps a point.
 
     Args:
@@ -68,7 +68,7 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         better = cost < best_cost[ids]
         if step:
             taken = np.flatnonzero(np.repeat(better, count))
-            kept.put(rows[taken], seen, taken)
+            kept.update(rows[taken], seen, taken)
         with np.errstate(invalid="ignore"):
             active = better & ~(best_cost[ids] - cost < _MIN_GAIN * cost)
         best[ids[better]], best_cost[ids[better]] = points[ids[better]], cost[better]
@@ -88,4 +88,4 @@ def polish_points(objective: Objective, structure: Structure, state: State, step
         seen = objective.point_rows(dataclasses.replace(state, points=points), rows)
         damping *= 0.1
     after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)])) + factors
-    return Polished(dataclasses.replace(state, points=best), before, after, kept)
+    return InnerIterations(dataclasses.replace(state, points=best), before, after, kept)

@@ -5,39 +5,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import scipy
 from numpy import float64
 from numpy.typing import NDArray
 
 from ba_node.core.linear import PcgLimits, Solution
-from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.problem import State
 
 FloatArray = NDArray[float64]
 
-# Up to this many unknowns numpy's kernels store S densely.
+# Up to this many unknowns PCG forms S for its products.
 DENSE_LIMIT = 3000
 
 
 @dataclass(frozen=True)
-class Moved:
+class StepResult:
     """What a step did.
 
     Attributes:
-        state: after the step and the polishing of points.
+        state: after the step and the inner iterations.
         predicted: by what the undamped model said the objective would fall, ``-g'p - 1/2 |J p|^2``.
         damping: ``1/2 mu p'D p``, which the damped model adds.
-        unpolished: objective after the step alone; NaN if the state is not finite.
+        before_inner: objective after the step alone; NaN if the state is not finite.
         objective: objective of ``state``; NaN if that is not finite.
     """
 
     state: State
     predicted: float
     damping: float
-    unpolished: float
+    before_inner: float
     objective: float
+
+
+class LinearSolver(NamedTuple):
+    """How a system is to be solved: dense, sparse or pcg, and a line that tells of it, with what it costs."""
+
+    kind: str
+    text: str
 
 
 class System(Protocol):
@@ -53,26 +59,24 @@ class System(Protocol):
     side: str
     radius_factor: float
 
-    def dense(self) -> FloatArray:
-        """Return S, (n, n)."""
+    def choose(self, asked: str) -> LinearSolver:
+        """Return how to solve systems like this one.
+
+        Args:
+            asked: ``auto`` for what costs least, ``cholesky`` for the cheapest that is exact, or one kind by its name.
+        """
+
+    def pcg_tries(self) -> int:
+        """Return how many steps of PCG to try before an exact solution, as they cost next to nothing; 0 for none."""
 
     def solve_dense(self) -> FloatArray | None:
         """Return the solution by dense Cholesky; None if S is not positive definite."""
 
-    def sparse(self) -> scipy.sparse.spmatrix:
-        """Return S, sparse."""
-
-    def sizes(self) -> Sizes | None:
-        """Return what each linear solver would have to do; None if that is not known."""
-
-    def factor_size(self, max_blocks: int, max_products: float) -> Factor:
-        """Return the size of the sparse factor, or how far it was counted until it was more than the limits."""
-
     def solve_sparse(self) -> FloatArray | None:
         """Return the solution by sparse Cholesky; None if S is not positive definite."""
 
-    def pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution | None:
-        """Solve ``S x = rhs`` by the kernels' own PCG in the space ``D x``; None if they have none.
+    def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
+        """Return the solution by PCG in the space ``D x``, in the space that is not scaled.
 
         Args:
             kind: preconditioner.
@@ -81,20 +85,23 @@ class System(Protocol):
             formed: form S for the products.
         """
 
-    def product(self, x: FloatArray) -> FloatArray:
-        """Return S x without forming S."""
-
-    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
-        """Return the diagonal blocks of S in runs of equal size, each (n, d, d)."""
-
-    def own_blocks(self) -> tuple[FloatArray, ...]:
-        """Return the diagonal blocks of the damped H that belong to the unknowns of S, as diagonal_blocks."""
-
     def gather(self, of_keyframes: FloatArray, of_points: FloatArray) -> FloatArray:
         """Return (n,) what belongs to the unknowns of S out of values (n_free, d) and (n_points, 3)."""
 
     def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return steps (n_free, d), (n_points, 3) and the reduction ``-g'p - 1/2 |J p|^2`` of the undamped model."""
+
+    def dense(self) -> FloatArray:
+        """Return S, (n, n)."""
+
+    def sparse(self) -> scipy.sparse.spmatrix:
+        """Return S, sparse."""
+
+    def product(self, x: FloatArray) -> FloatArray:
+        """Return S x without forming S."""
+
+    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
+        """Return the diagonal blocks of S in runs of equal size, each (n, d, d)."""
 
 
 class Kernels(Protocol):
@@ -103,9 +110,6 @@ class Kernels(Protocol):
     n_free: int
     size: int
     gradient_norm: float
-
-    def graduate(self, graduation: float) -> None:
-        """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself. See annealing.py."""
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
@@ -119,8 +123,8 @@ class Kernels(Protocol):
     def damp(self, kind: str, mu: float) -> System:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate."""
 
-    def move(self, state: State, system: System, x: FloatArray, polish_steps: int) -> Moved:
-        """Take the step whose part in ``system`` is x, and polish the points after it.
+    def step(self, state: State, system: System, x: FloatArray, inner_iterations: int) -> StepResult:
+        """Take the step whose part in ``system`` is x, and the inner iterations after it.
 
         The kernels may write over what this returned two calls before.
         """
@@ -128,5 +132,5 @@ class Kernels(Protocol):
     def objective(self, state: State) -> float:
         """Return the robust objective."""
 
-    def polish_points(self, state: State, steps: int) -> tuple[float, State]:
-        """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
+    def iterate_points(self, state: State, iterations: int) -> tuple[float, State]:
+        """Improve every point alone by up to so many damped Newton steps; return the objective and the state."""

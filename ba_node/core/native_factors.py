@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,8 @@ from ba_node import native
 from ba_node.core.factors import FactorSum, FactorTerms, KeyframeFactors, RelativePoses
 from ba_node.core.problem import State
 
-# As in the enum of adjustment/relative_poses.hpp.
-_LOSSES = ("squared", "huber", "cauchy")
+if TYPE_CHECKING:
+    from ba_node.native._kernels import RelativePoses as CompiledPoses
 
 
 class NativeFactorSum(FactorSum):
@@ -30,28 +30,17 @@ class NativeFactorSum(FactorSum):
         """Return 1/2 sum Psi."""
         total = 0.0
         for kind, kernel in zip(self._factors, self._kernels, strict=True):
-            total += self._value(kind, state) if kernel is None else kernel.value(state.rotation, state.translation)
+            total += self._value(kind, state) if kernel is None else kernel.value(state)
         return total
 
     def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms) -> float:
         kernel = self._kernels[number]
         if kernel is None:
             return super()._add(kind, number, state, terms)
-        value: float = kernel.linearise(
-            state.rotation, state.translation, terms.gradient, terms.diagonal, terms.pairs.blocks
-        )
-        return value
+        return kernel.linearise(state, terms.gradient, terms.diagonal, terms.pairs.blocks)
 
-    def _kernel(self, kind: KeyframeFactors, number: int) -> Any:
-        if not isinstance(kind, RelativePoses) or kind.loss not in _LOSSES:
+    def _kernel(self, kind: KeyframeFactors, number: int) -> CompiledPoses | None:
+        if not isinstance(kind, RelativePoses) or kind.loss not in native.LOSSES:
             return None
-        return native.kernels.RelativePoses(
-            keyframes=kind.keyframes,
-            rotation=kind.rotation,
-            translation=kind.translation,
-            root_information=kind.root_information,
-            loss=_LOSSES.index(kind.loss),
-            loss_scale=kind.loss_scale,
-            column=self._column,
-            pair=self._pair[number][:, 0],
-        )
+        kernel: CompiledPoses = native.kernels.RelativePoses(kind, self._column, self._pair[number][:, 0])
+        return kernel

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.config import SolverOptions
-from ba_node.core import scaling
-from ba_node.core.kernels import Kernels, Moved, System
+from ba_node.core import linear_costs, scaling
+from ba_node.core.kernels import Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.native_factors import NativeFactorSum
@@ -22,12 +22,10 @@ from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Problem, State
 
-FloatArray = NDArray[np.float64]
+if TYPE_CHECKING:
+    from ba_node.native._kernels import Kernel
 
-# As in the enums of kernel.hpp.
-_LOSSES = ("squared", "huber", "cauchy")
-_CHEIRALITY = ("keep", "constant", "drop")
-_PRECONDITIONERS = ("none", "schur_block", "schur_diag", "b_block", "b_diag")
+FloatArray = NDArray[np.float64]
 
 
 class KernelsError(ValueError):
@@ -59,22 +57,10 @@ def missing(options: SolverOptions) -> str:
     return reason
 
 
-def residual_norms(problem: Problem, state: State, backend: str = "auto") -> FloatArray:
+def residual_norms(problem: Problem, state: State, kernels: str = "auto") -> FloatArray:
     """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see."""
-    if backend != "numpy" and native.kernels is not None and not problem.free_intrinsics:
-        obs, cams = problem.observations, problem.cameras
-        norms: FloatArray = native.kernels.residual_norms(
-            keyframe=obs.keyframe,
-            camera=obs.camera,
-            point=obs.point,
-            uv=obs.uv,
-            sigma_px=obs.sigma_px,
-            camera_rotation=cams.rotation,
-            camera_translation=cams.translation,
-            camera_model=cams.model,
-            camera_params=cams.params,
-            state=_arrays(state),
-        )
+    if kernels != "numpy" and native.kernels is not None and not problem.free_intrinsics:
+        norms: FloatArray = native.kernels.residual_norms(problem, state)
         return norms
     error = reprojection_errors(problem, state)
     return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
@@ -85,52 +71,31 @@ class NativeKernels:
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
         """Hand the problem over; it is copied and sorted once."""
-        obs, cams = problem.observations, problem.cameras
         self.size = 9 if problem.free_intrinsics else 6
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
-        make_kernel = native.kernels.Kernel9 if problem.free_intrinsics else native.kernels.Kernel6
-        self._kernel: Any = make_kernel(
-            keyframe=obs.keyframe,
-            camera=obs.camera,
-            point=obs.point,
-            uv=obs.uv,
-            sigma_px=obs.sigma_px,
-            depth_m=obs.depth_m,
-            depth_sigma_m=obs.depth_sigma_m,
-            camera_rotation=cams.rotation,
-            camera_translation=cams.translation,
-            camera_model=cams.model,
-            camera_params=cams.params,
-            fixed=problem.fixed,
-            loss=_LOSSES.index(options.loss),
-            loss_scale=options.loss_scale_px,
-            cheirality=_CHEIRALITY.index(options.cheirality),
-            factor_pairs=_NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns),
-            threads=options.threads or len(os.sched_getaffinity(0)),
-            start=_arrays(problem.start),
-        )
+        pairs = _NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns)
+        threads = options.threads or len(os.sched_getaffinity(0))
+        cost = (options.loss, options.loss_scale_px, options.cheirality)
+        self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
-        self._system = _NativeSystem(self._kernel, self.size)
+        self._system = NativeSystem(self._kernel, self.size)
         # Where steps lead, in turn: the state that a step starts from is one of them.
         self._states = [_like(problem.start), _like(problem.start)]
-        self._moved: Moved | None = None
-
-    def graduate(self, graduation: float) -> None:
-        """Do nothing: these kernels have no truncated quadratic."""
+        self._stepped: StepResult | None = None
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        moved, self._moved = self._moved, None
-        # Polishing has seen all of it where it ended.
-        if moved is not None and state is moved.state and self._kernel.linearise_polished():
-            value = moved.objective
+        stepped, self._stepped = self._stepped, None
+        # The inner iterations have seen all of it where they ended.
+        if stepped is not None and state is stepped.state and self._kernel.linearise_prepared():
+            value = stepped.objective
         else:
-            moved, value = None, self._kernel.linearise(_arrays(state))
+            stepped, value = None, self._kernel.linearise(state)
         if self._factors is not None:
             terms = self._factors.linearise(state)
             self._kernel.add_factors(terms.diagonal, terms.gradient, terms.pairs.blocks)
-            value += terms.value if moved is None else 0.0
+            value += terms.value if stepped is None else 0.0
         self.gradient_norm = self._kernel.gradient_norm
         return value
 
@@ -139,12 +104,12 @@ class NativeKernels:
         d_c, d_p = self._kernel.diagonals()
         return d_c, d_p
 
-    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NativeSystem:
         """Add damping to the diagonals and eliminate the points."""
         self._kernel.factor(damping_c, damping_p)
         return self._system.renew()
 
-    def damp(self, kind: str, mu: float) -> System:
+    def damp(self, kind: str, mu: float) -> NativeSystem:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate the points."""
         if kind == "inc":
             d_c, d_p = scaling.diagonals(kind, self.diagonals())
@@ -152,26 +117,26 @@ class NativeKernels:
         self._kernel.damp(kind == "diag", 0.0 if kind == "none" else mu)
         return self._system.renew()
 
-    def move(self, state: State, _system: System, x: FloatArray, polish_steps: int) -> Moved:
-        """Take the step whose part in the system is x, and polish the points after it; see Kernels."""
+    def step(self, state: State, _system: System, x: FloatArray, inner_iterations: int) -> StepResult:
+        """Take the step whose part in the system is x, and the inner iterations after it; see Kernels."""
         target = self._states[self._states[0] is state]
-        predicted, damping, value, polished = self._kernel.move(_arrays(state), x, polish_steps, _arrays(target))
+        predicted, damping, value, inner = self._kernel.step(state, x, inner_iterations, target)
         if self._factors is not None and np.isfinite(value):
             factors = self._factors.value(target)
-            value, polished = value + factors, polished + factors
-        moved = Moved(target, predicted, damping, value, polished)
-        self._moved = moved if polish_steps and np.isfinite(polished) else None
-        return moved
+            value, inner = value + factors, inner + factors
+        stepped = StepResult(target, predicted, damping, value, inner)
+        self._stepped = stepped if inner_iterations and np.isfinite(inner) else None
+        return stepped
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
-        value: float = self._kernel.objective(_arrays(state))
+        value: float = self._kernel.objective(state)
         return value + self._value_of_factors(state)
 
-    def polish_points(self, state: State, steps: int) -> tuple[float, State]:
-        """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
-        self._moved = None
-        _before, value, points = self._kernel.polish_points(_arrays(state), steps)
+    def iterate_points(self, state: State, iterations: int) -> tuple[float, State]:
+        """Improve every point alone by up to so many damped Newton steps; return the objective and the state."""
+        self._stepped = None
+        _before, value, points = self._kernel.inner_iterations(state, iterations)
         value += self._value_of_factors(state)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
 
@@ -179,22 +144,19 @@ class NativeKernels:
         return 0.0 if self._factors is None else self._factors.value(state)
 
 
-def _arrays(state: State) -> tuple[FloatArray, ...]:
-    return state.rotation, state.translation, state.points, state.intrinsics
-
-
 def _like(state: State) -> State:
     """Return room for a state of the same size."""
-    return State(*(np.empty(array.shape) for array in _arrays(state)))
+    arrays = (state.rotation, state.translation, state.points, state.intrinsics)
+    return State(*(np.empty(array.shape) for array in arrays))
 
 
-class _NativeSystem:
+class NativeSystem:
     """The kernel's current reduced system; valid until the next linearisation or reduction."""
 
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, kernel: Any, size: int) -> None:
+    def __init__(self, kernel: Kernel, size: int) -> None:
         self._kernel, self._size = kernel, size
         n = kernel.n_free * size
         self.rhs: FloatArray = np.empty(n)
@@ -202,7 +164,7 @@ class _NativeSystem:
         # These are written in every iteration; S only where it is asked for.
         self._x, self._dense = np.empty(n), np.empty((0, 0))
 
-    def renew(self) -> System:
+    def renew(self) -> NativeSystem:
         """Return the system after another reduction."""
         self._kernel.rhs(self.rhs)
         return self
@@ -234,6 +196,22 @@ class _NativeSystem:
         edges, pairs = self._kernel.pairs()
         return Sizes(len(self.rhs), self._size, edges, pairs)
 
+    def choose(self, asked: str) -> LinearSolver:
+        """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
+        sizes = self.sizes()
+        if asked in ("dense", "pcg"):
+            return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), None, None))
+        exact = asked == "cholesky"
+        limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=exact)
+        factor = self.factor_size(linear_costs.max_blocks(sizes.block), limit)
+        if asked != "sparse" or not factor.complete:
+            asked = linear_costs.cheapest(sizes, factor, exact=exact)
+        return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), sizes, factor))
+
+    def pcg_tries(self) -> int:
+        """Return how many steps of PCG to try before an exact solution."""
+        return linear_costs.pcg_tries(self.sizes())
+
     def factor_size(self, max_blocks: int, max_products: float) -> Factor:
         """Return the size of the sparse factor; found at the first call with limits that it meets."""
         complete, blocks, products = self._kernel.analyse(max_blocks, max_products)
@@ -244,19 +222,14 @@ class _NativeSystem:
         x: FloatArray | None = self._kernel.solve_sparse()
         return x
 
-    def pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
+    def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
-        bounds = (limits.t_eps, limits.max_iterations, limits.radius, limits.q_eps)
-        found, steps, on_boundary = self._kernel.pcg(scale, _PRECONDITIONERS.index(kind), bounds, formed, self._x)
+        found, steps, on_boundary = self._kernel.pcg(scale, kind, limits, formed, self._x)
         return Solution(self._x if found else None, steps, on_boundary)
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S, (n_free, d, d)."""
         return (self._kernel.diagonal_blocks(),)
-
-    def own_blocks(self) -> tuple[FloatArray, ...]:
-        """Refuse: PCG makes its preconditioner inside the kernels."""
-        raise KernelsError("the C++ kernels give no blocks of B away; take backend numpy")
 
     def gather(self, of_keyframes: FloatArray, _of_points: FloatArray) -> FloatArray:
         """Return what belongs to the unknowns of S out of values for all unknowns."""

@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from ba_node.config import SolverOptions
-from ba_node.core import columns, inner_iterations, linear, parameterisation, scaling
-from ba_node.core.blocks import condition
-from ba_node.core.kernels import DENSE_LIMIT, Moved, System
-from ba_node.core.linear_costs import MAX_BYTES, Factor
+from ba_node.core import blocks, columns, linear, linear_costs, scaling
+from ba_node.core.inner_iterations import InnerIterations, iterate_points
+from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System
 from ba_node.core.objective import Linearisation, Objective
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
@@ -45,16 +47,16 @@ class NumpyKernels:
         self._linearisation: Linearisation
         self._equations: NormalEquations
         self._damping: tuple[FloatArray, FloatArray]
-        # The rows at the last state that points were polished at: if the step is taken they are asked for again.
-        self._polished: inner_iterations.Polished | None = None
+        # Where the last inner iterations ended: if the step is taken the rows there are asked for again.
+        self._ended: InnerIterations | None = None
 
     def graduate(self, graduation: float) -> None:
         """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself."""
-        self._objective.graduation, self._polished = graduation, None
+        self._objective.graduation, self._ended = graduation, None
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        known = self._polished.rows if self._polished is not None and self._polished.state is state else None
+        known = self._ended.rows if self._ended is not None and self._ended.state is state else None
         self._linearisation = self._objective.linearise(state, known)
         self._equations = normal_equations(self._structure, self._linearisation)
         self.gradient_norm = self._equations.gradient_norm
@@ -64,48 +66,35 @@ class NumpyKernels:
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
         return self._equations.diagonals()
 
-    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NumpySystem:
         """Add damping to the diagonals and eliminate."""
         side, factor = self._options.schur, 1.0
         if side == "adaptive":
             side, factor = self._adapt(damping_c, damping_p)
         reduction = _SIDES[side](self._structure, self._equations, damping_c, damping_p)
-        system = _NumpySystem(reduction, self._structure, self._equations, self._linearisation)
+        system = NumpySystem(reduction, self._structure, self._equations, self._linearisation)
         system.radius_factor = factor
         return system
 
-    def damp(self, kind: str, mu: float) -> System:
+    def damp(self, kind: str, mu: float) -> NumpySystem:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate."""
         d_c, d_p = scaling.diagonals(kind, self.diagonals())
         self._damping = mu * d_c, mu * d_p
         return self.reduce(*self._damping)
 
-    def move(self, state: State, system: System, x: FloatArray, polish_steps: int) -> Moved:
-        """Take the step whose part in ``system`` is x, and polish the points after it."""
+    def step(self, state: State, system: System, x: FloatArray, inner_iterations: int) -> StepResult:
+        """Take the step whose part in ``system`` is x, and the inner iterations after it."""
         step_c, step_p, predicted = system.back_substitute(x)
         d_c, d_p = self._damping
         damping = 0.5 * float(np.sum(d_c * step_c**2) + np.sum(d_p * step_p**2))
-        moved = self._retract(state, step_c, step_p)
-        if not moved.is_finite():
-            return Moved(moved, predicted, damping, np.nan, np.nan)
-        if not polish_steps:
-            value = self.objective(moved)
-            return Moved(moved, predicted, damping, value, value)
-        found = self._polished = inner_iterations.polish_points(self._objective, self._structure, moved, polish_steps)
-        return Moved(found.state, predicted, damping, found.before, found.after)
-
-    def _retract(self, state: State, step_c: FloatArray, step_p: FloatArray) -> State:
-        """Return the state after a step (n_free, d) and (n_points, 3)."""
-        free = self._free
-        rotation, translation = state.rotation.copy(), state.translation.copy()
-        rotation[free], translation[free] = parameterisation.retract(
-            self._options.parameterisation, rotation[free], translation[free], step_c[:, :6]
-        )
-        intrinsics = state.intrinsics
-        if len(intrinsics):
-            intrinsics = intrinsics.copy()
-            intrinsics[free] += step_c[:, 6:]
-        return State(rotation, translation, state.points + step_p, intrinsics)
+        stepped = self._objective.retract(state, step_c, step_p, self._free)
+        if not stepped.is_finite():
+            return StepResult(stepped, predicted, damping, np.nan, np.nan)
+        if not inner_iterations:
+            value = self.objective(stepped)
+            return StepResult(stepped, predicted, damping, value, value)
+        found = self._ended = iterate_points(self._objective, self._structure, stepped, inner_iterations)
+        return StepResult(found.state, predicted, damping, found.before, found.after)
 
     def _adapt(self, damping_c: FloatArray, damping_p: FloatArray) -> tuple[str, float]:
         """Return the side to eliminate and what the radius becomes there (Algorithm 10).
@@ -119,7 +108,7 @@ class NumpyKernels:
         equations, size = self._equations, self.size
         b = columns.plus_diagonal(equations.b, damping_c)
         c = columns.plus_diagonal(equations.c, damping_p)
-        if condition(c) < condition(b):
+        if blocks.condition(c) < blocks.condition(b):
             return "points", 1.0
         return "cameras", 3.0 * self._structure.n_points / (size * self.n_free)
 
@@ -127,13 +116,13 @@ class NumpyKernels:
         """Return the robust objective."""
         return self._objective.value(state)
 
-    def polish_points(self, state: State, steps: int) -> tuple[float, State]:
-        """Improve every point alone by up to ``steps`` damped Newton steps; return the objective and the state."""
-        found = inner_iterations.polish_points(self._objective, self._structure, state, steps)
+    def iterate_points(self, state: State, iterations: int) -> tuple[float, State]:
+        """Improve every point alone by up to so many damped Newton steps; return the objective and the state."""
+        found = iterate_points(self._objective, self._structure, state, iterations)
         return found.after, found.state
 
 
-class _NumpySystem:
+class NumpySystem:
     """A reduction that also knows the full model."""
 
     radius_factor = 1.0
@@ -155,25 +144,39 @@ class _NumpySystem:
         """Return the solution by dense Cholesky; None if S is not positive definite."""
         return linear.cholesky(self.dense(), self.rhs).x
 
-    def pcg(self, _kind: str, _scale: FloatArray, _limits: linear.PcgLimits, *, formed: bool) -> None:
-        """Leave PCG to linear.py."""
+    def solve_pcg(self, kind: str, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool) -> linear.Solution:
+        """Return the solution by PCG in the space scaled by 1 / ``scale``."""
+        matrix = self.dense() if formed else None
+        if matrix is not None:
+            matrix *= scale[:, None]
+            matrix *= scale
+
+        def product(x: FloatArray) -> FloatArray:
+            return np.asarray(matrix @ x) if matrix is not None else scale * self.product(scale * x)
+
+        found = linear.pcg_steihaug(product, scale * self.rhs, preconditioner(kind, self, scale), limits)
+        return replace(found, x=None if found.x is None else scale * found.x)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""
         return np.asarray(self._matrix @ x) if self._matrix is not None else self._reduction.product(x)
 
-    def sizes(self) -> None:
-        """Return nothing: dense up to DENSE_LIMIT unknowns, then whatever is asked for."""
+    def choose(self, asked: str) -> LinearSolver:
+        """Return how to solve systems like this one: dense while S is small, as scipy counts nothing beforehand."""
+        n = len(self.rhs)
+        if asked in ("auto", "cholesky"):
+            asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
+        return LinearSolver(asked, linear_costs.describe(asked, n, None, None))
 
-    def factor_size(self, _max_blocks: int, _max_products: float) -> Factor:
-        """Refuse to count: scipy finds its own order."""
-        return Factor(0, 0.0, complete=False)
+    def pcg_tries(self) -> int:
+        """Try no steps of PCG: in numpy they cost as much as an exact solution."""
+        return 0
 
     def solve_sparse(self) -> FloatArray | None:
         """Return the solution by scipy's sparse factorisation; None if S is not positive definite."""
         matrix = self.sparse()
         n = len(self.rhs)
-        if matrix.nnz > _DENSE_SHARE * n * n and 8.0 * n * n <= MAX_BYTES:
+        if matrix.nnz > _DENSE_SHARE * n * n and 8.0 * n * n <= linear_costs.MAX_BYTES:
             return linear.cholesky(np.asarray(matrix.toarray()), self.rhs).x
         return linear.cholesky(matrix, self.rhs).x
 
@@ -186,3 +189,29 @@ class _NumpySystem:
         if self._linearisation.factors is not None:
             curvature += self._linearisation.factors.curvature(step_c)
         return step_c, step_p, -float(slope) - 0.5 * curvature
+
+
+def preconditioner(kind: str, system: NumpySystem, scale: FloatArray) -> linear.Product:
+    """Return ``r -> M^-1 r`` for the system scaled by ``scale`` = 1/D, (n,)."""
+    if kind == "none":
+        return lambda r: r
+    parts = system.diagonal_blocks() if kind.startswith("schur") else system.own_blocks()
+    if kind.endswith("diag"):
+        diagonal = np.concatenate([np.diagonal(part, axis1=1, axis2=2).ravel() for part in parts]) * scale * scale
+        inverse = np.where(diagonal > 0.0, 1.0 / np.where(diagonal > 0.0, diagonal, 1.0), 1.0)
+        return lambda r: inverse * r
+    bounds = np.cumsum([0] + [part.shape[0] * part.shape[1] for part in parts])
+    spans = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
+    inverses = []
+    for part, span in zip(parts, spans, strict=True):
+        s = scale[span].reshape(-1, part.shape[1])
+        inverses.append(blocks.positive_inverses(part * s[:, :, None] * s[:, None, :]))
+
+    def apply(r: FloatArray) -> FloatArray:
+        pieces = [
+            (inverse @ r[span].reshape(-1, inverse.shape[1], 1)).ravel()
+            for inverse, span in zip(inverses, spans, strict=True)
+        ]
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+
+    return apply

@@ -81,14 +81,14 @@ class PointRows:
     residual: FloatArray
     d_point: FloatArray
 
-    def put(self, rows: IntArray, other: PointRows, taken: IntArray) -> None:
+    def update(self, rows: IntArray, other: PointRows, taken: IntArray) -> None:
         """Write over some rows with some of another's."""
         for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
             columns.put(mine, rows, columns.take(its, taken))
 
 
 @dataclass(frozen=True)
-class _Known:
+class _Observed:
     """What is known of some observations; of what is the same for all in the problem there is one row.
 
     Attributes:
@@ -113,7 +113,7 @@ class _Known:
     depth_weight: FloatArray
     ignored: BoolArray
 
-    def part(self, rows: IntArray | slice) -> _Known:
+    def part(self, rows: IntArray | slice) -> _Observed:
         """Return what is known of some of them."""
         n = len(self.point)
         parts: dict[str, Any] = {name: columns.take(a, rows) for name, a in vars(self).items() if len(a) == n}
@@ -143,7 +143,7 @@ class Objective:
         self._image_keyframe, self._image_camera = images // n_cam, images % n_cam
         self._has_depth = len(obs.depth_m) > 0
         depth_weight = np.nan_to_num(1.0 / obs.depth_sigma_m) * np.isfinite(obs.depth_m)
-        self._all = _Known(
+        self._all = _Observed(
             image,
             obs.point,
             np.asfortranarray(obs.uv),
@@ -180,11 +180,11 @@ class Objective:
 
     def costs(self, state: State, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Return Psi of some observations, (n,)."""
-        return self._judge(state, self._all.part(rows))[1]
+        return self._evaluate(state, self._all.part(rows))[1]
 
     def weighted_squares(self, state: State) -> tuple[float, int]:
         """Return ``r' W r`` with the IRLS weights W, and the number of rows that count (not those behind a camera)."""
-        residual, _, root_weight, masked = self._judge(state, self._all)
+        residual, _, root_weight, masked = self._evaluate(state, self._all)
         weighted = residual * root_weight
         rows = 2 * (len(residual) - len(masked))
         if self._has_depth:
@@ -211,7 +211,7 @@ class Objective:
         """Return costs, residuals and derivatives by the points of some observations."""
         return self._rows(state, self._all.part(rows), intrinsics=False)[0]
 
-    def _rows(self, state: State, of: _Known, *, intrinsics: bool) -> tuple[PointRows, FloatArray]:
+    def _rows(self, state: State, of: _Observed, *, intrinsics: bool) -> tuple[PointRows, FloatArray]:
         """Return the points' rows, and the derivatives by f, k1, k2 (n, d, 3 or 0), all weighted."""
         x_cam, rotation = self._in_camera(state, of)
         masked = self._mask(x_cam, of)
@@ -235,15 +235,27 @@ class Objective:
         residual *= root_weight
         return PointRows(costs, residual, columns.product(d_cam, rotation)), d_intrinsics
 
-    def retract(self, state: State, step_keyframes: FloatArray, step_points: FloatArray) -> State:
-        """Return the state after a step: (n_kf, 6 or 9) and (n_pt, 3)."""
-        rotation, translation = parameterisation.retract(
-            self.cost_model.parameterisation, state.rotation, state.translation, step_keyframes[:, :6]
+    def retract(
+        self, state: State, step_keyframes: FloatArray, step_points: FloatArray, of: IntArray | slice = slice(None)
+    ) -> State:
+        """Return the state after a step.
+
+        Args:
+            state: before it.
+            step_keyframes: (n, 6 or 9) of some keyframes, or of all.
+            step_points: (n_pt, 3).
+            of: (n,) which keyframes.
+        """
+        rotation, translation, intrinsics = state.rotation.copy(), state.translation.copy(), state.intrinsics
+        rotation[of], translation[of] = parameterisation.retract(
+            self.cost_model.parameterisation, rotation[of], translation[of], step_keyframes[:, :6]
         )
-        intrinsics = state.intrinsics + step_keyframes[:, 6:] if len(state.intrinsics) else state.intrinsics
+        if len(intrinsics):
+            intrinsics = intrinsics.copy()
+            intrinsics[of] += step_keyframes[:, 6:]
         return State(rotation, translation, state.points + step_points, intrinsics)
 
-    def _in_camera(self, state: State, of: _Known) -> tuple[FloatArray, FloatArray]:
+    def _in_camera(self, state: State, of: _Observed) -> tuple[FloatArray, FloatArray]:
         """Return points in their camera's optical frame, (n, 3), m, and (n, 3, 3) camera from world."""
         cams = self.problem.cameras
         rotation_cb = cams.rotation[self._image_camera]
@@ -253,7 +265,7 @@ class Objective:
         x_cam += columns.take(moved + cams.translation[self._image_camera], of.image)
         return x_cam, rotation
 
-    def _params(self, state: State, of: _Known) -> FloatArray:
+    def _params(self, state: State, of: _Observed) -> FloatArray:
         """Return the camera parameters of observations, with the keyframe's own f, k1, k2 put in if free."""
         if not self.problem.free_intrinsics:
             return of.params
@@ -265,7 +277,7 @@ class Objective:
         params[:, 4:6] += own[:, 1:]
         return params
 
-    def _mask(self, x_cam: FloatArray, of: _Known) -> IntArray:
+    def _mask(self, x_cam: FloatArray, of: _Observed) -> IntArray:
         """Return which observations push nothing, and move their points off the plane so that nothing is infinite."""
         hidden = cameras.behind(x_cam, of.model)
         if self.cost_model.cheirality == "keep":
@@ -275,7 +287,7 @@ class Objective:
         x_cam[masked] = (0.0, 0.0, 1.0)
         return masked
 
-    def _judge(self, state: State, of: _Known) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    def _evaluate(self, state: State, of: _Observed) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
         """Return residuals that are not weighted, costs and root weights as of _costs, and which are masked."""
         x_cam, _ = self._in_camera(state, of)
         masked = self._mask(x_cam, of)
@@ -283,7 +295,7 @@ class Objective:
         residual = self._residual(uv, x_cam, masked, of)
         return residual, *self._costs(residual, masked, of), masked
 
-    def _residual(self, uv: FloatArray, x_cam: FloatArray, masked: IntArray, of: _Known) -> FloatArray:
+    def _residual(self, uv: FloatArray, x_cam: FloatArray, masked: IntArray, of: _Observed) -> FloatArray:
         residual = columns.empty(len(uv), 3 if self._has_depth else 2)
         np.multiply(uv - of.uv, of.weight[:, None], out=residual[:, :2])
         if self._has_depth:
@@ -291,7 +303,7 @@ class Objective:
         residual[masked] = 0.0
         return residual
 
-    def _costs(self, residual: FloatArray, masked: IntArray, of: _Known) -> tuple[FloatArray, FloatArray]:
+    def _costs(self, residual: FloatArray, masked: IntArray, of: _Observed) -> tuple[FloatArray, FloatArray]:
         """Return Psi of each observation and the square root of the weight of each row, (n, 1) or (n, 3)."""
         norm = np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)
         cost, weight = self._loss(norm)
@@ -310,7 +322,7 @@ class Objective:
     def _loss(self, norm: FloatArray) -> tuple[FloatArray, FloatArray]:
         return loss.evaluate(self.cost_model.loss, norm, self.cost_model.loss_scale_px, self.graduation)
 
-    def _row_scale(self, root_weight: FloatArray, of: _Known) -> FloatArray:
+    def _row_scale(self, root_weight: FloatArray, of: _Observed) -> FloatArray:
         """Return sqrt(weight) / sigma of each row, (n, 1 or 3)."""
         scale = root_weight * of.weight[:, None]
         if self._has_depth:

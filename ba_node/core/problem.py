@@ -100,11 +100,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem: start values, what is held fixed, cameras and observations.
+    """A problem: start values, what is fixed, cameras and observations.
 
     Attributes:
         start: where the solver begins.
-        fixed: (n_kf,) True where the pose (and intrinsics) of a keyframe is held.
+        fixed: (n_kf,) True where the pose (and intrinsics) of a keyframe is fixed.
         cameras: the rig.
         observations: sorted by point.
         factors: all terms of the objective that are not reprojections, see factors.py.

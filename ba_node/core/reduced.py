@@ -12,15 +12,13 @@ Where a step of PCG costs next to nothing beside an exact solution, PCG is tried
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.config import SolverOptions
-from ba_node.core import blocks, linear, linear_costs, scaling
+from ba_node.core import linear, scaling
 from ba_node.core.kernels import DENSE_LIMIT, System
 
 FloatArray = NDArray[np.float64]
@@ -35,20 +33,16 @@ class ReducedSolver:
 
     Attributes:
         kind: dense, sparse or pcg; empty while none has been needed.
+        text: how the systems were solved, for the report, with what it costs.
     """
 
     def __init__(self, options: SolverOptions) -> None:
         """Keep the choices."""
         self._options = options
         self.kind = ""
-        self._text: Callable[[], str] = str
+        self.text = ""
         # Steps of PCG to be tried before an exact solver; 0 once they did not get there; None before the first system.
         self._tries: int | None = None
-
-    @property
-    def text(self) -> str:
-        """Return how the systems were solved, for the report, with what it costs."""
-        return self._text()
 
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
@@ -82,10 +76,9 @@ class ReducedSolver:
     def _worth_trying(self, system: System) -> int:
         """Return how many steps of PCG to try before an exact solver."""
         options = self._options
-        sizes = system.sizes() if options.linear_solver == "auto" and options.trust_region == "none" else None
-        tries = linear_costs.pcg_tries(sizes) if sizes is not None else 0
+        tries = system.pcg_tries() if options.linear_solver == "auto" and options.trust_region == "none" else 0
         if tries:
-            self._text = lambda: f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
+            self.text = f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
         return tries
 
     def _try(self, system: System, hessian: Hessian, steps: int) -> linear.Solution:
@@ -99,63 +92,13 @@ class ReducedSolver:
     def _pcg(
         self, system: System, hessian: Hessian, limits: linear.PcgLimits, kind: str, *, formed: bool
     ) -> linear.Solution:
-        """Solve by PCG with a preconditioner, by the kernels' own where they have one."""
+        """Solve by PCG with a preconditioner, in the scaled space."""
         scale = 1.0 / system.gather(*scaling.scaled_space(self._options.scaled_space, hessian()))
-        found = system.pcg(kind, scale, limits, formed=formed)
-        if found is None:
-            precondition = preconditioner(kind, system, scale)
-            found = linear.pcg_steihaug(_scaled_product(system, scale), scale * system.rhs, precondition, limits)
-            found = replace(found, x=None if found.x is None else scale * found.x)
-        return found
+        return system.solve_pcg(kind, scale, limits, formed=formed)
 
     def _choose(self, system: System) -> None:
         """Settle on a linear solver."""
-        asked, n = self._options.linear_solver, len(system.rhs)
+        asked = self._options.linear_solver
         if asked == "auto" and self._options.trust_region != "none":
             asked = "pcg"
-        sizes = system.sizes() if asked in ("auto", "cholesky", "sparse") else None
-        factor = None
-        if sizes is not None:
-            limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=asked == "cholesky")
-            factor = system.factor_size(linear_costs.max_blocks(sizes.block), limit)
-            if asked != "sparse" or not factor.complete:
-                asked = linear_costs.cheapest(sizes, factor, exact=asked == "cholesky")
-        elif asked in ("auto", "cholesky"):
-            asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
-        self.kind, self._text = asked, lambda: linear_costs.describe(asked, n, sizes, factor)
-
-
-def preconditioner(kind: str, system: System, scale: FloatArray) -> linear.Product:
-    """Return ``r -> M^-1 r`` for the system scaled by ``scale`` = 1/D, (n,)."""
-    if kind == "none":
-        return lambda r: r
-    parts = system.diagonal_blocks() if kind.startswith("schur") else system.own_blocks()
-    if kind.endswith("diag"):
-        diagonal = np.concatenate([np.diagonal(part, axis1=1, axis2=2).ravel() for part in parts]) * scale * scale
-        inverse = np.where(diagonal > 0.0, 1.0 / np.where(diagonal > 0.0, diagonal, 1.0), 1.0)
-        return lambda r: inverse * r
-    bounds = np.cumsum([0] + [part.shape[0] * part.shape[1] for part in parts])
-    spans = [slice(int(a), int(b)) for a, b in itertools.pairwise(bounds)]
-    inverses = []
-    for part, span in zip(parts, spans, strict=True):
-        s = scale[span].reshape(-1, part.shape[1])
-        inverses.append(blocks.positive_inverses(part * s[:, :, None] * s[:, None, :]))
-
-    def apply(r: FloatArray) -> FloatArray:
-        pieces = [
-            (inverse @ r[span].reshape(-1, inverse.shape[1], 1)).ravel()
-            for inverse, span in zip(inverses, spans, strict=True)
-        ]
-        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-
-    return apply
-
-
-def _scaled_product(system: System, scale: FloatArray) -> linear.Product:
-    """Return x -> D^-1 S D^-1 x."""
-    if len(scale) <= DENSE_LIMIT:
-        matrix = system.dense()
-        matrix *= scale[:, None]
-        matrix *= scale
-        return lambda x: np.asarray(matrix @ x)
-    return lambda x: scale * system.product(scale * x)
+        self.kind, self.text = system.choose(asked)

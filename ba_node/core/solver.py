@@ -3,7 +3,7 @@
 """One loop for every method: damped, trust-region, inexact Newton steps on the reduced system (Algorithms 5, 8 to 11).
 
 Each outer iteration linearises, damps (``H + mu D``), eliminates the points (or the keyframes, or nothing), solves
-what is left by Cholesky or by PCG inside ``|D x| <= radius``, substitutes back, and judges the step by the gain ratio
+what is left by Cholesky or by PCG inside ``|D x| <= radius``, substitutes back, and accepts the step by the gain ratio
 
     rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2)                   gain_model = undamped
     rho = (F(u) - F(u + p)) / (-g'p - 1/2 |J p|^2 - mu/2 p'D p)      gain_model = damped    (3.90, 3.102, 3.104)
@@ -33,11 +33,12 @@ from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import linear, native_kernels
 from ba_node.core.annealing import Annealing
 from ba_node.core.kernels import Kernels
+from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.problem import Problem
 from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Iteration, Result, Status
 
-# The gain ratio of a step that only the polished points made good: taken, but not much trusted.
+# The gain ratio of a step that only the inner iterations made good: taken, but not much trusted.
 _SAVED_RHO = 0.3
 # A loop that has rejected this many steps in a row has nothing left to gain.
 _MAX_REJECTED = 25
@@ -117,7 +118,7 @@ class _Run:
         if options.annealing == "gnc":
             with np.errstate(all="ignore"):
                 self.annealing = Annealing(problem, options)
-            self.kernels.graduate(self.annealing.graduation)
+            self._graduate()
 
     def run(self) -> Result:
         self.value = self.kernels.linearise(self.state)
@@ -158,12 +159,17 @@ class _Run:
         if not self.annealing.advance(self.rejected):
             return
         self.rejected = 0
-        self.kernels.graduate(self.annealing.graduation)
+        self._graduate()
         if self.annealing.active:
             self.value = self.kernels.linearise(self.state)
         else:
             self.state, self.value = self.annealing.state, self.annealing.value
             self.kernels.linearise(self.state)
+
+    def _graduate(self) -> None:
+        """Let the kernels work with the present surrogate; those in C++ have no truncated quadratic."""
+        assert self.annealing is not None and isinstance(self.kernels, NumpyKernels)
+        self.kernels.graduate(self.annealing.graduation)
 
     def _converged(self) -> str:
         if self.kernels.gradient_norm <= self.options.gradient_tolerance:
@@ -178,20 +184,20 @@ class _Run:
         self.side = system.side
         solution = self.reduced.solve(system, self.kernels.diagonals, self.radius)
         if solution.x is None:
-            return self._judge(-1.0, solution), solution
-        moved = self.kernels.move(self.state, system, solution.x, self.options.inner_iterations)
+            return self._accept_step(-1.0, solution), solution
+        stepped = self.kernels.step(self.state, system, solution.x, self.options.inner_iterations)
         rho = -1.0
-        predicted = moved.predicted - (moved.damping if self.options.gain_model == "damped" else 0.0)
-        if np.isfinite(moved.unpolished) and predicted > 0:
-            rho = (self.value - moved.unpolished) / predicted
-        if moved.objective < min(moved.unpolished, self.value):
-            rho = max(rho, (self.value - moved.objective) / predicted) if rho > 0 else _SAVED_RHO
-        accepted = self._judge(rho, solution)
+        predicted = stepped.predicted - (stepped.damping if self.options.gain_model == "damped" else 0.0)
+        if np.isfinite(stepped.before_inner) and predicted > 0:
+            rho = (self.value - stepped.before_inner) / predicted
+        if stepped.objective < min(stepped.before_inner, self.value):
+            rho = max(rho, (self.value - stepped.objective) / predicted) if rho > 0 else _SAVED_RHO
+        accepted = self._accept_step(rho, solution)
         if accepted:
-            self.state, self.value = moved.state, moved.objective
+            self.state, self.value = stepped.state, stepped.objective
         return accepted, solution
 
-    def _judge(self, rho: float, solution: linear.Solution) -> bool:
+    def _accept_step(self, rho: float, solution: linear.Solution) -> bool:
         """Update damping and radius from the gain ratio; return whether the step is taken."""
         accepted = rho > 0.0
         if accepted:

@@ -97,7 +97,7 @@ def is_map(path: Path | str) -> bool:
     return isinstance(head, dict) and head.get("format") == FORMAT
 
 
-def load_map(path: Path | str, config: SceneConfig) -> archive.Known:
+def load_map(path: Path | str, config: SceneConfig) -> archive.MapState:
     """Return what a file holds, for :meth:`Backend.take_over`.
 
     Raises:

@@ -8,20 +8,13 @@ other numbers are written so that they read back as the same float64.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal, DecimalException, InvalidOperation, localcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.estimate import Poses
 from ba_node.io.files import FileKindError, open_regular, whole_file
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Poses
-
-FloatArray = NDArray[np.float64]
 
 # A million poses.
 MAX_BYTES = 2**27
@@ -33,26 +26,7 @@ class TrajectoryError(ValueError):
     """A trajectory file that cannot be read."""
 
 
-@dataclass(frozen=True)
-class Trajectory:
-    """Stamped poses, in the order of the file.
-
-    Attributes:
-        stamp_ns: (n,) int64, ns.
-        position: (n, 3) body in the fixed frame, m.
-        orientation: (n, 4) fixed frame from body, quaternion x y z w as the file has it.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    position: FloatArray
-    orientation: FloatArray
-
-    def __len__(self) -> int:
-        """Return the number of poses."""
-        return len(self.stamp_ns)
-
-
-def write_tum(path: Path | str, poses: Poses | Trajectory) -> None:
+def write_tum(path: Path | str, poses: Poses) -> None:
     """Write stamped poses; keyframe ids have no place in the format."""
     rows = np.hstack([poses.position, poses.orientation]).tolist()
     lines = [
@@ -63,8 +37,8 @@ def write_tum(path: Path | str, poses: Poses | Trajectory) -> None:
         stream.write("".join([f"# {_COLUMNS}\n", *lines]).encode())
 
 
-def read_tum(path: Path | str) -> Trajectory:
-    """Read stamped poses; lines that are empty or begin with # are passed over.
+def read_tum(path: Path | str) -> Poses:
+    """Read stamped poses, numbered from 0 in the order of the file; empty lines and those with # are passed over.
 
     Raises:
         TrajectoryError: the file cannot be opened or holds no pose; a line has not eight finite numbers, a stamp beyond
@@ -94,7 +68,8 @@ def read_tum(path: Path | str) -> Trajectory:
     if not rows:
         raise TrajectoryError(f"{path}: no pose in it: expected lines with {_COLUMNS}")
     values = np.array(rows)
-    return Trajectory(np.array(stamps, dtype=np.int64), values[:, :3], values[:, 3:])
+    ids = np.arange(len(rows), dtype=np.uint64)
+    return Poses(ids, np.array(stamps, dtype=np.int64), values[:, :3], values[:, 3:])
 
 
 def format_stamp(stamp_ns: int) -> str:
@@ -109,20 +84,17 @@ def parse_stamp(text: str) -> int:
     Raises:
         ValueError: not a finite number, or beyond int64.
     """
-    with localcontext() as context:
-        context.prec = 60
-        try:
-            stamp = Decimal(text)
-            if not stamp.is_finite() or abs(stamp) > 2**63:
-                raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
-            stamp_ns = int((stamp * _NS).to_integral_value(rounding=ROUND_HALF_EVEN))
-        except InvalidOperation:
-            raise ValueError(f"stamp {text[:40]!r} is not a number") from None
-        except DecimalException:
-            raise ValueError(f"stamp {text[:40]!r}: expected finite seconds, within int64 nanoseconds") from None
-    if not -(2**63) <= stamp_ns < 2**63:
-        raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
-    return stamp_ns
+    try:
+        with localcontext() as context:
+            context.prec = 60
+            stamp_ns = (Decimal(text) * _NS).to_integral_value(rounding=ROUND_HALF_EVEN)
+    except InvalidOperation:
+        raise ValueError(f"stamp {text[:40]!r} is not a number") from None
+    except DecimalException:
+        stamp_ns = Decimal("inf")
+    if not (stamp_ns.is_finite() and -(2**63) <= stamp_ns < 2**63):
+        raise ValueError(f"stamp {text[:40]!r}: expected finite seconds, within int64 nanoseconds")
+    return int(stamp_ns)
 
 
 def _parse_pose(words: list[str]) -> list[float]:

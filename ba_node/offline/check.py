@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ba_node.backend import Backend, Diagnosis, can_examine
+import numpy as np
+
+from ba_node.backend import Backend, CurrentMap, Diagnosis, can_examine
 from ba_node.config import Config
 from ba_node.io.mcap import BagReader
 from ba_node.offline.attention import turned_away
@@ -52,37 +54,26 @@ def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
     if not can_examine():
         raise CheckError("OpenCV is missing: install opencv-python-headless (rosdep key python3-opencv)")
     backend = Backend(config)
-    found: list[CheckedSession] = []
-
-    def examine() -> None:
-        checked = _checked(backend)
-        if checked is not None:
-            found.append(checked)
-
+    maps = [backend.map]
     with BagReader(bag) as reader:
         for _, _, measurement in reader.measurements():
-            for admitted in backend.admit(measurement):
-                if admitted.begins is not None:
-                    examine()
-                backend.take(admitted)
+            backend.add(measurement)
+            if backend.map is not maps[-1]:
+                maps.append(backend.map)
         backend.flush(final=True)
-        examine()
+        maps += [backend.map] if backend.map is not maps[-1] else []
         notes = [*reader.rejection_notes, *backend.rejection_notes]
+    found = [checked for one in maps if (checked := _checked(one)) is not None]
     if not found:
         raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + notes[-1] if notes else ''}")
     return found
 
 
-def _checked(backend: Backend) -> CheckedSession | None:
-    diagnosis = backend.examine()
-    if diagnosis is None:
+def _checked(one: CurrentMap) -> CheckedSession | None:
+    found = one.examine()
+    if found is None:
         return None
-    keyframes = sorted(backend.map.input_keyframes(), key=lambda keyframe: keyframe.stamp_ns)
-    ends = (keyframes[0], keyframes[-1])
-    return CheckedSession(
-        backend.map.session_id,
-        (ends[0].keyframe_id, ends[1].keyframe_id),
-        (ends[0].stamp_ns, ends[1].stamp_ns),
-        diagnosis,
-        (*backend.warnings, *turned_away(backend.rejected)),
-    )
+    poses = one.estimate().trajectory[np.array([0, -1])]
+    ids, stamps = poses.keyframe_id.tolist(), poses.stamp_ns.tolist()
+    warnings = (*one.warnings, *turned_away(one.rejected))
+    return CheckedSession(one.session_id, (ids[0], ids[1]), (stamps[0], stamps[1]), found, warnings)

@@ -113,7 +113,7 @@ def run(bag: Path, out: Path, say: Callable[[str], None]) -> Outcome:
                 raise DemoError(f"the node sent no report; {node.last_words()}")
         after = listener.poses()
         cloud, frame_id = _cloud(listener), listener.points_frame
-    return Outcome(_poses(inputs), after, truth, cloud, listener.reports, frame_id, time.monotonic() - began)
+    return Outcome(Poses.of(inputs), after, truth, cloud, listener.reports, frame_id, time.monotonic() - began)
 
 
 def write(outcome: Outcome, out: Path) -> dict[str, TrajectoryError]:
@@ -230,15 +230,6 @@ def _has_last_solve(listener: NodeListener, newest_ns: int) -> bool:
     """Return True if points and report of the last solve have come; they are sent after its keyframes."""
     reports = [stamp_ns_from_message(report.header.stamp) for report in listener.reports[-1:]]
     return listener.points_stamp_ns == newest_ns and reports == [newest_ns]
-
-
-def _poses(keyframes: list[Keyframe]) -> Poses:
-    return Poses(
-        np.array([keyframe.keyframe_id for keyframe in keyframes], dtype=np.uint64),
-        np.array([keyframe.stamp_ns for keyframe in keyframes], dtype=np.int64),
-        np.array([keyframe.position for keyframe in keyframes]),
-        np.array([keyframe.orientation for keyframe in keyframes]),
-    )
 
 
 def _cloud(listener: NodeListener) -> Cloud:

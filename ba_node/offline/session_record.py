@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -100,22 +100,18 @@ class SessionRecord:
     @property
     def trajectory(self) -> Poses:
         """Return the newest estimate of every keyframe, by time."""
-        return _by_time(_joined([*self.forgotten, self.last.trajectory]))
+        parts = [*self.forgotten, self.last.trajectory]
+        names = [item.name for item in fields(Poses)]
+        poses = Poses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return poses[np.argsort(poses.stamp_ns, kind="stable")]
 
     @property
     def input_trajectory(self) -> Poses:
         """Return the front-end's poses of the same keyframes, in the same order."""
-        poses = self.trajectory
-        inputs = [self.inputs[key] for key in poses.keyframe_id.tolist()]
-        return Poses(
-            poses.keyframe_id,
-            poses.stamp_ns,
-            np.array([keyframe.position for keyframe in inputs]).reshape(-1, 3),
-            np.array([keyframe.orientation for keyframe in inputs]).reshape(-1, 4),
-        )
+        return Poses.of([self.inputs[key] for key in self.trajectory.keyframe_id.tolist()])
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for report.json."""
+        """Return the entries of report.json."""
         return {
             "session_id": self.session_id,
             "frame_id": self.last.frame_id,
@@ -171,16 +167,3 @@ def _listed(ids: list[int], *, together: bool) -> str:
         return f"keyframes {ids[0]} to {ids[-1]}"
     shown = ", ".join(map(str, ids[:_IDS_SHOWN])) + (", ..." if len(ids) > _IDS_SHOWN else "")
     return f"keyframe{'s' if len(ids) > 1 else ''} {shown}"
-
-
-def _joined(parts: list[Poses]) -> Poses:
-    return Poses(
-        np.concatenate([part.keyframe_id for part in parts]),
-        np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.orientation for part in parts]),
-    )
-
-
-def _by_time(poses: Poses) -> Poses:
-    return poses[np.argsort(poses.stamp_ns, kind="stable")]

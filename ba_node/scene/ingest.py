@@ -62,6 +62,33 @@ def keyframe_pose(keyframe: Keyframe, log: RejectionLog) -> Pose | None:
     return Pose(geometry.matrix_from_quaternion(quaternion), position)
 
 
+def plain_name(frame_id: str) -> str:
+    """Return the name of a frame as tf2 has it: without the slash that tf of ROS 1 put before it."""
+    return frame_id.strip().lstrip("/")
+
+
+def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -> None:
+    """Say so if the name of a keyframe's fixed frame is none, or one that tf2 refuses.
+
+    Args:
+        keyframe: as it came.
+        named: by a parameter, empty if it names none; then an empty name does no harm.
+        taken: what is taken for an empty name.
+        log: where it is said.
+    """
+    name = plain_name(keyframe.frame_id)
+    if name == keyframe.frame_id and name:
+        return
+    log.notice("frame_name")
+    if "frame_name" in log.warnings:
+        return
+    where = f"keyframe {keyframe.keyframe_id}: header.frame_id = {keyframe.frame_id!r}"
+    if name:
+        log.warn("frame_name", f"{where} is no name for tf2, taken as {name!r}: leave out the slash")
+    elif not named:
+        log.warn("frame_name", f"{where} names no frame, taken as {taken!r}: name the fixed frame of the poses")
+
+
 def _check_distance(name: str, frame_id: str, position: FloatArray, log: RejectionLog) -> None:
     """Warn where the cloud, as viewers take it, cannot tell points apart any more that the map can."""
     step_m = float(np.spacing(np.abs(position).max().astype(np.float32)))
@@ -96,7 +123,7 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
     sigma = np.asarray(tracks.sigma_px, float) if len(tracks.sigma_px) else np.ones(n)
     depth = np.array(tracks.depth_m, float) if len(tracks.depth_m) else np.full(n, np.nan)
     ids = np.asarray(tracks.track_id).astype(np.uint64)
-    if _nothing_to_judge(ids, uv, sigma, depth):
+    if _nothing_to_check(ids, uv, sigma, depth):
         return dataclasses.replace(tracks, track_id=ids, uv=uv, sigma_px=sigma, depth_m=depth)
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & ~np.isinf(depth)
     with np.errstate(invalid="ignore"):
@@ -200,7 +227,7 @@ def seen_from_first(rig: CameraRig) -> CameraRig:
     )
 
 
-def _nothing_to_judge(ids: IdArray, uv: FloatArray, sigma: FloatArray, depth: FloatArray) -> bool:
+def _nothing_to_check(ids: IdArray, uv: FloatArray, sigma: FloatArray, depth: FloatArray) -> bool:
     """Return True for most messages: ids that rise, sane pixels and sigmas, no depth or only sane ones."""
     if not len(ids) or not (ids[1:] > ids[:-1]).all():
         return False

@@ -72,7 +72,7 @@ class Landmarks(Table):
     rms_px: Float32Array
 
 
-class Sightings(Table):
+class ObservationTable(Table):
     """One row an observation. Pixels are kept in float32, the precision of the messages."""
 
     COLUMNS: ClassVar[Mapping[str, Column]] = {

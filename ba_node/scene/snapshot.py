@@ -24,7 +24,7 @@ from ba_node.scene.map_content import (
     require_unique,
     within,
 )
-from ba_node.scene.records import Block, Keyframes, Landmarks, Sightings
+from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
 from ba_node.scene.rejections import NOTES_KEPT, NOTICES, REASONS, WARNINGS, RejectionLog
 from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column, Table
@@ -37,7 +37,9 @@ if TYPE_CHECKING:
     from ba_node.config import SceneConfig
 
 _DERIVED = ("last", "views", "previous")
-_TABLES: dict[str, type[Table]] = {"keyframes": Keyframes, "landmarks": Landmarks, "sightings": Sightings}
+_TABLES: dict[str, type[Table]] = {"keyframes": Keyframes, "landmarks": Landmarks, "sightings": ObservationTable}
+# The table of a scene where the format has another name for it.
+_TABLE_OF = {"sightings": "observations"}
 _CAMERAS = {
     "rotation": Column(np.float64, (3, 3)),
     "translation": Column(np.float64, (3,)),
@@ -60,7 +62,7 @@ def take(scene: Scene) -> MapContent:
     """Return a copy of all that a scene holds; later changes of the scene do not reach it."""
     arrays: dict[str, NDArray[Any]] = {}
     for group, kind in _TABLES.items():
-        arrays |= prefixed(group, ((name, getattr(getattr(scene, group), name)) for name in _saved(kind)))
+        arrays |= prefixed(group, ((name, getattr(_table(scene, group), name)) for name in _saved(kind)))
     for group, cameras in (("cameras", scene.cameras), ("next_cameras", scene.next_cameras)):
         if cameras is not None:
             arrays |= prefixed(group, ((name, getattr(cameras, name)) for name in _CAMERAS))
@@ -93,14 +95,19 @@ def build(content: MapContent, config: SceneConfig) -> Scene:
     n = {group: len(next(iter(found.values()))) for group, found in columns.items()}
     _check_keyframes(columns["keyframes"])
     _check_landmarks(columns["landmarks"])
-    _check_sightings(columns["sightings"], n, 0 if scene.cameras is None else len(scene.cameras.model))
+    _check_observations(columns["sightings"], n, 0 if scene.cameras is None else len(scene.cameras.model))
     for group, found in columns.items():
-        getattr(scene, group).append(n[group], **found)
+        _table(scene, group).append(n[group], **found)
     scene.blocks = _blocks(content, columns["sightings"], n)
     scene.pending = _pending(content, session_id)
     _restore_log(content, scene)
     scene.index()
     return scene
+
+
+def _table(scene: Scene, group: str) -> Table:
+    table: Table = getattr(scene, _TABLE_OF.get(group, group))
+    return table
 
 
 def _saved(kind: type[Table]) -> dict[str, Column]:
@@ -145,7 +152,7 @@ def _check_landmarks(found: Mapping[str, NDArray[Any]]) -> None:
         require_all(good, f"landmarks/{name}", found[name], f"finite numbers where has_{name}")
 
 
-def _check_sightings(found: Mapping[str, NDArray[Any]], n: Mapping[str, int], n_cameras: int) -> None:
+def _check_observations(found: Mapping[str, NDArray[Any]], n: Mapping[str, int], n_cameras: int) -> None:
     for name, limit in (("keyframe", n["keyframes"]), ("landmark", n["landmarks"]), ("camera", n_cameras)):
         require_index(found[name], limit, f"sightings/{name}")
     require_all(within(found["uv"], ingest.MAX_PIXEL), "sightings/uv", found["uv"], f"at most {ingest.MAX_PIXEL:g} px")
@@ -167,8 +174,8 @@ def _blocks(content: MapContent, seen: Mapping[str, NDArray[Any]], n: Mapping[st
     whole = len(order) == 0 or (begin[order[0]] == 0 and bool((begin[order[1:]] == end[order[:-1]]).all()))
     require(whole and length.sum() == n["sightings"], "blocks do not cover the rows of sightings once each")
     for name in ("keyframe", "camera"):
-        told = np.repeat(found[name][order], length)
-        require(np.array_equal(told, seen[name]), f"blocks/{name} contradicts sightings/{name}")
+        stored = np.repeat(found[name][order], length)
+        require(np.array_equal(stored, seen[name]), f"blocks/{name} contradicts sightings/{name}")
     blocks: list[list[Block]] = [[] for _ in range(n["keyframes"])]
     for row, *block in zip(*(found[name].tolist() for name in _BLOCKS), strict=True):
         blocks[row].append(Block(*block))

@@ -56,12 +56,7 @@ class SyntheticData:
     @property
     def odometry(self) -> Poses:
         """Return the published, drifted poses."""
-        return Poses(
-            self.truth.keyframe_id,
-            self.truth.stamp_ns,
-            np.array([keyframe.position for keyframe in self.keyframes]),
-            np.array([keyframe.orientation for keyframe in self.keyframes]),
-        )
+        return Poses.of(self.keyframes)
 
     def timeline(self) -> Iterator[tuple[str, int, Measurement]]:
         """Yield topic (base name), stamp in ns and measurement, in the order a front-end publishes them."""

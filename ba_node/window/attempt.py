@@ -63,14 +63,14 @@ def attempt(
         if isinstance(selection, str):
             return selection
         options = methods.from_config(config.solver)
-        problem = begun(selection.problem, selection.norms[selection.believed], options)
+        problem = begun(selection.problem, selection.norms[selection.inlier], options)
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration)
         solve_time_s += clock() - began
         found = outcome(scene, selection, result, config.tracks, config.solver.kernels)
         if found.state is None:
             return Attempt(selection, result, found, guard.Health(), "", without, solve_time_s)
-        verdict = guard.judge(config, selection, found, trust)
+        verdict = guard.decide(config, selection, found, trust)
         if without or not verdict.keyframes:
             held = trust.hear(verdict.reason, verdict.odd, without, config)
             return Attempt(selection, result, found, verdict.health, held, without, solve_time_s)

@@ -42,6 +42,6 @@ def work_out(
         found["covariance"] = np.full((len(refined), 6, 6), np.nan)
         found["covariance"][place] = covariances(selection, state, measured, methods.from_config(config.solver))
     if wanted.view:
-        good = ~scene.sightings.outlier[selection.rows[selection.believed]]
+        good = ~scene.observations.outlier[selection.rows[selection.inlier]]
         found["view"] = view(selection.problem, state, good, place, len(refined))
     return found

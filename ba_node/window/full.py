@@ -1,20 +1,20 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Refine everything that is kept, on a copy, while windows go on being solved; then put the result in.
+"""Refine everything that is kept, on a snapshot, while windows go on being solved; then merge the result.
 
 Between the copy and the result keyframes and points come, move and go. With ``A`` the pose (world from body) that a
-keyframe k of the copy has when the result comes, and ``B`` the one that the result gives it, the correction at k is
+keyframe k of the snapshot has when the result comes, and ``B`` the one that the result gives it, the correction at k is
 
     C_k = B inverse(A),         for one camera    C_k(x) = s_k R_C x + t_C,
 
 s_k being the median, over the points of k in the result, of how much farther from k they are than before: where scale
 drifts, the map has another scale at each of its ends.
 
-- A keyframe of the copy gets B, a point of the copy its new place.
-- Every other keyframe is moved by the correction of the last one of the copy before it, every other point by the
-  correction of the keyframe that saw it first: what came later keeps its place relative to the end of the copy.
+- A keyframe of the snapshot gets B, a point of the snapshot its new place.
+- Every other keyframe is moved by the correction of the last one of the snapshot before it, every other point by the
+  correction of the keyframe that saw it first: what came later keeps its place relative to the end of the snapshot.
 - Then the keyframes after the copy and a window before are solved, all others that see their points being fixed: what
-  came later has seen points of the copy as well, and these have moved.
+  came later has seen points of the snapshot as well, and these have moved.
 - A point that lost its place meanwhile stays without. What was forgotten is passed over, and the result of a map that
   is no longer the current one altogether.
 """
@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ba_node.core import geometry, methods, native_kernels, solver
-from ba_node.window.merging import Merged, judge, merge, scaled, settled
+from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
 
@@ -63,14 +63,14 @@ def options(config: SolverConfig, method: str = "", max_iterations: int = 0) -> 
 
 
 class Solved(NamedTuple):
-    """What the solver made of a copy, and the sizes of the residuals after it, as ``Selection.norms``."""
+    """What the solver made of a snapshot, and the sizes of the residuals after it, as ``Selection.norms``."""
 
     result: Result
     norms: FloatArray
 
 
 @dataclass(frozen=True)
-class Copy:
+class Snapshot:
     """The problem of everything that was kept at a moment, and by which ids to find its parts again.
 
     Attributes:
@@ -98,7 +98,7 @@ class Copy:
     ) -> Solved:
         """Solve, on any thread. The scene is not touched."""
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration)
-        whole = dataclasses.replace(self.selection.problem, observations=self.selection.sightings)
+        whole = dataclasses.replace(self.selection.problem, observations=self.selection.observations)
         return Solved(result, native_kernels.residual_norms(whole, result.state, chosen.kernels))
 
     def outcome(self, state: State, config: Config) -> Merged:
@@ -121,16 +121,16 @@ class _Similarity:
         return np.asarray(self.scale[which, None] * turned + self.translation[which])
 
 
-def copy(scene: Scene, config: Config) -> Copy | str:
+def take_snapshot(scene: Scene, config: Config) -> Snapshot | str:
     """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
     if isinstance(selection, str):
         return selection
     problem = selection.problem
-    held = _held(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
-    selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=held))
-    return Copy(
+    fixed = _fixed(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
+    selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
+    return Snapshot(
         scene,
         selection,
         scene.keyframes.keyframe_id[selection.keyframes],
@@ -140,26 +140,26 @@ def copy(scene: Scene, config: Config) -> Copy | str:
     )
 
 
-def _held(fixed: BoolArray, unscaled: IntArray, position: FloatArray) -> BoolArray:
-    """Return the keyframes to hold: where scale floats, one more, the first that is a usual step from the held one.
+def _fixed(fixed: BoolArray, unscaled: IntArray, position: FloatArray) -> BoolArray:
+    """Return the keyframes to fix: where scale floats, one more, the first that is a usual step from the fixed one.
 
     In many iterations with little damping a floating scale shrinks a map until nothing is left of it.
     """
-    held = fixed.copy()
+    more = fixed.copy()
     for anchor in np.unique(unscaled[unscaled >= 0]):
         members = np.flatnonzero(unscaled == anchor)
         step = np.median(np.linalg.norm(np.diff(position[members], axis=0), axis=1)) if len(members) > 1 else 0.0
         away = np.linalg.norm(position[members] - position[anchor], axis=1)
         if len(members) > 2 and step > 0.0:
-            held[members[np.argmax(away >= min(step, away.max()))]] = True
-    return held
+            more[members[np.argmax(away >= min(step, away.max()))]] = True
+    return more
 
 
-def put(scene: Scene, config: Config, taken: Copy, state: State) -> int | None:
-    """Put the result for a copy, in the scale of the map (``Copy.outcome``), into the map.
+def merge_snapshot(scene: Scene, config: Config, taken: Snapshot, state: State) -> int | None:
+    """Merge the result for a snapshot, in the scale of the map (``Snapshot.outcome``), into the map.
 
     Returns:
-        How many refined keyframes that are not of the copy followed; None if nothing of the copy is left.
+        How many refined keyframes that are not of the snapshot followed; None if nothing of the snapshot is left.
     """
     keyframes = scene.find_keyframes(taken.keyframe_id)
     here = keyframes >= 0
@@ -189,8 +189,8 @@ def put(scene: Scene, config: Config, taken: Copy, state: State) -> int | None:
     table.refined[keyframes[here]] = True
     points.position[landmarks[kept]] = found[kept]
     points.has_position[landmarks[kept]] = True
-    scene.settle_poses()
-    _judge(scene, config, taken.selection, keyframes[here], landmarks[kept])
+    scene.propagate_corrections()
+    _classify(scene, config, taken.selection, keyframes[here], landmarks[kept])
     _join(scene, config, len(table) - 1 - int(scene.places()[keyframes[here]].max()))
     return len(others)
 
@@ -209,12 +209,12 @@ def _join(scene: Scene, config: Config, later: int) -> None:
 
 def _corrections(
     scene: Scene,
-    taken: Copy,
+    taken: Snapshot,
     result: tuple[FloatArray, FloatArray, FloatArray],
     keyframes: IntArray,
     landmarks: IntArray,
 ) -> _Similarity:
-    """Return the correction at each keyframe of the copy; senseless at those that are forgotten."""
+    """Return the correction at each keyframe of the snapshot; senseless at those that are forgotten."""
     rotation, position, found = result
     before = (scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes])
     turn = rotation @ np.swapaxes(before[0], -1, -2)
@@ -256,19 +256,19 @@ def _follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, sim
     follows[updated] = False
     places = scene.places()
     first = np.zeros(len(scene.landmarks), np.intp)
-    first[scene.sightings.landmark] = len(places) - 1
-    np.minimum.at(first, scene.sightings.landmark, places[scene.sightings.keyframe])
+    first[scene.observations.landmark] = len(places) - 1
+    np.minimum.at(first, scene.observations.landmark, places[scene.observations.keyframe])
     rows = np.flatnonzero(follows)
     which = anchor_of_row[scene.order[first[rows]]]
     scene.landmarks.position[rows] = similarity.move(which, scene.landmarks.position[rows])
 
 
-def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArray, landmarks: IntArray) -> None:
-    """Judge what the keyframes of the copy saw of its points anew; later ones have their windows for that."""
+def _classify(scene: Scene, config: Config, selection: Selection, keyframes: IntArray, landmarks: IntArray) -> None:
+    """Classify what the keyframes of the snapshot saw of its points anew; later ones have their windows for that."""
     is_ours = np.zeros(len(scene.keyframes), bool)
     is_ours[keyframes] = True
     rows = scene.views_of(landmarks)
-    rows = rows[is_ours[scene.sightings.keyframe[rows]]]
+    rows = rows[is_ours[scene.observations.keyframe[rows]]]
     origin = selection.origin
     problem = problem_of(
         scene, rows, keyframes, landmarks, origin, scene.landmarks.position[landmarks] - origin, config
@@ -276,11 +276,11 @@ def _judge(scene: Scene, config: Config, selection: Selection, keyframes: IntArr
     now = dataclasses.replace(
         selection,
         problem=problem,
-        sightings=problem.observations,
+        observations=problem.observations,
         rows=rows,
-        believed=~scene.sightings.outlier[rows],
+        inlier=~scene.observations.outlier[rows],
         keyframes=keyframes,
         landmarks=landmarks,
     )
     norms = native_kernels.residual_norms(problem, problem.start, config.solver.kernels)
-    judge(scene, now, problem.start, norms, config.tracks, config.solver.kernels)
+    classify(scene, now, problem.start, norms, config.tracks, config.solver.kernels)

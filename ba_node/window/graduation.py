@@ -37,7 +37,7 @@ def begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Proble
     """Return a problem with a better start, if its own is bad.
 
     Args:
-        problem: with the observations that are believed.
+        problem: with the inlier observations.
         norms: (n_obs,) sizes of their residuals at the start, sigmas.
         options: what it will be solved with.
     """

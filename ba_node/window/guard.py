@@ -13,7 +13,7 @@
   cameras together and for each alone (``trial.py``).
 
 Nothing here sees the scene. What is held leaves it as it was but for the count of solves; keyframes that were never
-taken follow the front-end by the correction of the last one that was (``Scene.settle_poses``).
+taken follow the front-end by the correction of the last one that was (``Scene.propagate_corrections``).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ba_node.window.selection import Selection
     from ba_node.window.trial import Explained
 
-# A common factor, or half the steps being off, is not judged from fewer steps.
+# A common factor, or half the steps being off, is not told from fewer steps.
 _MIN_STEPS = 4
 # Measured depths, and sigmas, that are looked at.
 _LOOKED_AT = 256
@@ -82,7 +82,7 @@ class Verdict:
     systematic: bool = False
 
 
-def judge(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
+def decide(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
     """Return whether a solution may be taken.
 
     Args:
@@ -97,7 +97,7 @@ def judge(config: Config, selection: Selection, found: Merged, trust: Trust | No
     gate = config.tracks.outlier_px or np.inf
     agrees = found.norms <= gate
     share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
-    sigma = median(selection.sightings.sigma_px[:: 1 + len(found.norms) // _LOOKED_AT])
+    sigma = median(selection.observations.sigma_px[:: 1 + len(found.norms) // _LOOKED_AT])
     health = Health(
         inlier_share=share,
         parallax_deg=float(np.degrees(found.explained.parallax_rad)),
@@ -125,7 +125,7 @@ def _misfit(selection: Selection, state: State, agrees: BoolArray, config: Confi
         )
     n_cam = len(selection.problem.cameras.model)
     for camera in range(n_cam if 1 < n_cam <= _FEW_CAMERAS else 0):
-        own = selection.sightings.camera == camera
+        own = selection.observations.camera == camera
         count = int(np.count_nonzero(own))
         share = float(np.count_nonzero(agrees & own)) / max(count, 1)
         if share < least and count > len(agrees) // (2 * n_cam):
@@ -300,7 +300,7 @@ class _Compared:
     @cached_property
     def _views(self) -> tuple[IntArray, IntArray, BoolArray]:
         """Return point, keyframe, and whether all cameras agree, of each pair of point and keyframe."""
-        obs, n = self.selection.sightings, self.selection.problem.n_keyframes
+        obs, n = self.selection.observations, self.selection.problem.n_keyframes
         pairs, of = np.unique(obs.point * n + obs.keyframe, return_inverse=True)
         wrong = np.bincount(of, self.norms > (self.config.tracks.outlier_px or np.inf), len(pairs))
         return *np.divmod(pairs, n), wrong == 0

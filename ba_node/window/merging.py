@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Put the solution of a window back into the scene, and judge its observations and points anew."""
+"""Put the solution of a window back into the scene, and classify its observations and points anew."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ class Merged(NamedTuple):
     explained: Explained | None = None
 
 
-def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
-    """Put the refined poses and points of a usable, finite result into the scene and judge its observations anew."""
-    found = outcome(scene, selection, result, tracks, backend)
+def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
+    """Put the refined poses and points of a usable, finite result into the scene and classify its observations anew."""
+    found = outcome(scene, selection, result, tracks, kernels)
     if found.state is None:
         return found
-    return found._replace(norms=put(scene, selection, found.state, found.norms, tracks, backend))
+    return found._replace(norms=apply(scene, selection, found.state, found.norms, tracks, kernels))
 
 
-def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
+def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
     """Return what came of a result, in the scale of the map; the scene stays as it is."""
     if not result.status.usable or not result.state.is_finite():
         return Merged(selection.norms, None)
     state = scaled(selection, scene.keyframes.input_position[selection.keyframes], result.state)
-    return settled(selection, state, tracks, backend)
+    return settled(selection, state, tracks, kernels)
 
 
-def settled(selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> Merged:
+def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: str = "auto") -> Merged:
     """Return a solution with its points where they may be published, see ``Merged``.
 
     Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
@@ -71,22 +71,22 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, backend: s
         selection: what was solved.
         state: the solution, in the scale of the map.
         tracks: the outlier gate.
-        backend: kernels.
+        kernels: native, numpy or auto.
     """
-    explained = selection.trial(backend).explained(selection.measured, (state.rotation, state.translation))
+    explained = selection.trial(kernels).explained(selection.measured, (state.rotation, state.translation))
     found = explained.points
     if len(found):
         points, aside = state.points.copy(), selection.tried[: len(found)]
         points[aside] = np.where(np.isnan(found), points[aside], found)
         state = dataclasses.replace(state, points=points)
-    norms = native_kernels.residual_norms(selection.whole, state, backend)
-    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, backend)
+    norms = native_kernels.residual_norms(selection.whole, state, kernels)
+    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, kernels)
     return Merged(norms, state, explained)
 
 
-def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, backend: str) -> State:
+def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str) -> State:
     """Return a state whose points that ran away are back where they began; their norms are written over."""
-    whole, point, n = selection.whole, selection.sightings.point, selection.problem.n_points
+    whole, point, n = selection.whole, selection.observations.point, selection.problem.n_points
     limit = _noticed_m(selection, state)
     centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
     away, began = (np.abs(points - centre).max(axis=1) > limit for points in (state.points, whole.start.points))
@@ -99,7 +99,7 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
         return state
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
     start = dataclasses.replace(state, points=whole.start.points[doubted])
-    before = native_kernels.residual_norms(views, start, backend)
+    before = native_kernels.residual_norms(views, start, kernels)
     support = np.bincount(views.observations.point[before <= gate], minlength=views.n_points)
     # A leap has to be borne out by more views than there were.
     better = support + leapt[doubted] > agreeing[doubted]
@@ -114,24 +114,24 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
 
 def _noticed_m(selection: Selection, state: State) -> float:
     """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise."""
-    cams, obs = selection.problem.cameras, selection.sightings
+    cams, obs = selection.problem.cameras, selection.observations
     spread = np.ptp(-(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0], axis=0).max()
     spread = max(float(spread), float(np.ptp(cams.translation, axis=0).max()))
     return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
 
 
-def put(
-    scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, backend: str = "auto"
+def apply(
+    scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, kernels: str = "auto"
 ) -> FloatArray:
-    """Put a solution, in the scale of the map, into the scene and judge its observations anew.
+    """Put a solution, in the scale of the map, into the scene and classify its observations anew.
 
     Args:
-        scene: to put it into.
+        scene: that it goes into.
         selection: what was solved.
         state: the solution.
         norms: (n_all,) sizes of its residuals, as ``Selection.norms``; written over.
         tracks: the gates.
-        backend: kernels.
+        kernels: native, numpy or auto.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
@@ -144,7 +144,7 @@ def put(
     scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
-    judge(scene, selection, state, norms, tracks, backend)
+    classify(scene, selection, state, norms, tracks, kernels)
     _displace(scene, selection.lost)
     return norms
 
@@ -172,8 +172,8 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
     return dataclasses.replace(state, translation=translation, points=points)
 
 
-def judge(
-    scene: Scene, selection: Selection, state: State, norm: FloatArray, tracks: TracksConfig, backend: str = "auto"
+def classify(
+    scene: Scene, selection: Selection, state: State, norm: FloatArray, tracks: TracksConfig, kernels: str = "auto"
 ) -> None:
     """Mark the observations to leave out next time, and note the error of each point.
 
@@ -183,14 +183,14 @@ def judge(
     heard again when it is next placed. ``norm`` are the sizes of the residuals; those of what is placed anew are
     written over.
     """
-    obs, n_points, outlier_px = selection.sightings, selection.problem.n_points, tracks.outlier_px
+    obs, n_points, outlier_px = selection.observations, selection.problem.n_points, tracks.outlier_px
     whole = dataclasses.replace(selection.problem, observations=obs, start=state)
     # What was left out of the solve tells nothing about how good it is.
-    gate = widened(outlier_px, norm[selection.believed]) if outlier_px > 0 else np.inf
+    gate = widened(outlier_px, norm[selection.inlier]) if outlier_px > 0 else np.inf
     outlier = norm > gate
     if outlier_px > 0:
-        _place_anew(scene, selection, whole, (norm, outlier), tracks, backend)
-    scene.sightings.outlier[selection.rows] = outlier
+        _place_anew(scene, selection, whole, (norm, outlier), tracks, kernels)
+    scene.observations.outlier[selection.rows] = outlier
     if outlier_px > 0:
         worth = ~outlier * np.where(np.isfinite(obs.depth_m), 2, 1) if len(obs.depth_m) else ~outlier
         good = np.bincount(obs.point, worth, n_points)
@@ -198,19 +198,19 @@ def judge(
     error = norm * obs.sigma_px
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
     if outlier_px > 0:
-        note_reuse(scene, part_reused(scene, selection, whole, norm, gate, backend))
+        note_reuse(scene, part_reused(scene, selection, whole, norm, gate, kernels))
 
 
 def _place_anew(
     scene: Scene,
     selection: Selection,
     whole: Problem,
-    judged: tuple[FloatArray, BoolArray],
+    classified: tuple[FloatArray, BoolArray],
     tracks: TracksConfig,
-    backend: str,
+    kernels: str,
 ) -> None:
     """Move the points that most views contradict to where more of them agree; write their norms and outliers over."""
-    norm, outlier = judged
+    norm, outlier = classified
     point, n_points = whole.observations.point, whole.n_points
     good = np.bincount(point, ~outlier, n_points)
     doubted = 2 * good < np.bincount(point, minlength=n_points)
@@ -218,9 +218,9 @@ def _place_anew(
     if not len(rows):
         return
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
-    found = agreed_points(views, tracks, tracks.outlier_px, backend)
+    found = agreed_points(views, tracks, tracks.outlier_px, kernels)
     start = dataclasses.replace(views.start, points=found.points)
-    at = native_kernels.residual_norms(views, start, backend)
+    at = native_kernels.residual_norms(views, start, kernels)
     supports = at <= tracks.outlier_px
     better = found.good & (np.bincount(views.observations.point, supports, views.n_points) > good[doubted])
     moved = better.take(views.observations.point)
@@ -232,12 +232,12 @@ def _place_anew(
 def _displace(scene: Scene, landmarks: IntArray) -> None:
     """Take the position of landmarks away; all their views are heard again when they are next placed."""
     scene.landmarks.has_position[landmarks] = False
-    scene.sightings.outlier[scene.views_of(landmarks)] = False
+    scene.observations.outlier[scene.views_of(landmarks)] = False
 
 
-def _rms_by_point(squared: FloatArray, point: IntArray, believed: BoolArray, n_points: int) -> FloatArray:
-    """Return the root mean square error per coordinate of each point's believed observations, px."""
-    good = np.asarray(believed & np.isfinite(squared))
+def _rms_by_point(squared: FloatArray, point: IntArray, inlier: BoolArray, n_points: int) -> FloatArray:
+    """Return the root mean square error per coordinate of each point's inlier observations, px."""
+    good = np.asarray(inlier & np.isfinite(squared))
     total = np.bincount(point, np.where(good, squared, 0.0), n_points)
     count = np.bincount(point, good, n_points)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -41,7 +41,7 @@ def problem_of(
         positions: (n_pt, 3) of the points in the problem.
         config: for the precision of depths.
     """
-    table, cameras = scene.sightings, scene.cameras
+    table, cameras = scene.observations, scene.cameras
     assert cameras is not None
     keyframe = _number(keyframes, len(scene.keyframes)).take(table.keyframe.take(rows))
     point = _number(landmarks, len(scene.landmarks)).take(table.landmark.take(rows))

@@ -36,12 +36,12 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
         selection: what was solved.
         norms: (n_all,) sizes of its residuals, as ``Selection.norms``.
     """
-    error = (norms * selection.sightings.sigma_px)[selection.believed]
+    error = (norms * selection.observations.sigma_px)[selection.inlier]
     error = np.minimum(error[np.isfinite(error)], BOUND_PX)
     return float(np.sqrt(np.mean(error * error) / 2.0)) if len(error) else 0.0
 
 
-def figures(selection: Selection, result: Result, norms: FloatArray) -> dict[str, Any]:
+def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[str, Any]:
     """Return how a solve went, by the names of a report.
 
     Args:
@@ -67,7 +67,7 @@ def figures(selection: Selection, result: Result, norms: FloatArray) -> dict[str
         "landmarks": problem.n_points,
         "observations": len(problem.observations),
         "held_keyframes": len(selection.window) - int(np.count_nonzero(np.isin(selection.window, selection.keyframes))),
-        "outliers": int(np.count_nonzero(~selection.believed & ~selection.held_out[selection.sightings.point])),
+        "outliers": int(np.count_nonzero(~selection.inlier & ~selection.held_out[selection.observations.point])),
     }
 
 
@@ -131,7 +131,7 @@ def _all_errors(scene: Scene, config: Config, state: str, *, outliers: bool) -> 
     landmarks = np.flatnonzero(seen_twice)
     rows = scene.views_of(landmarks)
     if not outliers:
-        rows = rows[~scene.sightings.outlier[rows]]
+        rows = rows[~scene.observations.outlier[rows]]
     if not len(rows):
         return np.empty((0, 2))
     origin = scene.keyframes.position[scene.order[0]]

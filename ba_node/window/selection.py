@@ -6,7 +6,7 @@ Free are the newest ``window.max_keyframes`` keyframes. Older ones that were ref
 part with fixed poses. A point takes part when two images see it (a stereo pair counts), or one with a measured depth.
 
 What holds the problem in place is chosen in ``gauge.py``. A keyframe with too few observations is held out of it, and
-goes on following its predecessor (``Scene.settle_poses``).
+goes on following its predecessor (``Scene.propagate_corrections``).
 
 ``select`` does not change the scene (but for settling poses); ``merging.py`` does, and only after a usable solve. The
 problem has its origin at its oldest keyframe: far from the map's origin (UTM) no digits are lost.
@@ -51,11 +51,11 @@ class Selection:
     """A problem and where its parts stand in the scene.
 
     Attributes:
-        problem: with the observations that are believed.
-        sightings: all observations of its points by its keyframes, believed or not, sorted by point.
+        problem: with the inlier observations.
+        observations: all observations of its points by its keyframes, inliers or not, sorted by point.
         norms: (n_all,) their residuals at the start, sigmas, inf behind the camera.
         rows: (n_all,) row in the scene of each of these.
-        believed: (n_all,) True where it is in the problem.
+        inlier: (n_all,) True where it is in the problem.
         keyframes: (n_kf,) row of each keyframe in the scene, oldest first.
         landmarks: (n_pt,) row of each point, by track id.
         window: rows of all keyframes of the window, those held out included, oldest first.
@@ -71,10 +71,10 @@ class Selection:
     """
 
     problem: Problem
-    sightings: Observations
+    observations: Observations
     norms: FloatArray
     rows: IntArray
-    believed: BoolArray
+    inlier: BoolArray
     keyframes: IntArray
     landmarks: IntArray
     window: IntArray
@@ -91,7 +91,7 @@ class Selection:
     @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
-        return dataclasses.replace(self.problem, observations=self.sightings)
+        return dataclasses.replace(self.problem, observations=self.observations)
 
     def trial(self, backend: str) -> trial.Trial:
         """Return the tracks that poses are tried on."""
@@ -138,7 +138,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     reason = _nothing(scene, window)
     if reason:
         return reason
-    scene.settle_poses()
+    scene.propagate_corrections()
     part, norms, strays = _arrived(scene, window, config, without)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
@@ -155,17 +155,17 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     tried, aside = trial.choose(track_id, obs.point[usable], config.guard.held_out_tracks)
     held_out = np.zeros(len(part.landmarks), bool)
     held_out[aside] = True
-    believed = usable & ~held_out.take(obs.point)
-    active = some_observations(part.problem, np.flatnonzero(believed))
+    inlier = usable & ~held_out.take(obs.point)
+    active = some_observations(part.problem, np.flatnonzero(inlier))
     held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
     active = dataclasses.replace(active, fixed=held.fixed)
     factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned)
     return Selection(
         problem=dataclasses.replace(active, factors=factors),
-        sightings=obs,
+        observations=obs,
         norms=norms,
         rows=part.rows,
-        believed=believed,
+        inlier=inlier,
         keyframes=part.keyframes,
         landmarks=part.landmarks,
         window=window,
@@ -226,7 +226,7 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
 
     Keyframes of ``without`` take no part, nor do landmarks that they alone see.
     """
-    table = scene.sightings
+    table = scene.observations
     taking_part = window[~np.isin(window, without)] if len(without) else window
     ranges = [np.arange(b.begin, b.end) for row in taking_part for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
@@ -276,7 +276,7 @@ def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Par
     if not config.odometry.enabled or len(part.keyframes) > _MOST_TURNS:
         return part
     of_window = np.isin(part.keyframes, window).take(part.problem.observations.keyframe)
-    used = of_window & ~scene.sightings.outlier.take(part.rows)
+    used = of_window & ~scene.observations.outlier.take(part.rows)
     found = turns.find(part.problem, part.keyframes, used, scene.landmarks.has_position[part.landmarks])
     if found is None:
         return part
@@ -289,7 +289,7 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
     new = ~scene.landmarks.has_position[part.landmarks]
     points = part.problem.start.points.copy()
     points[new] = np.nan
-    rows = np.flatnonzero(new.take(part.problem.observations.point) & ~scene.sightings.outlier.take(part.rows))
+    rows = np.flatnonzero(new.take(part.problem.observations.point) & ~scene.observations.outlier.take(part.rows))
     if len(rows):
         of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
         guess = moved_guesses(scene, part.landmarks[new]) - part.origin
@@ -300,7 +300,7 @@ def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
 
 def _gate(scene: Scene, part: _Part, new: BoolArray, config: Config) -> float | None:
     """Return how far off a view of a new point may be: as those of the known points are; None without these."""
-    rows = np.flatnonzero(~new.take(part.problem.observations.point) & ~scene.sightings.outlier.take(part.rows))
+    rows = np.flatnonzero(~new.take(part.problem.observations.point) & ~scene.observations.outlier.take(part.rows))
     if len(rows) < _BULK:
         return None
     known = some_observations(part.problem, rows)
@@ -324,14 +324,14 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
         return guess
     rows = scene.views_of(landmarks)
     first = np.full(len(scene.landmarks), len(scene.order) - 1)
-    np.minimum.at(first, scene.sightings.landmark[rows], scene.places()[scene.sightings.keyframe[rows]])
+    np.minimum.at(first, scene.observations.landmark[rows], scene.places()[scene.observations.keyframe[rows]])
     rotation, translation = scene.corrections(scene.order[first[landmarks]])
     return np.asarray((rotation @ guess[:, :, None])[..., 0] + translation)
 
 
 def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> BoolArray:
     """Return which observations may take part: no outliers, and none that begins with an absurd residual."""
-    usable: BoolArray = ~scene.sightings.outlier.take(part.rows)
+    usable: BoolArray = ~scene.observations.outlier.take(part.rows)
     if outlier_px <= 0:
         return usable
     obs = part.problem.observations
@@ -355,7 +355,7 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
 def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     """Return the rows of placed landmarks that absurd residuals leave with too few views, by track id."""
     obs, n = part.problem.observations, len(part.landmarks)
-    heard = ~scene.sightings.outlier.take(part.rows)
+    heard = ~scene.observations.outlier.take(part.rows)
     doubted = np.zeros(n, bool)
     doubted[obs.point[heard & ~usable]] = True
     rows = np.flatnonzero(doubted.take(obs.point))

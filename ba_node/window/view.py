@@ -23,7 +23,7 @@ def view(problem: Problem, state: State, good: BoolArray, place: IntArray, n: in
     Args:
         problem: as it was solved.
         state: its solution.
-        good: (n_obs,) observations that are believed after it: a wrong match says nothing about a pose.
+        good: (n_obs,) observations that are inliers after it: a wrong match says nothing about a pose.
         place: (n_kf,) row of each keyframe of the problem among the n keyframes of the estimate.
         n: keyframes of the estimate; those that are not in the problem are neither free nor linked.
     """

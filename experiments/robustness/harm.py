@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
@@ -91,7 +89,7 @@ def _place(path: Path) -> tuple[int, str]:
 
 
 def _session(folder: Path, truth: Poses) -> SessionError:
-    before, after = (_poses(folder / f"{name}.tum") for name in ("trajectory_input", "trajectory"))
+    before, after = (read_tum(folder / f"{name}.tum") for name in ("trajectory_input", "trajectory"))
     return SessionError(
         folder,
         len(after),
@@ -100,11 +98,6 @@ def _session(folder: Path, truth: Poses) -> SessionError:
         absolute_error(before, truth, "none").rotation.rmse,
         absolute_error(after, truth, "none").rotation.rmse,
     )
-
-
-def _poses(path: Path) -> Poses:
-    read = read_tum(path)
-    return Poses(np.arange(len(read), dtype=np.uint64), read.stamp_ns, read.position, read.orientation)
 
 
 def _translation_m(poses: Poses, truth: Poses) -> float:

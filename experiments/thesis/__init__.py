@@ -3,5 +3,5 @@
 """Repeat the experiments of the thesis: what is run is data (catalogue.py), each run is one recorded JSON file.
 
 tasks.py says what can be run, runner.py runs it and keeps the records, tables.py and plots.py make tables and pictures
-from records alone, report.py puts them on pages, claims.py judges by them what the thesis says.
+from records alone, report.py puts them on pages, claims.py checks by them what the thesis says.
 """

@@ -1,10 +1,10 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""The claims of the thesis, each with the comparisons by which it is judged."""
+"""The claims of the thesis, each with the comparisons by which it is checked."""
 
 from __future__ import annotations
 
-from experiments.thesis.judging import Below, Breaks, Claim, Within
+from experiments.thesis.verdicts import Below, Breaks, Claim, Within
 
 # Objectives that differ by less than this are the same.
 _SAME = 0.999
@@ -385,9 +385,9 @@ CLAIMS: tuple[Claim, ...] = (
         "IRLS comes nearest to the truth at scale",
         "5.3.2, 6, Tables 5.3, 5.4",
         tuple(
-            Below("5.3", quantity, huber, ("local DINM, C++", "LMA-CD", "BAL", "DINM", "ADINM"), _NEARER)
+            Below("5.3", metric, huber, ("local DINM, C++", "LMA-CD", "BAL", "DINM", "ADINM"), _NEARER)
             for huber in ("IRLS, C++", "auto, Huber, C++")
-            for quantity in ("rmse_cameras", "median_points")
+            for metric in ("rmse_cameras", "median_points")
         ),
         "Huber's loss does where it is led to its end, as by `auto` in 30 steps; PCG without a preconditioner is on its"
         " way there. The RMSE of points is that of one or two which lie anywhere.",

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.core.kernels import System
-from ba_node.core.numpy_kernels import NumpyKernels
+from ba_node.core.numpy_kernels import NumpyKernels, NumpySystem
 from ba_node.core.schur import block_diagonal
 from ba_node.core.solver import solve
 from ba_node.offline.solver_settings import solver_options
@@ -31,15 +30,15 @@ _WORST_OF = ("condition_c", "condition_b", "condition_s", "lone_points")
 
 
 class Watched(NumpyKernels):
-    """The kernels in numpy, and a row of figures for every linear system.
+    """The kernels in numpy, and a row of metrics for every linear system.
 
     Attributes:
-        rows: the figures, by name.
+        rows: the metrics, by name.
     """
 
     rows: list[dict[str, float]]
 
-    def damp(self, kind: str, mu: float) -> System:
+    def damp(self, kind: str, mu: float) -> NumpySystem:
         """Add damping and eliminate, as ever; look at what is inverted."""
         system = super().damp(kind, mu)
         (d_c, d_p), equations = self._damping, self._equations
@@ -85,7 +84,7 @@ def worst(blocks: FloatArray) -> float:
 
 
 def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float]) -> dict[str, Any]:
-    """Return figures and curves of one solve.
+    """Return metrics and curves of one solve.
 
     Args:
         posed: the problem.
@@ -99,8 +98,8 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
     rows = kernels.rows
     broken = [index for index, row in enumerate(rows, start=1) if not row["plain"]]
     # A solve that ends where it begins has no system to look at.
-    figures: dict[str, Any] = {name: max((row[name] for row in rows), default=None) for name in _WORST_OF}
-    figures |= {
+    found: dict[str, Any] = {name: max((row[name] for row in rows), default=None) for name in _WORST_OF}
+    found |= {
         "first_break": float(broken[0]) if broken else None,
         "breaks": float(len(broken)),
         "solves": float(len(rows)),
@@ -108,4 +107,4 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
         "gradient": result.gradient_norm,
     }
     columns = {name: [row[name] for row in rows] for name in (*_WORST_OF, "active", "plain")}
-    return {"figures": figures, "data": {"conditions": columns}}
+    return {"figures": found, "data": {"conditions": columns}}

@@ -17,7 +17,7 @@ class Case:
     Attributes:
         label: as in the thesis where it has the same.
         task: what is run.
-        thesis: its figures, by quantity (quantities.py).
+        thesis: its figures, by metric (metrics.py).
         note: what departs from the thesis.
         versus: label of the case that its times are compared with; empty for the first.
     """
@@ -37,7 +37,7 @@ class Experiment:
         name: ``3.8`` for a table, ``fig-3.1`` for figures alone, a word for what the thesis does not have.
         title: what is compared.
         cases: rows.
-        columns: quantities of the table.
+        columns: metrics of the table.
         figures: of the thesis that it repeats.
         plots: names in plots.PLOTS.
         note: what is to be known.

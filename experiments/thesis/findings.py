@@ -1,11 +1,11 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""What we say of the open problems of the thesis, judged by comparisons like its own claims."""
+"""What we say of the open problems of the thesis, checked by comparisons like its own claims."""
 
 from __future__ import annotations
 
-from experiments.thesis.judging import Below, Check, Claim, Within
 from experiments.thesis.problems import SHARES
+from experiments.thesis.verdicts import Below, Check, Claim, Within
 
 _M, _C, _S = "open-preconditioner", "open-conditioning", "open-conditioning-sphere"
 _STANDING = tuple(f"{name}, as it stands" for name in ("diag block of S", "B", "diag of S", "diag of B"))
@@ -16,8 +16,7 @@ def _nearer(share: int, method: str, other: str, factor: float) -> tuple[Check, 
     """Return that a method ends nearer to the truth than another, in cameras and in points."""
     labels = f"{share} %, {method}", f"{share} %, {other}"
     return tuple(
-        Below("open-outliers", quantity, labels[0], (labels[1],), factor)
-        for quantity in ("rmse_cameras", "median_points")
+        Below("open-outliers", metric, labels[0], (labels[1],), factor) for metric in ("rmse_cameras", "median_points")
     )
 
 

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from ba_node.config import SolverOptions
 from ba_node.core import linear, native_kernels
-from ba_node.core.numpy_kernels import NumpyKernels
+from ba_node.core.numpy_kernels import NumpyKernels, preconditioner
 from ba_node.core.objective import Objective
 from ba_node.core.problem import State
-from ba_node.core.reduced import preconditioner
 from ba_node.core.schur import Structure, normal_equations
 from experiments.thesis.conditioning import conditions
-from experiments.thesis.finals import truth_errors
+from experiments.thesis.final_state import truth_errors
 from experiments.thesis.matrix_forms import FORMS
 from experiments.thesis.problems import Posed
 from experiments.thesis.step_search import search_steps

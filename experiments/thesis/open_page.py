@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from experiments.thesis.catalogue import find
 from experiments.thesis.findings import FINDINGS
-from experiments.thesis.judging import Results, judge
 from experiments.thesis.page import grounds, old_cases, verdict_table
 from experiments.thesis.tables import table
+from experiments.thesis.verdicts import Results, verdict_on
 
 _INTRO = """\
 # What the thesis leaves open
@@ -17,7 +17,7 @@ Chapter 6 of Z. Qu, *Efficient Optimization for Robust Bundle Adjustment* (TU Mu
 that helps, for what reweighting does to the condition of the matrices, and for more data; its figures raise two more
 questions, why IRLS is no better where there are outliers, and what it costs to give every image a calibration of its
 own. `ba thesis open-preconditioner open-conditioning open-conditioning-sphere open-outliers open-data open-intrinsics`
-makes what stands here. Verdicts are judged as in [thesis.md](thesis.md), by comparisons that are declared
+makes what stands here. Verdicts are made as in [thesis.md](thesis.md), by comparisons that are declared
 (`experiments/thesis/findings.py`); the comparisons stand at the end.
 
 """
@@ -113,7 +113,7 @@ has no shared free ones; the row "shared" ties the steps in an experiment of its
 
 def open_page(results: Results) -> str:
     """Return docs/open_problems.md."""
-    verdicts = [judge(finding, results) for finding in FINDINGS]
+    verdicts = [verdict_on(finding, results) for finding in FINDINGS]
     parts = [_INTRO, verdict_table(verdicts, old_cases(results), "finding").markdown()]
     for title, before, after, names in _SECTIONS:
         parts.append(f"\n## {title}\n\n{before}\n")

@@ -9,17 +9,17 @@ from collections.abc import Collection, Sequence
 
 from experiments.thesis.catalogue import EXPERIMENTS
 from experiments.thesis.claims import CLAIMS
-from experiments.thesis.judging import HOLDS, HOLDS_NOT, PARTLY, Results, Verdict, judge
 from experiments.thesis.problems import DATA, Library
 from experiments.thesis.tables import Table, escaped
 from experiments.thesis.tasks import key
+from experiments.thesis.verdicts import HOLDS, HOLDS_NOT, PARTLY, Results, Verdict, verdict_on
 
 _INTRO = """\
 # The claims of the thesis
 
 The local DINM method comes from Z. Qu, *Efficient Optimization for Robust Bundle Adjustment*, master's thesis, TU
 Munich, 2018. `ba thesis --all` repeats its experiments; from the figures recorded there
-([thesis_results.json](thesis_results.json)) each of its claims is judged by comparisons that were declared with it
+([thesis_results.json](thesis_results.json)) each of its claims is checked by comparisons that were declared with it
 (`experiments/thesis/claims.py`): it **holds** if all of them do, **partly** if some do. The comparisons stand below the
 table. What the thesis leaves open: [open_problems.md](open_problems.md).
 
@@ -60,7 +60,7 @@ def verdict_table(verdicts: Sequence[Verdict], old: Collection[tuple[str, str]] 
     """Return the claims with their verdicts, numbered.
 
     Args:
-        verdicts: of judging.judge.
+        verdicts: of verdicts.verdict_on.
         old: experiment and label of cases whose figures were recorded with other options than are declared now.
         what: head of the column of claims.
     """
@@ -96,7 +96,7 @@ def old_cases(results: Results) -> set[tuple[str, str]]:
 
 def claims_page(results: Results) -> str:
     """Return docs/thesis.md."""
-    verdicts, old = [judge(claim, results) for claim in CLAIMS], old_cases(results)
+    verdicts, old = [verdict_on(claim, results) for claim in CLAIMS], old_cases(results)
     counts = Counter(verdict.word for verdict in verdicts)
     summary = f"Of {len(verdicts)} claims {counts[HOLDS]} hold, {counts[PARTLY]} partly, {counts[HOLDS_NOT]} do not."
     if old:

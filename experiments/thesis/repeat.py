@@ -13,11 +13,11 @@ from ba_node.io.json_file import write_json
 from experiments.thesis.claims import CLAIMS
 from experiments.thesis.experiments import Experiment
 from experiments.thesis.findings import FINDINGS
-from experiments.thesis.judging import judge_all
 from experiments.thesis.problems import Library
 from experiments.thesis.report import Section, write_report
 from experiments.thesis.runner import Clock, Progress, Runner
 from experiments.thesis.tasks import Task
+from experiments.thesis.verdicts import verdicts_on
 
 # Problems that a quick look leaves out.
 _LARGE = ("100-4000", "500-5000")
@@ -65,7 +65,7 @@ class Repetition:
         """Write the pages and results.json; return the page that holds all."""
         found = results(sections)
         write_json(self._out / "results.json", found)
-        verdicts = [] if self._quick else judge_all((*CLAIMS, *FINDINGS), found)
+        verdicts = [] if self._quick else verdicts_on((*CLAIMS, *FINDINGS), found)
         return write_report(self._out, sections, verdicts)
 
     def _tasks(self) -> list[Task]:
@@ -76,11 +76,11 @@ class Repetition:
 
 
 def results(sections: Sequence[Section]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return the figures of all cases by experiment and label, with the key of the record; five digits are enough."""
+    """Return the metrics of all cases by experiment and label, with the key of the record; five digits are enough."""
     return {
         section.experiment.name: {
-            label: {"key": section.records[label]["key"], **{name: _short(value) for name, value in figures.items()}}
-            for label, figures in section.figures.items()
+            label: {"key": section.records[label]["key"], **{name: _short(value) for name, value in metrics.items()}}
+            for label, metrics in section.metrics.items()
         }
         for section in sections
     }

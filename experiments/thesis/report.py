@@ -14,11 +14,11 @@ from typing import Any
 from ba_node.io.files import whole_file
 from experiments.figures import png
 from experiments.thesis.experiments import Experiment
-from experiments.thesis.judging import Verdict
+from experiments.thesis.metrics import metrics_of
 from experiments.thesis.page import grounds, verdict_table
 from experiments.thesis.plots import PLOTS
-from experiments.thesis.quantities import figures
 from experiments.thesis.tables import Table, table
+from experiments.thesis.verdicts import Verdict
 
 Record = Mapping[str, Any]
 
@@ -50,13 +50,13 @@ class Section:
     records: Mapping[str, Record]
 
     @property
-    def figures(self) -> dict[str, dict[str, float | str | None]]:
-        """Return the figures of each case."""
-        return {label: figures(record) for label, record in self.records.items()}
+    def metrics(self) -> dict[str, dict[str, float | str | None]]:
+        """Return the metrics of each case."""
+        return {label: metrics_of(record) for label, record in self.records.items()}
 
     def table(self) -> Table:
         """Return its table."""
-        return table(self.experiment, self.figures)
+        return table(self.experiment, self.metrics)
 
     def pictures(self) -> dict[str, bytes]:
         """Return its pictures as PNG, by name."""

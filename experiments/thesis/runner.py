@@ -17,7 +17,7 @@ from ba_node.core.result import Iteration, Result
 from ba_node.core.solver import solve
 from ba_node.io.json_file import write_json
 from ba_node.offline.solver_settings import describe
-from experiments.thesis import finals, measures
+from experiments.thesis import final_state, measures
 from experiments.thesis.problems import NAMES, Library, Posed
 from experiments.thesis.tasks import Measure, Run, Task, key
 from experiments.thesis.variants import VARIANTS
@@ -113,13 +113,13 @@ class Runner:
 def _end(task: Run, posed: Posed, result: Result) -> dict[str, Any]:
     problem, state = posed.problem, result.state
     out: dict[str, Any] = {
-        "gradient": finals.gradients(problem, task.options(), state),
-        "residuals": finals.residuals(problem, state),
-        "images": finals.pictures(problem, state, task.images),
+        "gradient": final_state.gradients(problem, task.options(), state),
+        "residuals": final_state.residuals(problem, state),
+        "images": final_state.pictures(problem, state, task.images),
     }
     if posed.truth is not None:
-        out["truth_before"] = finals.truth_errors(problem.start, posed.truth)
-        out["truth_after"] = finals.truth_errors(state, posed.truth)
+        out["truth_before"] = final_state.truth_errors(problem.start, posed.truth)
+        out["truth_after"] = final_state.truth_errors(state, posed.truth)
     return out
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of an experiment: our figures and the thesis's side by side."""
+"""Tables of an experiment: our metrics and those of the thesis side by side."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from experiments.thesis.experiments import Case, Experiment
-from experiments.thesis.quantities import QUANTITIES, shown
+from experiments.thesis.metrics import METRICS, shown
 
-Figures = Mapping[str, float | str | None]
+Metrics = Mapping[str, float | str | None]
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ def escaped(text: str) -> str:
     return text.replace("|", "&#124;")
 
 
-def table(experiment: Experiment, figures: Mapping[str, Figures]) -> Table:
+def table(experiment: Experiment, metrics: Mapping[str, Metrics]) -> Table:
     """Return the table of an experiment.
 
     Args:
         experiment: which columns it has.
-        figures: of each case, by label. Cases without any of the columns make no row.
+        metrics: of each case, by label. Cases without any of the columns make no row.
     """
-    cases = [c for c in experiment.cases if any(name in figures.get(c.label, {}) for name in experiment.columns)]
+    cases = [c for c in experiment.cases if any(name in metrics.get(c.label, {}) for name in experiment.columns)]
     head, columns = [""], []
     for name in experiment.columns:
-        quantity = QUANTITIES[name]
-        head.append(quantity.title + (" (ratio)" if quantity.is_time and len(cases) > 1 else ""))
-        columns.append([_cell(name, case, experiment, figures) for case in cases])
+        metric = METRICS[name]
+        head.append(metric.title + (" (ratio)" if metric.is_time and len(cases) > 1 else ""))
+        columns.append([_cell(name, case, experiment, metrics) for case in cases])
         if any(name in case.thesis for case in cases):
             head.append("thesis")
             thesis = {case.label: case.thesis for case in experiment.cases}
@@ -65,16 +65,16 @@ def table(experiment: Experiment, figures: Mapping[str, Figures]) -> Table:
     return Table(tuple(head), tuple(rows))
 
 
-def _cell(name: str, case: Case, experiment: Experiment, figures: Mapping[str, Figures]) -> str:
-    """Return a figure, a time with its ratio to the case it is compared with."""
-    value = figures.get(case.label, {}).get(name)
-    if name not in figures.get(case.label, {}):
+def _cell(name: str, case: Case, experiment: Experiment, metrics: Mapping[str, Metrics]) -> str:
+    """Return a metric, a time with its ratio to the case it is compared with."""
+    value = metrics.get(case.label, {}).get(name)
+    if name not in metrics.get(case.label, {}):
         return ""
     text = shown(name, value)
-    if not QUANTITIES[name].is_time or not isinstance(value, float) or len(experiment.cases) == 1:
+    if not METRICS[name].is_time or not isinstance(value, float) or len(experiment.cases) == 1:
         return text
     for label in (case.versus, ""):
-        base = figures.get(experiment.case(label).label, {}).get(name)
+        base = metrics.get(experiment.case(label).label, {}).get(name)
         if isinstance(base, float) and base > 0.0:
             ratio = value / base
             return f"{text} ({ratio:.0f})" if ratio >= 100.0 else f"{text} ({ratio:.2g})"

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.core import linear, scaling
-from ba_node.core.kernels import System
-from ba_node.core.numpy_kernels import NumpyKernels
+from ba_node.core.numpy_kernels import NumpyKernels, NumpySystem
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import normal_equations
@@ -26,7 +25,7 @@ MU_FLOOR = 1e-8
 class UnscaledPreconditioner(NumpyKernels):
     """M is made of S as it stands, while PCG works on ``D^-1 S D^-1``: lines 4 and 5 of Algorithm 4 to the letter."""
 
-    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NumpySystem:
         """Return the system; its diagonal blocks come out as those of S after the solver has scaled them."""
         system = super().reduce(damping_c, damping_p)
         d = system.gather(*scaling.scaled_space(self._options.scaled_space, self.diagonals()))
@@ -54,7 +53,7 @@ class Cured(NumpyKernels):
         self.gradient_norm = self._equations.gradient_norm
         return value
 
-    def damp(self, kind: str, mu: float) -> System:
+    def damp(self, kind: str, mu: float) -> NumpySystem:
         """Damp by no less than the floor."""
         return super().damp(kind, max(mu, MU_FLOOR))
 
@@ -65,7 +64,7 @@ class SharedIntrinsics(NumpyKernels):
     They must be equal at the start, all keyframes free, and the solver a dense one.
     """
 
-    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
+    def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NumpySystem:
         """Return the system; its dense solution has equal steps of the intrinsics."""
         system = super().reduce(damping_c, damping_p)
         n, size = self.n_free, self.size

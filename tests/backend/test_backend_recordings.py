@@ -74,7 +74,7 @@ def test_real_stereo_recording(shared_data: Path) -> None:
     assert len(last.trajectory) == 26
     assert backend.scene.keyframes.refined.all()
     # 1/2 sum |r|^2 = 17069.622 over 32756 coordinates, as another library computes it from the data behind the bag.
-    assert 2 * len(backend.scene.sightings) == 32756
+    assert 2 * len(backend.scene.observations) == 32756
     assert backend.map.rms_px("input") == pytest.approx(np.sqrt(2 * 17069.622 / 32756), rel=2e-6)
     assert backend.map.rms_px("refined") <= 0.37, f"{backend.map.rms_px('refined'):.4f} px"
 

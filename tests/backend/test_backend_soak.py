@@ -32,7 +32,7 @@ def sizes(backend: Backend) -> dict[str, int]:
     """Return how much the back-end holds: rows in use, rows of memory, and what waits."""
     scene = backend.scene
     tables: dict[str, Table] = {
-        "keyframes": scene.keyframes, "landmarks": scene.landmarks, "sightings": scene.sightings
+        "keyframes": scene.keyframes, "landmarks": scene.landmarks, "sightings": scene.observations
     }  # fmt: skip
     rows = {name: len(table) for name, table in tables.items()}
     room = {f"room for {name}": max(map(len, table._buffers.values())) for name, table in tables.items()}

@@ -84,7 +84,7 @@ def error_of(node: Backend, refined: bool) -> float:
 @pytest.mark.parametrize("backend", ["auto", "numpy"])
 def test_what_is_seen_beyond_90_degrees_takes_part(backend: str) -> None:
     node = run(False, backend)
-    table, points = node.scene.sightings, node.scene.landmarks
+    table, points = node.scene.observations, node.scene.landmarks
     rig, centres, true = scene()
     track = points.track_id[table.landmark].astype(int)
     x = true[track] - centres[table.keyframe] - rig.position[table.camera]
@@ -98,7 +98,7 @@ def test_what_is_seen_beyond_90_degrees_takes_part(backend: str) -> None:
 
 def test_it_is_worth_more_than_the_front_alone() -> None:
     whole, front = run(False), run(True)
-    assert len(whole.scene.sightings) > len(front.scene.sightings) + 500
+    assert len(whole.scene.observations) > len(front.scene.observations) + 500
     assert error_of(whole, refined=True) < 1.1 * error_of(front, refined=True)
 
 

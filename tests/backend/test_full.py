@@ -182,7 +182,7 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     # The scale is given to the map by its steps, so they are stretched with it.
     snapshot = dataclasses.replace(snapshot, position=moved(position))
     state = scaled(snapshot.selection, snapshot.position, state)
-    assert full.put(scene, backend.config, snapshot, state) == 8
+    assert full.merge_snapshot(scene, backend.config, snapshot, state) == 8
     after = backend.estimate()
     # Those that no solve has had follow the front-end's steps, which are not stretched.
     had = scene.keyframes.refined[scene.order]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ba_node.cli.main import main
-from ba_node.io.trajectory import Trajectory, write_tum
+from ba_node.estimate import Poses
+from ba_node.io.trajectory import write_tum
 
 
 @pytest.fixture
@@ -18,10 +19,11 @@ def trajectories(tmp_path: Path) -> tuple[str, str]:
     rng = np.random.default_rng(0)
     stamps = 1_000_000_000 + 100_000_000 * np.arange(20, dtype=np.int64)
     position, orientation = rng.normal(size=(20, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))
+    ids = np.arange(20, dtype=np.uint64)
     estimate, reference = tmp_path / "e.tum", tmp_path / "r.tum"
-    write_tum(reference, Trajectory(stamps, position, orientation))
+    write_tum(reference, Poses(ids, stamps, position, orientation))
     order = rng.permutation(20)
-    write_tum(estimate, Trajectory(stamps[order], position[order] + [1.0, 0.0, 0.0], orientation))
+    write_tum(estimate, Poses(ids, stamps[order], position[order] + [1.0, 0.0, 0.0], orientation))
     return str(estimate), str(reference)
 
 

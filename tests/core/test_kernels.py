@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels in C++ against those in numpy, on every quantity; and the polishing of points."""
+"""The kernels in C++ against those in numpy, on every quantity; and the inner iterations over points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from ba_node import native
 from ba_node.config import SolverOptions
-from ba_node.core import cameras, native_kernels, reduced, solver
+from ba_node.core import cameras, native_kernels, numpy_kernels, reduced, solver
 from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Objective
@@ -92,10 +92,12 @@ def test_native_agrees_with_numpy(shape: dict[str, object], options: SolverOptio
 @built
 @pytest.mark.parametrize("options", COST_MODELS)
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_native_polishes_as_numpy_does(shape: dict[str, object], options: SolverOptions, make_problem: Make) -> None:
+def test_native_iterates_points_like_numpy(
+    shape: dict[str, object], options: SolverOptions, make_problem: Make
+) -> None:
     problem, _ = make_problem(start_error=0.02, **shape)
     oracle, kernels = pair(problem, options)
-    (value_a, state_a), (value_b, state_b) = (k.polish_points(problem.start, 3) for k in (oracle, kernels))
+    (value_a, state_a), (value_b, state_b) = (k.iterate_points(problem.start, 3) for k in (oracle, kernels))
     assert value_b == pytest.approx(value_a, rel=1e-9)
     near(state_a.points, state_b.points, 1e-7)
 
@@ -104,7 +106,7 @@ def test_native_polishes_as_numpy_does(shape: dict[str, object], options: Solver
 @pytest.mark.parametrize("damping", ["none", "identity", "diag", "inc"])
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make_problem: Make) -> None:
-    """Damping, dense Cholesky, and the state after the step with and without polishing; fixed keyframes stay."""
+    """Damping, dense Cholesky, and the state after the step with and without inner iterations; fixed keyframes stay."""
     problem, _ = make_problem(start_error=0.02, **shape)
     both = pair(problem, SolverOptions(loss="huber"))
     for inner_iterations in (0, 3):
@@ -117,14 +119,14 @@ def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make
             continue
         near(steps[0], steps[1], 1e-6)
         a, b = (
-            kernels.move(problem.start, system, steps[0], inner_iterations)
+            kernels.step(problem.start, system, steps[0], inner_iterations)
             for kernels, system in zip(both, systems, strict=True)
         )
         assert b.predicted == pytest.approx(a.predicted, rel=1e-6)
         assert b.damping == pytest.approx(a.damping, rel=1e-6, abs=1e-300)
-        assert b.unpolished == pytest.approx(a.unpolished, rel=1e-6)
+        assert b.before_inner == pytest.approx(a.before_inner, rel=1e-6)
         assert b.objective == pytest.approx(a.objective, rel=1e-6)
-        assert (b.objective == b.unpolished) == (inner_iterations == 0)
+        assert (b.objective == b.before_inner) == (inner_iterations == 0)
         for field in dataclasses.fields(State):
             near(getattr(a.state, field.name), getattr(b.state, field.name), 1e-6)
         np.testing.assert_array_equal(b.state.rotation[problem.fixed], problem.start.rotation[problem.fixed])
@@ -133,17 +135,17 @@ def test_native_steps_as_numpy_does(shape: dict[str, object], damping: str, make
 @built
 @pytest.mark.parametrize("options", COST_MODELS)
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_native_linearises_where_polishing_ended(
+def test_native_linearises_where_inner_iterations_ended(
     shape: dict[str, object], options: SolverOptions, make_problem: Make
 ) -> None:
-    """What polishing kept of its last look is what a linearisation there finds anew."""
+    """What inner iterations kept of their last look is what a linearisation there finds anew."""
     problem = some_behind(make_problem(start_error=0.02, **shape)[0])
     kernels = native_kernels.make(problem, options)
     kernels.linearise(problem.start)
     system = kernels.damp("diag", 1e-2)
     step = system.solve_dense()
     assert step is not None
-    first = kernels.move(problem.start, system, step.copy(), 3).state
+    first = kernels.step(problem.start, system, step.copy(), 3).state
     oracle = made(problem, options, "numpy")
 
     def agree() -> None:
@@ -156,20 +158,20 @@ def test_native_linearises_where_polishing_ended(
         near(a.rhs, b.rhs, 1e-9)
 
     agree()
-    # Another step was polished since, and rejected: the linearisation is one from the beginning.
-    kernels.move(first, kernels.damp("diag", 1.0), step, 3)
+    # Another step was taken since, and rejected: the linearisation is one from the beginning.
+    kernels.step(first, kernels.damp("diag", 1.0), step, 3)
     agree()
 
 
 @built
-def test_native_knows_once_where_polishing_ended(make_problem: Make) -> None:
+def test_native_knows_once_where_inner_iterations_ended(make_problem: Make) -> None:
     kernels = native_kernels.make(make_problem()[0], SolverOptions(kernels="native"))
     assert isinstance(kernels, native_kernels.NativeKernels)
-    polished = kernels.polish_points(make_problem()[0].start, 2)[1]
-    assert kernels._kernel.linearise_polished()
-    assert not kernels._kernel.linearise_polished()
-    kernels.linearise(polished)
-    assert not kernels._kernel.linearise_polished()
+    iterated = kernels.iterate_points(make_problem()[0].start, 2)[1]
+    assert kernels._kernel.linearise_prepared()
+    assert not kernels._kernel.linearise_prepared()
+    kernels.linearise(iterated)
+    assert not kernels._kernel.linearise_prepared()
 
 
 @built
@@ -177,8 +179,8 @@ def test_a_step_that_is_not_finite_has_no_objective(make_problem: Make) -> None:
     problem, _ = make_problem()
     for kernels in pair(problem, SolverOptions()):
         system = kernels.damp("diag", 1e-3)
-        moved = kernels.move(problem.start, system, np.full(len(system.rhs), np.nan), 3)
-        assert np.isnan(moved.unpolished) and np.isnan(moved.objective)
+        moved = kernels.step(problem.start, system, np.full(len(system.rhs), np.nan), 3)
+        assert np.isnan(moved.before_inner) and np.isnan(moved.objective)
 
 
 @built
@@ -302,10 +304,10 @@ def test_native_numbers_images_of_many_keyframes_and_cameras(make_problem: Make)
 
 
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
-def test_polishing_moves_points_only_and_never_makes_one_worse(backend: str, make_problem: Make) -> None:
+def test_inner_iterations_move_points_only_and_never_make_one_worse(backend: str, make_problem: Make) -> None:
     problem, _ = make_problem(start_error=0.05)
     kernels = native_kernels.make(problem, SolverOptions(loss="huber", kernels=backend))
-    value, state = kernels.polish_points(problem.start, 3)
+    value, state = kernels.iterate_points(problem.start, 3)
     objective = Objective(problem, SolverOptions(loss="huber"))
     assert value == pytest.approx(objective.value(state), rel=1e-12)
     before, after = (
@@ -318,10 +320,10 @@ def test_polishing_moves_points_only_and_never_makes_one_worse(backend: str, mak
 
 @pytest.mark.parametrize("shape", [{}, {"stereo": True, "depth": True}, {"free_intrinsics": True}])
 @pytest.mark.parametrize("steps", [1, 3])
-def test_rows_kept_while_polishing_are_those_of_the_state(
+def test_rows_kept_by_inner_iterations_are_those_of_the_state(
     shape: dict[str, object], steps: int, make_problem: Make
 ) -> None:
-    """After a step the linearisation takes up what polishing has worked out; so it is as good as a fresh one."""
+    """After a step the linearisation takes up what inner iterations worked out; it is as good as a fresh one."""
     problem, _ = make_problem(start_error=0.05, **shape)
     options = SolverOptions(loss="huber")
     kernels = NumpyKernels(problem, options)
@@ -329,7 +331,7 @@ def test_rows_kept_while_polishing_are_those_of_the_state(
     system = kernels.damp("diag", 1e-4)
     x = system.solve_dense()
     assert x is not None
-    moved = kernels.move(problem.start, system, x, steps)
+    moved = kernels.step(problem.start, system, x, steps)
     fresh = NumpyKernels(problem, options)
     assert kernels.linearise(moved.state) == pytest.approx(fresh.linearise(moved.state), rel=1e-13)
     for name in ("b", "c", "e", "gradient_c", "gradient_p"):
@@ -345,19 +347,19 @@ def test_rows_of_one_surrogate_do_not_serve_the_next(make_problem: Make) -> None
     system = kernels.damp("diag", 1e-4)
     x = system.solve_dense()
     assert x is not None
-    state = kernels.move(problem.start, system, x, 3).state
+    state = kernels.step(problem.start, system, x, 3).state
     first = kernels.linearise(state)
     kernels.graduate(10.0)
     fresh.graduate(10.0)
     assert kernels.linearise(state) == fresh.linearise(state) != first
 
 
-def test_polishing_what_is_at_its_best_changes_nothing(make_problem: Make) -> None:
+def test_iterating_what_is_at_its_best_changes_nothing(make_problem: Make) -> None:
     problem, _ = make_problem()
     kernels = NumpyKernels(problem, SolverOptions())
-    value, state = kernels.polish_points(problem.start, 20)
+    value, state = kernels.iterate_points(problem.start, 20)
     for _ in range(20):
-        before, (value, state) = value, kernels.polish_points(state, 20)
+        before, (value, state) = value, kernels.iterate_points(state, 20)
     assert value == pytest.approx(before, rel=1e-14)
     assert kernels.linearise(state) == pytest.approx(value, rel=1e-13)
 
@@ -373,7 +375,8 @@ def test_large_systems_are_solved_without_a_dense_s(
         SolverOptions(), kernels=backend, linear_solver=linear_solver, t_eps=1e-6, function_tolerance=1e-14
     )
     dense = solver.solve(problem, options)
-    monkeypatch.setattr(reduced, "DENSE_LIMIT", 0)
+    for module in (reduced, numpy_kernels):
+        monkeypatch.setattr(module, "DENSE_LIMIT", 0)
     other = solver.solve(problem, options)
     assert other.objective_after == pytest.approx(dense.objective_after, rel=1e-9)
 

@@ -38,7 +38,7 @@ def quantities(problem: Problem, threads: int) -> dict[str, object]:
     assert x is not None
     out |= {"rhs": system.rhs.copy(), "x": x.copy(), "dense": system.dense(), "sparse": system.sparse().toarray()}
     out |= {"product": system.product(x), "blocks": system.diagonal_blocks()[0], "back": system.back_substitute(x)[1:]}
-    moved = kernels.move(problem.start, system, x, 3)
+    moved = kernels.step(problem.start, system, x, 3)
     out |= {"moved": dataclasses.astuple(moved), "objective": kernels.objective(moved.state)}
     return out
 
@@ -77,7 +77,7 @@ def test_an_iteration_asks_for_no_memory(shape: str, make_problem: Make) -> None
         system = kernels.damp("diag", 1e-3)
         x = system.solve_dense()
         assert x is not None
-        state = kernels.move(state, system, x, 3).state
+        state = kernels.step(state, system, x, 3).state
         known.append((native.kernels.allocations() - before[0], tracemalloc.get_traced_memory()[1] - before[1]))
     tracemalloc.stop()
     assert known[0][0] > 0, "the first iteration makes room for S, or the counter does not count"

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.estimate import Estimate
-from ba_node.io.trajectory import Trajectory, TrajectoryError, format_stamp, parse_stamp, read_tum, write_tum
+from ba_node.estimate import Estimate, Poses
+from ba_node.io.trajectory import TrajectoryError, format_stamp, parse_stamp, read_tum, write_tum
 
 
 @given(st.integers(-(2**63), 2**63 - 1))
@@ -44,10 +44,10 @@ def test_what_was_written_is_read_exactly(tmp_path: Path, estimate: Estimate) ->
 
 def test_form_of_a_line(tmp_path: Path) -> None:
     path = tmp_path / "t.tum"
-    pose = Trajectory(np.array([1_000_000_001]), np.array([[1.0, -2.5, 1e-7]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
-    write_tum(path, pose)
+    position, orientation = np.array([[1.0, -2.5, 1e-7]]), np.array([[0.0, 0.0, 0.0, 1.0]])
+    write_tum(path, Poses(np.array([7], dtype=np.uint64), np.array([1_000_000_001]), position, orientation))
     assert path.read_text() == "# stamp x y z qx qy qz qw\n1.000000001 1.0 -2.5 1e-07 0.0 0.0 0.0 1.0\n"
-    assert len(read_tum(path)) == 1
+    assert read_tum(path).keyframe_id.tolist() == [0], "the format has no ids"
 
 
 @pytest.mark.parametrize(

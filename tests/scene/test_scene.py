@@ -68,12 +68,12 @@ def content(scene: Scene) -> tuple[Any, ...]:
             repr(float(depth)),
         )
         for s_kf, camera, s_lm, uv, sigma, depth in zip(
-            scene.sightings.keyframe,
-            scene.sightings.camera,
-            scene.sightings.landmark,
-            scene.sightings.uv,
-            scene.sightings.sigma_px,
-            scene.sightings.depth_m,
+            scene.observations.keyframe,
+            scene.observations.camera,
+            scene.observations.landmark,
+            scene.observations.uv,
+            scene.observations.sigma_px,
+            scene.observations.depth_m,
             strict=True,
         )
     )
@@ -90,15 +90,15 @@ def content(scene: Scene) -> tuple[Any, ...]:
 def check_links(scene: Scene) -> None:
     """Check that the views found through the links are those of the table, for every landmark."""
     for row in range(len(scene.landmarks)):
-        expected = np.flatnonzero(scene.sightings.landmark == row)
+        expected = np.flatnonzero(scene.observations.landmark == row)
         assert sorted(scene.views_of(np.array([row])).tolist()) == expected.tolist()
         assert scene.landmarks.views[row] == len(expected)
     blocks = sorted((b.begin, b.end, row, b.camera) for row, of_row in enumerate(scene.blocks) for b in of_row)
     covered = [i for begin, end, _, _ in blocks for i in range(begin, end)]
-    assert covered == list(range(len(scene.sightings)))
+    assert covered == list(range(len(scene.observations)))
     for begin, end, row, camera in blocks:
-        assert (scene.sightings.keyframe[begin:end] == row).all()
-        assert (scene.sightings.camera[begin:end] == camera).all()
+        assert (scene.observations.keyframe[begin:end] == row).all()
+        assert (scene.observations.camera[begin:end] == camera).all()
 
 
 def test_any_uint64_is_an_id() -> None:
@@ -127,7 +127,7 @@ def test_bad_rows_are_dropped_one_by_one(reason: str, values: dict[str, list[Any
     arrays: dict[str, Any] = {k: np.array(v, np.uint64 if k == "track_id" else float) for k, v in values.items()}
     scene = scene_of(rig(), keyframe(4), tracks(4, ids=IDS[:3], **arrays))
     assert scene.log.rejected == {reason: count}
-    assert len(scene.sightings) == 3 - count
+    assert len(scene.observations) == 3 - count
     assert f"({reason} = {count})" in scene.log.notes[-1]
     assert "keyframe 4" in scene.log.notes[-1]
 
@@ -135,8 +135,8 @@ def test_bad_rows_are_dropped_one_by_one(reason: str, values: dict[str, list[Any
 def test_a_bad_depth_costs_the_depth_alone() -> None:
     scene = scene_of(rig(), keyframe(4), tracks(4, ids=IDS[:4], depth_m=np.array([-1.0, 0.0, 5.0, np.nan])))
     assert scene.log.rejected == {"bad_depth": 2}
-    assert scene.sightings.depth_m.tolist()[2] == 5.0
-    assert np.isnan(scene.sightings.depth_m[[0, 1, 3]]).all()
+    assert scene.observations.depth_m.tolist()[2] == 5.0
+    assert np.isnan(scene.observations.depth_m[[0, 1, 3]]).all()
 
 
 BAD_MESSAGES = [
@@ -230,8 +230,8 @@ def test_the_newest_views_are_the_last_rows_of_each_landmark(newest: int) -> Non
     landmarks = np.array([0, 2, 3])
     found = scene.views_of(landmarks, newest)
     for row in landmarks:
-        expected = np.flatnonzero(scene.sightings.landmark == row)[-newest:]
-        assert sorted(found[scene.sightings.landmark[found] == row].tolist()) == expected.tolist()
+        expected = np.flatnonzero(scene.observations.landmark == row)[-newest:]
+        assert sorted(found[scene.observations.landmark[found] == row].tolist()) == expected.tolist()
 
 
 def test_new_keyframes_follow_the_correction_of_their_predecessor() -> None:
@@ -240,7 +240,7 @@ def test_new_keyframes_follow_the_correction_of_their_predecessor() -> None:
     scene.keyframes.rotation[1], scene.keyframes.position[1] = turn, [10.0, 0, 0]
     scene.keyframes.refined[1] = True
     scene.add(keyframe(3, position=np.array([1.5, 0.25, 0])))
-    scene.settle_poses()
+    scene.propagate_corrections()
     # Keyframe 2 came in at x = 1: keyframe 3 is (0.5, 0.25, 0) further on, seen from it.
     np.testing.assert_allclose(scene.keyframes.position[2], [10.0, 0, 0] + turn @ [0.5, 0.25, 0], atol=1e-14)
     np.testing.assert_allclose(scene.keyframes.rotation[2], turn, atol=1e-14)
@@ -255,7 +255,7 @@ def test_the_oldest_keyframes_are_forgotten_with_their_observations() -> None:
         scene.add(tracks(i, ids=np.array([i // 2, 1000], np.uint64)))
         assert len(scene.keyframes) <= 20
     assert [int(k) for k in scene.keyframes.keyframe_id][-1] == 99
-    assert len(scene.sightings) == 2 * len(scene.keyframes)
+    assert len(scene.observations) == 2 * len(scene.keyframes)
     check_links(scene)
 
 
@@ -330,8 +330,8 @@ def test_no_stream_raises_or_breaks_the_links(stream: list[Measurement]) -> None
         assert known <= {int(k) for k in scene.keyframes.keyframe_id}
         assert len(scene.pending) <= 3
     assert np.isfinite(scene.keyframes.position).all()
-    assert np.isfinite(scene.sightings.uv).all()
-    assert (scene.sightings.sigma_px > 0).all()
+    assert np.isfinite(scene.observations.uv).all()
+    assert (scene.observations.sigma_px > 0).all()
     assert np.isfinite(scene.landmarks.guess[scene.landmarks.has_guess]).all()
     check_links(scene)
 

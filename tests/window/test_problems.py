@@ -20,7 +20,7 @@ def test_a_part_is_what_would_have_been_made_of_its_rows(depth_share: float) -> 
     ).timeline():
         scene.add(measurement)
     rng = np.random.default_rng(0)
-    rows = np.arange(len(scene.sightings))
+    rows = np.arange(len(scene.observations))
     landmarks = rng.permutation(len(scene.landmarks))
     origin, positions = np.array([1.0, 2.0, 3.0]), rng.normal(size=(len(landmarks), 3))
     whole = problem_of(scene, rows, scene.order, landmarks, origin, positions, settings)

@@ -12,9 +12,9 @@ from ba_node.cli.main import main
 from experiments.thesis import catalogue
 from experiments.thesis.experiments import Experiment
 from experiments.thesis.measures import MEASURES
+from experiments.thesis.metrics import METRICS
 from experiments.thesis.plots import PLOTS
 from experiments.thesis.problems import NAMES
-from experiments.thesis.quantities import QUANTITIES
 from experiments.thesis.tasks import Run
 
 TABLES = [*(f"3.{i}" for i in range(1, 12)), "4.1", "4.2", *(f"5.{i}" for i in range(1, 5))]
@@ -36,7 +36,7 @@ def test_every_table_and_figure_is_repeated_once() -> None:
 
 @pytest.mark.parametrize("experiment", catalogue.EXPERIMENTS, ids=IDS)
 def test_everything_it_names_exists(experiment: Experiment) -> None:
-    assert set(experiment.columns) <= QUANTITIES.keys()
+    assert set(experiment.columns) <= METRICS.keys()
     assert set(experiment.plots) <= PLOTS.keys()
     labels = [case.label for case in experiment.cases]
     assert len(set(labels)) == len(labels)
@@ -52,7 +52,7 @@ def test_everything_it_names_exists(experiment: Experiment) -> None:
 
 @pytest.mark.parametrize("experiment", catalogue.EXPERIMENTS, ids=IDS)
 def test_a_table_whose_times_are_compared_uses_one_kind_of_kernels(experiment: Experiment) -> None:
-    if not any(QUANTITIES[name].is_time for name in experiment.columns):
+    if not any(METRICS[name].is_time for name in experiment.columns):
         return
     compared = [case.task for case in experiment.cases if not case.label.endswith("C++")]
     backends = {task.options().kernels for task in compared if isinstance(task, Run)}
@@ -99,6 +99,7 @@ class TestCommand:
         assert main(["thesis", "3.8", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
         assert "grail.cs.washington.edu" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_a_small_one(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         arguments = ["thesis", "5.1", "fig-5.5", "--quick", "--out", str(tmp_path / "a" / "b")]
         assert main(arguments) == 0

@@ -15,7 +15,10 @@ import pytest
 from experiments.thesis import catalogue
 from experiments.thesis.claims import CLAIMS
 from experiments.thesis.findings import FINDINGS
-from experiments.thesis.judging import (
+from experiments.thesis.metrics import METRICS
+from experiments.thesis.open_page import open_page
+from experiments.thesis.page import claims_page, old_cases
+from experiments.thesis.verdicts import (
     HOLDS,
     HOLDS_NOT,
     NOT_RUN,
@@ -25,11 +28,8 @@ from experiments.thesis.judging import (
     Check,
     Claim,
     Within,
-    judge,
+    verdict_on,
 )
-from experiments.thesis.open_page import open_page
-from experiments.thesis.page import claims_page, old_cases
-from experiments.thesis.quantities import QUANTITIES
 
 RECORDED = Path(__file__).resolve().parents[3] / "docs" / "thesis_results.json"
 # Where the objective at the end is that of a point on the way, as nothing damps INM.
@@ -70,17 +70,17 @@ def recorded() -> dict[str, dict[str, dict[str, Any]]]:
     ],
 )
 def test_verdicts(checks: tuple[Check, ...], word: str) -> None:
-    verdict = judge(Claim("it is so", "1", checks), MADE_UP)
+    verdict = verdict_on(Claim("it is so", "1", checks), MADE_UP)
     assert verdict.word == word
     assert len(verdict.found) == (0 if word == NOT_RUN else len(checks))
 
 
 def used(check: Check) -> list[tuple[str, str, str]]:
-    """Return experiment, label and quantity of everything that a check looks at."""
+    """Return experiment, label and metric of everything that a check looks at."""
     if isinstance(check, Below):
-        return [(check.experiment, label, check.quantity) for label in (check.small, *check.large)]
+        return [(check.experiment, label, check.metric) for label in (check.small, *check.large)]
     if isinstance(check, Within):
-        return [(check.experiment, check.label, check.quantity)]
+        return [(check.experiment, check.label, check.metric)]
     assert isinstance(check, Breaks)
     return [(name, check.label, "objective") for name in check.experiments]
 
@@ -89,16 +89,16 @@ def used(check: Check) -> list[tuple[str, str, str]]:
 def test_a_claim_looks_at_what_is_run(claim: Claim) -> None:
     assert claim.checks
     for check in claim.checks:
-        for name, label, quantity in used(check):
+        for name, label, metric in used(check):
             assert label in [case.label for case in catalogue.find(name).cases], (name, label)
-            assert quantity in QUANTITIES
+            assert metric in METRICS
 
 
 class TestRecorded:
     """The figures in docs/thesis_results.json, on which docs/thesis.md rests."""
 
     def test_they_judge_nearly_every_claim(self, recorded: dict[str, dict[str, dict[str, Any]]]) -> None:
-        left = [claim.text for claim in CLAIMS if judge(claim, recorded).word == NOT_RUN]
+        left = [claim.text for claim in CLAIMS if verdict_on(claim, recorded).word == NOT_RUN]
         assert len(left) <= len(CLAIMS) // 5, left
 
     @pytest.mark.parametrize("claim", CLAIMS + FINDINGS, ids=lambda claim: claim.text)
@@ -106,18 +106,18 @@ class TestRecorded:
         self, claim: Claim, recorded: dict[str, dict[str, dict[str, Any]]]
     ) -> None:
         """Each figure is moved by what was seen between two machines; what it is compared with stays."""
-        word = judge(claim, recorded).word
+        word = verdict_on(claim, recorded).word
         for check in claim.checks:
-            for name, label, quantity in used(check):
-                value = recorded[name][label].get(quantity)
-                by = 1.1 if QUANTITIES[quantity].is_time else NOISE.get(quantity, 1.0)
-                if quantity == "objective" and name in FAR_FROM_THE_END:
+            for name, label, metric in used(check):
+                value = recorded[name][label].get(metric)
+                by = 1.1 if METRICS[metric].is_time else NOISE.get(metric, 1.0)
+                if metric == "objective" and name in FAR_FROM_THE_END:
                     by = 1.02
                 for moved in (value * by, value / by) if value is not None else ():
-                    recorded[name][label][quantity] = moved
-                    again = judge(claim, recorded).word
-                    recorded[name][label][quantity] = value
-                    assert again == word, (label, quantity, value, moved)
+                    recorded[name][label][metric] = moved
+                    again = verdict_on(claim, recorded).word
+                    recorded[name][label][metric] = value
+                    assert again == word, (label, metric, value, moved)
 
     def test_the_page_shows_every_claim(self, recorded: dict[str, dict[str, dict[str, Any]]]) -> None:
         page = claims_page(recorded)
@@ -129,7 +129,7 @@ class TestRecorded:
     ) -> None:
         page = open_page(recorded)
         assert all(finding.text in page for finding in FINDINGS)
-        assert all(judge(finding, recorded).word == HOLDS for finding in FINDINGS)
+        assert all(verdict_on(finding, recorded).word == HOLDS for finding in FINDINGS)
         names = re.findall(r"\]\((images/[^)]+)\)", page)
         assert len(names) == 5
         assert all((RECORDED.parent / name).read_bytes().startswith(b"\x89PNG") for name in names)

@@ -48,7 +48,7 @@ def test_records_hold_the_trace_and_how_it_ended(tiny: Experiment, tmp_path: Pat
     assert record["truth_after"]["rmse_points"] < record["truth_before"]["rmse_points"]
     assert [image["image"] for image in record["images"]] == [0, 3]
     assert record["problem"] == {"name": "10-253", "images": 10, "points": 253, "observations": 1326}
-    assert abs(section.figures["Taylor"]["slope"] - 2.0) < 0.1  # type: ignore[operator]
+    assert abs(section.metrics["Taylor"]["slope"] - 2.0) < 0.1  # type: ignore[operator]
 
 
 def test_what_was_interrupted_goes_on_where_it_stopped(
@@ -77,6 +77,7 @@ def test_what_was_interrupted_goes_on_where_it_stopped(
     assert repetition(tiny, tmp_path).missing() == []
 
 
+@pytest.mark.slow
 def test_a_second_run_solves_nothing_and_says_the_same(
     tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,8 +130,8 @@ def test_the_page_holds_everything(tiny: Experiment, tmp_path: Path) -> None:
     )
     lma = next(line for line in table if line.startswith("| LMA-CD"))
     assert "| 5 (0.5) |" in lma, "the thesis's time has its ratio to the first row"
-    figures = json.loads((tmp_path / "results.json").read_text())["9.9"]
-    assert figures["DINM"]["steps"] == 4.0
+    metrics = json.loads((tmp_path / "results.json").read_text())["9.9"]
+    assert metrics["DINM"]["steps"] == 4.0
     assert not any("the problem" in line for line in table), "a case without figures makes no row"
 
 

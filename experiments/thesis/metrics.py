@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a record: what tables show and claims are judged by."""
+"""Metrics of a record: what tables show and claims are checked against."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Metric:
     """What a column shows.
 
     Attributes:
@@ -28,50 +28,50 @@ class Quantity:
     is_time: bool = False
 
 
-QUANTITIES: dict[str, Quantity] = {
-    "seconds": Quantity("time [s]", is_time=True),
-    "seconds_per_solve": Quantity("time per linear solve and step [s]", is_time=True),
-    "pcg_per_solve": Quantity("PCG steps per solve", ".0f"),
-    "pcg_total": Quantity("PCG steps in all", ".0f"),
-    "steps": Quantity("steps taken", ".0f"),
-    "solves": Quantity("steps tried", ".0f"),
-    "objective": Quantity("objective at the end", ".6g"),
-    "objective_before": Quantity("objective at the start", ".6g"),
-    "gradient": Quantity("norm of the gradient at the end"),
-    "gradient_smallest": Quantity("smallest norm of the gradient"),
-    "gradient_largest_entry": Quantity("largest entry of the gradient"),
-    "gradient_rise": Quantity("mean rise of its log10 a step", ".3f"),
-    "side": Quantity("eliminated cameras in [steps]", ".0f"),
-    "rmse_cameras": Quantity("RMSE of cameras", ".4g"),
-    "rmse_points": Quantity("RMSE of points", ".4g"),
-    "median_points": Quantity("median error of points", ".4g"),
-    "outside_two_px": Quantity("|error| > 2 px [%]", ".2f"),
-    "gaussian_outside": Quantity("of a Gaussian as wide [%]", ".2f"),
-    "kurtosis": Quantity("kurtosis (Gaussian: 3)", ".1f"),
-    "end": Quantity("why it stopped"),
-    "slope": Quantity("slope", ".4f"),
-    "megabytes": Quantity("memory at most [MB]"),
-    "difference": Quantity("|p - p of Cholesky|² / s", ".2g"),
-    "rotation": Quantity("rotation", ".0e"),
-    "translation": Quantity("translation", ".0e"),
-    "f": Quantity("f", ".0e"),
-    "k1": Quantity("k1", ".0e"),
-    "k2": Quantity("k2", ".0e"),
-    "point": Quantity("point", ".0e"),
-    "observations": Quantity("observations", ".0f"),
-    "fill_of_e": Quantity("share of E's blocks", ".2f"),
-    "views_per_point": Quantity("images per point", ".1f"),
-    "condition_c": Quantity("condition of C", ".1e"),
-    "condition_b": Quantity("condition of B", ".1e"),
-    "condition_s": Quantity("condition of S", ".1e"),
-    "lone_points": Quantity("points held by < 2 observations", ".0f"),
-    "first_break": Quantity("first break in step", ".0f"),
-    "breaks": Quantity("breaks", ".0f"),
+METRICS: dict[str, Metric] = {
+    "seconds": Metric("time [s]", is_time=True),
+    "seconds_per_solve": Metric("time per linear solve and step [s]", is_time=True),
+    "pcg_per_solve": Metric("PCG steps per solve", ".0f"),
+    "pcg_total": Metric("PCG steps in all", ".0f"),
+    "steps": Metric("steps taken", ".0f"),
+    "solves": Metric("steps tried", ".0f"),
+    "objective": Metric("objective at the end", ".6g"),
+    "objective_before": Metric("objective at the start", ".6g"),
+    "gradient": Metric("norm of the gradient at the end"),
+    "gradient_smallest": Metric("smallest norm of the gradient"),
+    "gradient_largest_entry": Metric("largest entry of the gradient"),
+    "gradient_rise": Metric("mean rise of its log10 a step", ".3f"),
+    "side": Metric("eliminated cameras in [steps]", ".0f"),
+    "rmse_cameras": Metric("RMSE of cameras", ".4g"),
+    "rmse_points": Metric("RMSE of points", ".4g"),
+    "median_points": Metric("median error of points", ".4g"),
+    "outside_two_px": Metric("|error| > 2 px [%]", ".2f"),
+    "gaussian_outside": Metric("of a Gaussian as wide [%]", ".2f"),
+    "kurtosis": Metric("kurtosis (Gaussian: 3)", ".1f"),
+    "end": Metric("why it stopped"),
+    "slope": Metric("slope", ".4f"),
+    "megabytes": Metric("memory at most [MB]"),
+    "difference": Metric("|p - p of Cholesky|² / s", ".2g"),
+    "rotation": Metric("rotation", ".0e"),
+    "translation": Metric("translation", ".0e"),
+    "f": Metric("f", ".0e"),
+    "k1": Metric("k1", ".0e"),
+    "k2": Metric("k2", ".0e"),
+    "point": Metric("point", ".0e"),
+    "observations": Metric("observations", ".0f"),
+    "fill_of_e": Metric("share of E's blocks", ".2f"),
+    "views_per_point": Metric("images per point", ".1f"),
+    "condition_c": Metric("condition of C", ".1e"),
+    "condition_b": Metric("condition of B", ".1e"),
+    "condition_s": Metric("condition of S", ".1e"),
+    "lone_points": Metric("points held by < 2 observations", ".0f"),
+    "first_break": Metric("first break in step", ".0f"),
+    "breaks": Metric("breaks", ".0f"),
 }
 
 
-def figures(record: Record) -> dict[str, float | str | None]:
-    """Return every figure that a record has, by name of the quantity."""
+def metrics_of(record: Record) -> dict[str, float | str | None]:
+    """Return every metric that a record has, by name."""
     if "trace" not in record:
         return dict(record.get("figures", {}))
     rows = record["trace"]
@@ -110,9 +110,9 @@ def _rise(norms: Sequence[float]) -> float:
 
 
 def shown(name: str, value: float | str | None) -> str:
-    """Return a figure as text; a dash for none."""
+    """Return a metric as text; a dash for none."""
     if value is None:
         return "–"
     if isinstance(value, str):
         return value
-    return format(value, QUANTITIES[name].form) if math.isfinite(value) else "–"
+    return format(value, METRICS[name].form) if math.isfinite(value) else "–"

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge a claim by figures: it is declared as comparisons, and holds if all of them do, partly if some do.
+"""Check a claim by its comparisons of recorded metrics: it holds if all of them do, partly if some do.
 
 Comparisons of times ask for a margin that noise does not reach; most compare counts, objectives and gradients, which a
 second run repeats to the last digit.
@@ -13,25 +13,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from experiments.thesis.quantities import QUANTITIES, shown
+from experiments.thesis.metrics import METRICS, shown
 
 Results = Mapping[str, Mapping[str, Mapping[str, Any]]]
 HOLDS, PARTLY, HOLDS_NOT, NOT_RUN = "holds", "partly", "holds not", "not run"
 
 
 class NotRunError(LookupError):
-    """A figure that has not been measured."""
+    """A metric that has not been measured."""
 
 
-def figure(results: Results, experiment: str, label: str, quantity: str) -> float:
-    """Return a figure.
+def metric_of(results: Results, experiment: str, label: str, metric: str) -> float:
+    """Return a metric.
 
     Raises:
         NotRunError: there is none.
     """
-    value = results.get(experiment, {}).get(label, {}).get(quantity)
+    value = results.get(experiment, {}).get(label, {}).get(metric)
     if not isinstance(value, float):
-        raise NotRunError(f"{experiment}, {label}: {quantity}")
+        raise NotRunError(f"{experiment}, {label}: {metric}")
     return value
 
 
@@ -41,16 +41,16 @@ class Check(Protocol):
     def cases(self) -> tuple[tuple[str, str], ...]:
         """Return experiment and label of each case that it looks at."""
 
-    def look(self, results: Results) -> tuple[bool, str]:
+    def evaluate(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and in words what was asked and found."""
 
 
 @dataclass(frozen=True)
 class Below:
-    """A figure of one case is below those of others, by a factor."""
+    """A metric of one case is below that of others, by a factor."""
 
     experiment: str
-    quantity: str
+    metric: str
     small: str
     large: tuple[str, ...]
     factor: float = 1.0
@@ -59,26 +59,26 @@ class Below:
         """Return experiment and label of each case that it looks at."""
         return tuple((self.experiment, label) for label in (self.small, *self.large))
 
-    def look(self, results: Results) -> tuple[bool, str]:
+    def evaluate(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and what was asked and found."""
-        small = figure(results, self.experiment, self.small, self.quantity)
-        others = {label: figure(results, self.experiment, label, self.quantity) for label in self.large}
+        small = metric_of(results, self.experiment, self.small, self.metric)
+        others = {label: metric_of(results, self.experiment, label, self.metric) for label in self.large}
         good = all(small * self.factor <= value for value in others.values())
         asked = "below"
         if self.factor > 1.0:
             asked = f"below by a factor of {self.factor:.3g}"
         elif self.factor < 1.0:
             asked = f"at most {100.0 * (1.0 / self.factor - 1.0):.2g} % above"
-        found = ", ".join(f"{label} {shown(self.quantity, value)}" for label, value in others.items())
-        return good, f"{QUANTITIES[self.quantity].title}: {self.small} {shown(self.quantity, small)} {asked} {found}"
+        found = ", ".join(f"{label} {shown(self.metric, value)}" for label, value in others.items())
+        return good, f"{METRICS[self.metric].title}: {self.small} {shown(self.metric, small)} {asked} {found}"
 
 
 @dataclass(frozen=True)
 class Within:
-    """A figure lies between two bounds."""
+    """A metric lies between two bounds."""
 
     experiment: str
-    quantity: str
+    metric: str
     label: str
     low: float = -math.inf
     high: float = math.inf
@@ -87,16 +87,16 @@ class Within:
         """Return experiment and label of each case that it looks at."""
         return ((self.experiment, self.label),)
 
-    def look(self, results: Results) -> tuple[bool, str]:
+    def evaluate(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and what was asked and found."""
-        value = figure(results, self.experiment, self.label, self.quantity)
+        value = metric_of(results, self.experiment, self.label, self.metric)
         bounds = [f"at least {self.low:g}"] * (self.low > -math.inf) + [f"at most {self.high:g}"] * (
             self.high < math.inf
         )
-        title = QUANTITIES[self.quantity].title
+        title = METRICS[self.metric].title
         return (
             self.low <= value <= self.high,
-            f"{title}: {self.label} {shown(self.quantity, value)} {' and '.join(bounds)}",
+            f"{title}: {self.label} {shown(self.metric, value)} {' and '.join(bounds)}",
         )
 
 
@@ -111,9 +111,9 @@ class Breaks:
         """Return experiment and label of each case that it looks at."""
         return tuple((name, self.label) for name in self.experiments)
 
-    def look(self, results: Results) -> tuple[bool, str]:
+    def evaluate(self, results: Results) -> tuple[bool, str]:
         """Return whether it is so, and what was asked and found."""
-        steps = [figure(results, name, self.label, "steps") for name in self.experiments]
+        steps = [metric_of(results, name, self.label, "steps") for name in self.experiments]
         # What is not finite is null in a record.
         broken = sum(results[name][self.label].get("objective") is None for name in self.experiments)
         counted = ", ".join(f"{count:.0f}" for count in steps)
@@ -146,16 +146,16 @@ class Verdict:
     found: tuple[tuple[bool, str], ...]
 
 
-def judge(claim: Claim, results: Results) -> Verdict:
-    """Return the verdict; NOT_RUN if a figure that it needs has not been measured."""
+def verdict_on(claim: Claim, results: Results) -> Verdict:
+    """Return the verdict; NOT_RUN if a metric that it needs has not been measured."""
     try:
-        found = tuple(check.look(results) for check in claim.checks)
+        found = tuple(check.evaluate(results) for check in claim.checks)
     except NotRunError:
         return Verdict(claim, NOT_RUN, ())
     good = sum(so for so, _ in found)
     return Verdict(claim, HOLDS if good == len(found) else PARTLY if good else HOLDS_NOT, found)
 
 
-def judge_all(claims: Sequence[Claim], results: Results) -> list[Verdict]:
-    """Return the verdicts on all claims for which there are figures."""
-    return [verdict for claim in claims if (verdict := judge(claim, results)).word != NOT_RUN]
+def verdicts_on(claims: Sequence[Claim], results: Results) -> list[Verdict]:
+    """Return the verdicts on all claims for which there are metrics."""
+    return [verdict for claim in claims if (verdict := verdict_on(claim, results)).word != NOT_RUN]

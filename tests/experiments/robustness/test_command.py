@@ -10,6 +10,7 @@ import pytest
 from ba_node.cli.main import main
 
 
+@pytest.mark.slow
 def test_rows_page_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["robustness", "--only", "stamps_in_another_unit", "--seeds", "1", "--out", str(tmp_path)]
     assert main(command) == 0

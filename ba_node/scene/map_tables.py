@@ -1,0 +1,235 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of one map, and what keeps them consistent: order, indices, links between views, forgetting.
+
+All observations stand in one table in order of arrival. Each row knows the previous row of the same landmark and each
+landmark its last, so that the views of some landmarks are found in as many vector steps as the longest track has views,
+however large the map is.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
+from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IdIndex, IntArray
+
+if TYPE_CHECKING:
+    from ba_node.config import SceneConfig
+
+# 2^64 over the golden ratio: its multiples, modulo 2^64, are all different and spread evenly.
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+class MapTables:
+    """Keyframes, landmarks and who saw what.
+
+    Attributes:
+        config: how much is kept.
+        keyframes: table, in order of arrival; see ``order``.
+        landmarks: table, in order of arrival.
+        observations: table, in order of arrival.
+        blocks: per keyframe row, its rows in ``observations``.
+    """
+
+    def __init__(self, config: SceneConfig) -> None:
+        """Start empty."""
+        self.config = config
+        self.keyframes = Keyframes()
+        self.landmarks = Landmarks()
+        self.observations = ObservationTable()
+        self.blocks: list[list[Block]] = []
+        self._keyframe_rows: dict[int, int] = {}
+        self._landmark_rows = IdIndex()
+        self._order: IntArray | None = None
+
+    @property
+    def order(self) -> IntArray:
+        """Return the keyframe rows by (stamp, arrival), oldest first."""
+        if self._order is None:
+            self._order = np.argsort(self.keyframes.stamp_ns, kind="stable")
+        return self._order
+
+    @property
+    def landmark_order(self) -> IntArray:
+        """Return the landmark rows by track id."""
+        return self._landmark_rows.rows
+
+    def find_keyframe(self, keyframe_id: int) -> int | None:
+        """Return the row of a keyframe, None if it is not known."""
+        return self._keyframe_rows.get(keyframe_id)
+
+    def find_keyframes(self, keyframe_ids: IdArray) -> IntArray:
+        """Return the row of each keyframe, -1 where it is not known."""
+        return np.array([self._keyframe_rows.get(key, -1) for key in keyframe_ids.tolist()], np.intp)
+
+    def find_landmarks(self, track_ids: IdArray) -> IntArray:
+        """Return the row of each track, -1 where it is not known."""
+        return self._landmark_rows.find(track_ids)
+
+    def places(self) -> IntArray:
+        """Return the place of each row of keyframes in the order of time."""
+        place = np.empty(len(self.order), np.intp)
+        place[self.order] = np.arange(len(place))
+        return place
+
+    def cameras_of(self, keyframe_row: int) -> set[int]:
+        """Return the indices of the cameras that delivered for a keyframe."""
+        return {block.camera for block in self.blocks[keyframe_row]}
+
+    def views_of(self, landmarks: IntArray, newest: int | None = None) -> IntArray:
+        """Return the rows of all observations of some landmarks, or of the newest of each, in no particular order."""
+        found: list[IntArray] = []
+        front = self.landmarks.last[landmarks]
+        front = front[front >= 0]
+        while len(front) and (newest is None or len(found) < newest):
+            found.append(front)
+            front = self.observations.previous[front]
+            front = front[front >= 0]
+        return np.concatenate(found) if found else np.empty(0, np.intp)
+
+    def split(self, landmarks: IntArray, since: IntArray) -> IntArray:
+        """Give the older views of some tracks landmarks of their own: their ids have become another point's.
+
+        What was known of a landmark stays with its older views, under an id that nobody has; the track keeps the newer
+        ones and has no position.
+
+        Args:
+            landmarks: (n,) rows, all different, each with older views.
+            since: (n,) place in the order of time of the first keyframe whose views stay.
+
+        Returns:
+            (n,) rows of the landmarks of the older views.
+        """
+        table, observations = self.landmarks, self.observations
+        number = np.full(len(table), -1)
+        number[landmarks] = np.arange(len(landmarks))
+        rows = np.sort(self.views_of(landmarks))
+        of = number[observations.landmark[rows]]
+        old = self.places()[observations.keyframe[rows]] < since[of]
+        known = {name: getattr(table, name)[landmarks] for name in ("position", "guess", "has_position", "has_guess")}
+        ids = self._unknown_ids(len(landmarks))
+        added = table.append(len(landmarks), track_id=ids, last_seen=table.last_seen[landmarks], **known)
+        self._landmark_rows.insert(ids, added)
+        table.position[landmarks] = table.guess[landmarks] = np.nan
+        table.has_position[landmarks] = table.has_guess[landmarks] = False
+        observations.landmark[rows[old]] = added[of[old]]
+        self._link_rows(rows, np.concatenate([landmarks, added]))
+        return added
+
+    def propagate_corrections(self) -> None:
+        """Move keyframes that took part in no solve by the correction of their predecessor.
+
+        So the relative motion comes from the front-end and the anchor from the refined map (before the first refined
+        keyframe, from that one). Done anew before each use: corrections change with every solve.
+        """
+        order, table = self.order, self.keyframes
+        refined = table.refined[order]
+        if refined.all() or not refined.any():
+            return
+        at = np.arange(len(order))
+        anchor = np.maximum.accumulate(np.where(refined, at, -1))
+        anchor = np.where(anchor < 0, int(np.argmax(refined)), anchor)
+        rows, anchors = order[~refined], order[anchor[~refined]]
+        rotation, translation = self.corrections(anchors)
+        moved = geometry.compose(rotation, translation, table.input_rotation[rows], table.input_position[rows])
+        table.rotation[rows], table.position[rows] = moved
+
+    def forget_solutions(self) -> None:
+        """Put keyframes back to where the front-end has them; forget where points are and which views are outliers."""
+        table = self.keyframes
+        table.rotation[:], table.position[:] = table.input_rotation, table.input_position
+        table.refined[:] = False
+        self.landmarks.has_position[:] = False
+        self.observations.outlier[:] = False
+
+    def corrections(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the transform from the front-end's fixed frame to the refined map, as it is at some keyframes."""
+        table = self.keyframes
+        back = geometry.inverse(table.input_rotation[rows], table.input_position[rows])
+        return geometry.compose(table.rotation[rows], table.position[rows], *back)
+
+    def index(self) -> None:
+        """Find anew what follows from the tables: the rows of ids, and which observations belong to a landmark."""
+        self._index_keyframes()
+        self._landmark_rows = IdIndex()
+        self._landmark_rows.insert(self.landmarks.track_id, np.arange(len(self.landmarks)))
+        self._link()
+
+    def _rows_of(self, track_ids: IdArray) -> IntArray:
+        """Return the landmark row of each track (all different), making rows for new ones."""
+        rows = self._landmark_rows.find(track_ids)
+        new = rows < 0
+        rows[new] = self.landmarks.append(int(np.count_nonzero(new)), track_id=track_ids[new])
+        self._landmark_rows.insert(track_ids[new], rows[new])
+        return rows
+
+    def _see(self, landmarks: IntArray, stamp_ns: int) -> None:
+        self.landmarks.last_seen[landmarks] = np.maximum(self.landmarks.last_seen[landmarks], stamp_ns)
+
+    def _forget_keyframes(self) -> None:
+        """Forget the oldest keyframes with their observations: a tenth at once, so that the cost is spread."""
+        table = self.keyframes
+        n_drop = len(table) - self.config.max_keyframes + self.config.max_keyframes // 10
+        keep = np.ones(len(table), bool)
+        keep[self.order[:n_drop]] = False
+        self._drop_observations(keep[self.observations.keyframe])
+        renumbered = table.keep(keep)
+        self.observations.keyframe[:] = renumbered[self.observations.keyframe]
+        self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
+        self._index_keyframes()
+
+    def _limit_landmarks(self) -> None:
+        """Forget the landmarks seen longest ago, ties by row, once there are too many; again a tenth at once."""
+        table, limit = self.landmarks, self.config.max_landmarks
+        if len(table) <= limit:
+            return
+        n_drop = len(table) - limit + limit // 10
+        keep = np.ones(len(table), bool)
+        keep[np.argsort(table.last_seen, kind="stable")[:n_drop]] = False
+        self._drop_observations(keep[self.observations.landmark])
+        renumbered = table.keep(keep)
+        self._landmark_rows.renumber(renumbered)
+        self.observations.landmark[:] = renumbered[self.observations.landmark]
+
+    def _drop_observations(self, keep: BoolArray) -> None:
+        """Forget observations and link the others anew. Landmark numbers are still the old ones."""
+        before = np.concatenate([[0], np.cumsum(keep)])
+        self.blocks = [
+            [Block(b.camera, int(before[b.begin]), int(before[b.end])) for b in blocks] for blocks in self.blocks
+        ]
+        self.observations.keep(keep)
+        self._link()
+
+    def _index_keyframes(self) -> None:
+        self._keyframe_rows = {int(k): row for row, k in enumerate(self.keyframes.keyframe_id)}
+        self._order = None
+
+    def _unknown_ids(self, n: int) -> IdArray:
+        """Return n ids that no track has, spread over all there are."""
+        ids: IdArray = np.empty(0, np.uint64)
+        begin = 1
+        while len(ids) < n:
+            spread = np.arange(begin, begin + 2 * n, dtype=np.uint64) * _GOLDEN
+            ids = np.concatenate([ids, spread[self._landmark_rows.find(spread) < 0]])
+            begin += 2 * n
+        return ids[:n]
+
+    def _link(self) -> None:
+        self._link_rows(np.arange(len(self.observations)), np.arange(len(self.landmarks)))
+
+    def _link_rows(self, rows: IntArray, landmarks: IntArray) -> None:
+        """Find anew which observations belong to some landmarks: ``rows``, ascending, are all that they have."""
+        landmark = self.observations.landmark[rows]
+        order = rows[np.argsort(landmark, kind="stable")]
+        landmark = self.observations.landmark[order]
+        same = landmark[1:] == landmark[:-1]
+        self.observations.previous[rows] = -1
+        self.observations.previous[order[1:][same]] = order[:-1][same]
+        self.landmarks.last[landmarks] = -1
+        # Rows ascend within a landmark, so the last write is its newest row.
+        self.landmarks.last[landmark] = order
+        self.landmarks.views[landmarks] = np.bincount(landmark, minlength=len(self.landmarks))[landmarks]
