@@ -35,7 +35,7 @@ def start_node(domain: int) -> Iterator[Callable[..., NodeProcess]]:  # noqa: AR
 
     yield start
     for node in started:
-        node.kill()
+        node.close()
 
 
 @pytest.fixture

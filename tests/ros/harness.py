@@ -144,7 +144,7 @@ class NodeProcess:
     def alive(self) -> bool:
         return self._poll(0.0) is None
 
-    def kill(self) -> None:
+    def close(self) -> None:
         self.send_signal(signal.SIGKILL)
         self.wait()
 
@@ -304,6 +304,8 @@ def shut_gates(folder: str) -> None:
         while Path(folder, name).exists():
             Path(folder, f"{name}.waits").touch()
             time.sleep(0.005)
+        if Path(folder, f"{name}.waits").exists():
+            Path(folder, f"{name}.waits").rename(Path(folder, f"{name}.passed"))
 
     def gated(problem: Any, options: Any, *, on_iteration: Any = None, **others: Any) -> Any:
         def watch(row: Any) -> bool:
@@ -334,11 +336,16 @@ class Gates:
         return {"prepare": shut_gates, "folder": str(self.folder)}
 
     def shut(self, thread: str) -> None:
+        for mark in ("waits", "passed"):
+            (self.folder / f"{thread}.{mark}").unlink(missing_ok=True)
         (self.folder / thread).touch()
 
     def open(self, thread: str) -> None:
         (self.folder / thread).unlink()
-        (self.folder / f"{thread}.waits").unlink(missing_ok=True)
+
+    def passed(self, thread: str) -> bool:
+        """Return True if a solver has gone on from its gate."""
+        return (self.folder / f"{thread}.passed").exists()
 
     def waits(self, thread: str) -> bool:
         """Return True if a solver stands at its gate."""

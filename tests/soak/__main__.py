@@ -61,7 +61,7 @@ def _node(count: int) -> list[str]:
         return _show("node", runs.node(process, peer, Drive(tracks=150), count, count // _PARTS), timed=True)
     finally:
         peer.close()
-        process.kill()
+        process.close()
 
 
 if __name__ == "__main__":

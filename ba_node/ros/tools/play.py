@@ -41,6 +41,8 @@ _POLL_S = 0.02
 _ACK_TIMEOUT_S = 10.0
 _LATCHED_DEPTH = 10
 _playing: list[Any] = []
+# What a user calls the fields of PlayOptions that are numbers.
+_OPTIONS = {"rate": "--rate", "wait_s": "--wait", "start_s": "--start", "rounds": "--loop", "clock_hz": "--clock"}
 
 
 class PlayError(ValueError):
@@ -72,10 +74,10 @@ class PlayOptions:
     ros_args: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("rate", "wait_s", "start_s", "rounds", "clock_hz"):
+        for name, option in _OPTIONS.items():
             value = getattr(self, name)
             if not math.isfinite(value) or value < 0:
-                raise PlayError(f"{name} = {value!r}: expected a finite number, 0 or more")
+                raise PlayError(f"{option} {value:g}: expected a finite number, 0 or more")
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def _node(options: PlayOptions) -> Iterator[Any]:
                 enable_rosout=False,
             )
         except _WRONG_OPTIONS as error:
-            raise PlayError(f"namespace or remapping: {error}") from error
+            raise PlayError(f"--namespace or --remap: {error}") from error
         _playing.append(node)
         try:
             yield node
@@ -262,7 +264,7 @@ class _Player:
             return next((log_time_ns for _, _, log_time_ns, _ in self._reader.messages()), 0)
         length_s = (times[-1] - times[0]) * 1e-9
         if self._options.start_s > length_s:
-            raise PlayError(f"start_s = {self._options.start_s:g}: the recording is {length_s:.1f} s long")
+            raise PlayError(f"--start {self._options.start_s:g}: the recording is {length_s:.1f} s long")
         return times[0] + round(self._options.start_s * 1e9)
 
     def _publish(self, publisher: Any, data: bytes) -> None:

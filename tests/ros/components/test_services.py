@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -189,7 +189,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
     ):
         answer = _save(peer, path)
         assert (answer.success, answer.keyframes) == (False, 0)
-        assert _matches(reason, answer.message)
+        assert re.search(reason, answer.message), answer.message
     assert (tmp_path / "text.npz").read_text() == "hello"
 
     good = tmp_path / "good.npz"
@@ -213,17 +213,11 @@ def test_what_cannot_be_saved_or_loaded_is_told(
     ):
         answer = _load(peer, path)
         assert (answer.success, answer.keyframes) == (False, 0)
-        assert _matches(reason, answer.message)
+        assert re.search(reason, answer.message), answer.message
     # The map is as it was.
     _play(peer, scene, 3)
     peer.until(lambda: len(peer.received["path"][-1].poses) == 4, "the path of the map and one more")
     assert node.stop() == 0
-
-
-def _matches(pattern: str, text: str) -> bool:
-    with pytest.raises(ValueError, match=pattern):
-        raise ValueError(text)
-    return True
 
 
 def test_an_answer_does_not_wait_for_a_solve(
@@ -312,8 +306,7 @@ def test_a_file_is_written_to_the_end(
     peer.until(lambda: gates.waits("map file"), "the file")
     node.send_signal(signal.SIGINT)
     peer.until(lambda: "stopped" in node.out, "the end of all but the file")
-    time.sleep(0.3)
-    assert node.alive
     gates.open("map file")
     assert node.wait() == 0, node.err
+    assert gates.passed("map file")
     assert len(read_map(tmp_path / "a.npz").arrays["keyframes/position"]) == 3

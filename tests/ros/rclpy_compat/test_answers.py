@@ -160,7 +160,7 @@ def shared(domain: int, folder: Path, scene: SyntheticData) -> Iterator[Client]:
     assert client.peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path="kept")).success
     yield client
     peer.close()
-    node.kill()
+    node.close()
 
 
 @pytest.fixture
