@@ -63,8 +63,10 @@ def test_every_command_of_make_is_there() -> None:
 def test_hooks_call_tools_of_the_environment() -> None:
     pinned = (ROOT / "requirements" / "dev.txt").read_text()
     for hook in hooks():
-        python, flag, module, *arguments = hook["entry"].split()
-        assert (python, flag, hook["language"]) == (".venv/bin/python", "-m", "system"), hook
+        program, *arguments = hook["entry"].removeprefix(".venv/bin/python -m ").split()
+        module = program.removeprefix(".venv/bin/")
+        assert hook["entry"].startswith(".venv/bin/"), hook
+        assert hook["language"] == "system", hook
         assert re.search(rf"^{module.replace('_', '.')}==", pinned, re.MULTILINE), f"{module} is not pinned"
         paths = [argument for argument in arguments if "/" in argument]
         assert all((ROOT / path).exists() for path in paths), hook

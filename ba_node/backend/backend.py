@@ -33,8 +33,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING
 
 from ba_node.backend import archive
-from ba_node.backend.completion import Completion
-from ba_node.backend.current_map import CurrentMap
+from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.optimization import Optimization
 from ba_node.backend.replay import MapEnded, replay
 from ba_node.check.watch import Check, SetUpWatch
@@ -65,14 +64,12 @@ def _no_clock() -> float:
 
 
 class Backend:
-    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise on no data whatever.
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data.
 
     Attributes:
         map: the current map.
         finished: session id and last estimate of the sessions before, oldest first, the last few.
         solve_count: solves since the beginning.
-        jumps: sessions that began although the front-end did not raise the session id.
-        jump_note: the last of these in words.
         refused: the last keyframes that were turned away.
         extras: what the next solve is to work out beside the estimate.
         setup: the check of the set-up; while it gives a reason, every solve is held.
@@ -84,8 +81,6 @@ class Backend:
         self.map = CurrentMap(config, Scene(config.scene), 0)
         self.finished: list[tuple[int, Estimate]] = []
         self.solve_count = 0
-        self.jumps = 0
-        self.jump_note = ""
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
         self.extras = Extras()
         self.setup = SetUpWatch()
@@ -375,8 +370,6 @@ class Backend:
             refuse_lone(before, self.scene.log)
         if begin.kind:
             self.scene.log.warn(begin.kind, begin.text)
-            self.jumps += 1
-            self.jump_note = begin.text
 
     def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
         scene = Scene(self.config.scene, session_id)

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from ba_node.estimate import Status
 from ba_node.window import full, quality
 
 if TYPE_CHECKING:
@@ -73,16 +72,6 @@ class Optimization:
         """Return what the solver gave back."""
         assert self.solved is not None, "solve() comes first"
         return self.solved.result
-
-    @property
-    def status(self) -> Status:
-        """Return why the solve stopped."""
-        return self.result.status
-
-    @property
-    def reason(self) -> str:
-        """Return the same in words."""
-        return self.result.reason
 
     def with_result(self, **changes: Any) -> Optimization:
         """Return the same with another result of the solver: other words, for example, for why it stopped."""

@@ -16,7 +16,8 @@ from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.synthetic import SyntheticOptions
+from tests.generated import generated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -40,7 +41,7 @@ Stream = list[Measurement]
 
 def recording(**options: Any) -> tuple[Stream, Poses]:
     base: dict[str, Any] = {"keyframes": 40, "landmarks": 3000, "tracks": 150, "length_m": 35.0}
-    data = generate(SyntheticOptions(**{**base, **options}))
+    data = generated(SyntheticOptions(**{**base, **options}))
     return [measurement for _, _, measurement in data.timeline()], data.truth
 
 

@@ -21,7 +21,7 @@ from tests.conftest import Case
 
 Cases = Callable[[str], Case]
 OK, ATTENTION = 0, 3
-# Name -> keyframes, exit codes, largest error m, patterns of which each has to be found in what is said.
+# Name -> keyframes, exit codes, largest error m, patterns of which each has to be found in the messages.
 WITH_TRUTH: dict[str, tuple[int, tuple[int, ...], float, tuple[str, ...]]] = {
     "clock_set_back": (40, (ATTENTION,), 0.01, (r"keyframe 20 is 3599\.9 s older",)),
     "one_stamp_zero": (39, (ATTENTION,), 0.02, ("stamp", "keyframe 17", "1 bad_stamp, 2 unknown_keyframe")),
@@ -36,7 +36,7 @@ WITH_TRUTH: dict[str, tuple[int, tuple[int, ...], float, tuple[str, ...]]] = {
 @pytest.mark.parametrize("name", WITH_TRUTH)
 def test_no_worse_than_what_came_in(name: str, case: Cases, run: Replay) -> None:
     given = case(name)
-    keyframes, codes, most_m, told = WITH_TRUTH[name]
+    keyframes, codes, most_m, named = WITH_TRUTH[name]
     outcome = run(given.bag)
     assert outcome.code in codes, outcome.words
     errors = outcome.errors(given.truth)
@@ -44,7 +44,7 @@ def test_no_worse_than_what_came_in(name: str, case: Cases, run: Replay) -> None
     for error in errors:
         assert error.published_m <= most_m, f"{error.folder.name}: {error.published_m:.4f} m, at most {most_m} m"
     assert sum(error.keyframes for error in errors) == keyframes
-    outcome.tells(*told)
+    outcome.tells(*named)
     folders = [outcome.out, outcome.out / "session_0"] if name == "clock_set_back" else [outcome.out]
     assert sorted(error.folder for error in errors) == sorted(folders)
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import os
 import re
 import shutil
@@ -22,7 +23,7 @@ from ba_node.core import native_kernels
 from ba_node.core.consensus import agreeing
 from ba_node.core.factors import RelativePoses
 from ba_node.core.linear import PcgLimits
-from ba_node.core.native_factors import NativeFactorSum
+from ba_node.core.native_kernels import NativeFactorSum
 from ba_node.core.problem import Problem
 from ba_node.core.triangulation import rays_of, triangulate
 from tests.core.conftest import Spec, make
@@ -51,9 +52,11 @@ def solution(x: np.ndarray | None) -> np.ndarray:
     return x.copy()
 
 
-def of_kernels(problem: Problem) -> Quantities:
+def of_kernels(problem: Problem, threads: int = 1) -> Quantities:
     """Return everything that the kernels say about a problem at its start, and after one step."""
-    kernels = native_kernels.make(problem, SolverOptions(loss="huber", loss_scale_px=1.5, kernels="native"))
+    kernels = native_kernels.make(
+        problem, SolverOptions(loss="huber", loss_scale_px=1.5, kernels="native", threads=threads)
+    )
     kernel = kernels._kernel  # type: ignore[attr-defined]
     out: Quantities = {"objective": np.array(kernels.linearise(problem.start))}
     out["d_c"], out["d_p"] = kernels.diagonals()
@@ -121,6 +124,18 @@ def test_targets_agree_to_rounding(name: str, target: str) -> None:
         largest = float(np.abs(expected).max(initial=1e-300))
         off = float(np.abs(found - expected).max(initial=0.0)) / largest
         assert off < 1e-9, f"{quantity}: {off:.1e} of {largest:.3g} between baseline and {target}"
+
+
+@pytest.mark.parametrize("target", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_any_number_of_threads_gives_the_same_bits(name: str, target: str) -> None:
+    if target not in native.kernels.targets():
+        pytest.skip(f"this processor or this build has no {target}")
+    native.kernels.use_target(target)
+    problem, _ = make(dataclasses.replace(PROBLEMS[name], keyframes=8, points=400))
+    one, three = (of_kernels(problem, threads) for threads in (1, 3))
+    for quantity, expected in one.items():
+        assert three[quantity].tobytes() == expected.tobytes(), quantity
 
 
 def started(value: str) -> tuple[str, str]:
