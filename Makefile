@@ -7,13 +7,16 @@ PYTHON ?=
 ARGS ?=
 
 RUN := .venv/bin/python
+# Two at a time; each file stays in one process, so that what its tests share is made once.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 STYLED := $(CHECKED) examples
+CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
 
-.PHONY: help setup demo test fuzz soak sanitize bench thesis robustness lint format clean
+.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness lint format clean
 
 help: ## list the commands
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
 
 setup: ## make .venv with ROS 2 Jazzy, ba_msgs and ba_node; the commands below do it by themselves
 	@PYTHON="$(PYTHON)" sh tools/setup.sh
@@ -21,8 +24,11 @@ setup: ## make .venv with ROS 2 Jazzy, ba_msgs and ba_node; the commands below d
 demo: setup ## play a recording into the node over DDS, compare with ground truth, write out/demo/
 	@$(RUN) -m ba_node.cli.main demo --out out/demo $(ARGS)
 
-test: setup ## run the tests
-	@$(RUN) -m pytest $(ARGS)
+test: setup ## run the quick tests (about 5 minutes on two cores; ARGS="-k solver", ARGS="-m slow")
+	@$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: setup ## run all tests, the slow ones too
+	@$(PYTEST) $(ARGS)
 
 fuzz: setup ## give readers and back-end 50 000 broken files and 200 000 broken messages (about 20 minutes)
 	@$(RUN) -m tests.fuzz $(ARGS)
@@ -30,8 +36,14 @@ fuzz: setup ## give readers and back-end 50 000 broken files and 200 000 broken 
 soak: setup ## run back-end and node for long, and see that nothing grows (about 20 minutes)
 	@$(RUN) -m tests.soak $(ARGS)
 
-sanitize: setup ## run the tests of the C++ kernels under AddressSanitizer and UndefinedBehaviourSanitizer
+sanitize: setup ## run the tests of the C++ kernels under Address-, UndefinedBehaviour- and ThreadSanitizer
 	@sh tools/sanitize.sh $(ARGS)
+
+cross: setup ## build the C++ kernels for aarch64 and run their tests in C++ under an emulator, where both are installed
+	@sh tools/native_tests.sh aarch64
+
+wheel: setup ## build a wheel into out/wheel/, and try it in a fresh environment without a compiler
+	@sh tools/wheel.sh
 
 bench: setup ## compare with the solvers that are installed, see docs/performance.md (ARGS="--quick": two windows)
 	@$(RUN) -m experiments.benchmarks $(ARGS)
@@ -45,11 +57,13 @@ robustness: setup ## replay recordings gone wrong, and see that no harm is done 
 lint: setup ## check style and types
 	@$(RUN) -m ruff check $(STYLED)
 	@$(RUN) -m ruff format --check $(STYLED)
+	@.venv/bin/clang-format --dry-run -Werror $(CPP)
 	@$(RUN) -m mypy $(CHECKED)
 
-format: setup ## put all Python files into the agreed style
+format: setup ## put all files of Python and C++ into the agreed style
 	@$(RUN) -m ruff check --fix $(STYLED)
 	@$(RUN) -m ruff format $(STYLED)
+	@.venv/bin/clang-format -i $(CPP)
 
 clean: ## remove .venv and everything else that commands have made
 	@rm -rf .venv build install log out *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

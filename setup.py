@@ -3,19 +3,98 @@
 """Install ba_node with colcon (ament_python) or pip.
 
 The C++ kernels are built where pybind11 and a C++17 compiler are found; the package works without them, more slowly.
-BA_NODE_PORTABLE=1 builds kernels that run on other processors than this one.
+On x86-64 they are built for several processors; which one it is, is asked when they are imported (ba_node/native).
+BA_NODE_TARGETS=baseline,avx2 builds some of them, BA_NODE_WERROR=1 makes the compiler's warnings errors.
 """
 
 import os
+import platform
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
 from setuptools.command.develop import develop
 from setuptools.command.install import install
+from setuptools.modified import newer_group
 
 NAME, MESSAGES = "ba_node", "ba_msgs"
+SOURCES = Path(NAME) / "native" / "src"
+# What is compiled once, and what once for each target.
+COMMON = (
+    "bindings/module",
+    "targets/target",
+    "adjustment/layout",
+    "linalg/block_fill",
+    "parallel/memory",
+    "parallel/pool",
+)
+KERNELS = ("targets/kernel6", "targets/kernel9", "targets/functions")
+# The narrowest first, in which order they have to be linked: simd/target.hpp says why. bindings/module.cpp asks the
+# processor for what their flags take for granted.
+TARGETS = ("baseline", "avx2", "avx512")
+
+
+class Unit(NamedTuple):
+    """A source, the folder of its object, and the flags that it is compiled with."""
+
+    source: str
+    folder: str
+    flags: tuple[str, ...]
+
+
+def wanted_targets() -> list[str]:
+    """Return the targets to build."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return ["baseline"]
+    wanted = os.environ.get("BA_NODE_TARGETS", "").split(",")
+    return [name for name in TARGETS if wanted == [""] or name in wanted or name == "baseline"]
+
+
+def flags_of(target: str) -> list[str]:
+    """Return the compiler's flags for a target, or those for all of them (common)."""
+    path = SOURCES / "targets" / f"{target}.flags"
+    return path.read_text().split() if path.exists() else []
+
+
+def units() -> list[Unit]:
+    """Return what to compile, in the order to link it."""
+    targets = wanted_targets()
+    has = [f"-DBA_HAS_{name.upper()}" for name in targets]
+    listed = [Unit(f"{name}.cpp", "common", tuple(has)) for name in COMMON]
+    for target in targets:
+        flags = (f"-DBA_TARGET={target}", *flags_of(target))
+        listed += [Unit(f"{name}.cpp", target, flags) for name in KERNELS]
+    return listed
+
+
+class BuildKernels(build_ext):
+    """Compiles each unit with flags of its own, on all cores."""
+
+    def build_extension(self, ext: Extension) -> None:
+        """Compile and link the kernels."""
+        # Python's own flags ask for debug information, which is most of the size.
+        debug = [] if "-g" in os.environ.get("CFLAGS", "") else ["-g0"]
+        strict = ["-Werror"] if os.environ.get("BA_NODE_WERROR", "0") not in ("", "0") else []
+
+        def compiled(unit: Unit) -> str:
+            source, folder = str(SOURCES / unit.source), str(Path(self.build_temp) / unit.folder)
+            (result,) = self.compiler.object_filenames([source], output_dir=folder)
+            if self.force or newer_group([source, __file__, *ext.depends], result):
+                flags = [*debug, *flags_of("common"), *unit.flags, *strict]
+                self.compiler.compile([source], folder, include_dirs=ext.include_dirs, extra_postargs=flags)
+            return str(result)
+
+        listed = units()
+        # The slowest ones, which are the widest targets' kernels, first.
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            jobs = {unit: pool.submit(compiled, unit) for unit in reversed(listed)}
+        ext.extra_objects = [jobs[unit].result() for unit in listed]
+        ext.sources, ext.depends = [], ext.extra_objects
+        super().build_extension(ext)
 
 
 def extensions() -> list[Extension]:
@@ -28,17 +107,11 @@ def extensions() -> list[Extension]:
             file=sys.stderr,
         )
         return []
-    sources = Path(NAME) / "native" / "src"
-    # Without -ffast-math, which would remove the tests for numbers that are not finite.
-    flags = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-Wno-psabi"]
-    if os.environ.get("BA_NODE_PORTABLE", "0") in ("", "0"):
-        flags.append("-march=native")
     kernels = Extension(
         f"{NAME}.native._kernels",
-        sources=[str(sources / "bindings" / "module.cpp")],
-        depends=[str(path) for path in sorted(sources.rglob("*.hpp"))],
-        include_dirs=[str(sources), pybind11.get_include()],
-        extra_compile_args=flags,
+        sources=[str(SOURCES / unit.source) for unit in units()],
+        depends=[str(path) for path in sorted([*SOURCES.rglob("*.hpp"), *SOURCES.rglob("*.flags")])],
+        include_dirs=[str(SOURCES), pybind11.get_include()],
         language="c++",
         # A compiler that fails leaves a package without kernels.
         optional=True,
@@ -99,7 +172,7 @@ class Develop(develop):
 
 setup(
     name=NAME,
-    cmdclass={"develop": Develop, "install": Install},
+    cmdclass={"build_ext": BuildKernels, "develop": Develop, "install": Install},
     version="0.1.0",
     description="Bundle-adjustment back-end for ROS 2",
     maintainer="The ba_node Authors",
@@ -107,7 +180,7 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     # The definitions of ba_msgs, with which bags are read and written where ROS is not installed.
-    package_data={f"{NAME}.io": ["ba_msgs/*.msg"]},
+    package_data={NAME: ["py.typed"], f"{NAME}.io": ["ba_msgs/*.msg"], f"{NAME}.native": ["*.pyi"]},
     ext_modules=extensions(),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -89,7 +89,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class SolveReport:
-    """How a solve went (message ``ba_msgs/SolverReport``, which documents every field)."""
+    """How a solve went: the fields of ``ba_msgs/SolverReport`` that the back-end knows, which documents them."""
 
     session_id: int = 0
     solve_count: int = 0
@@ -120,27 +120,13 @@ class SolveReport:
     held_keyframes: int = 0
     rejected: Mapping[str, int] = field(default_factory=dict)
     solve_time_s: float = 0.0
-    queue_wait_s: float = 0.0
-    dropped: int = 0
-    coalesced: int = 0
-    received: int = 0
-    solved: int = 0
-    dropped_keyframes: int = 0
-    rejected_keyframes: int = 0
-    waiting: int = 0
-    latency_p50_s: float = 0.0
-    latency_p95_s: float = 0.0
-    latency_max_s: float = 0.0
-    stamp_latency_p50_s: float = 0.0
-    stamp_latency_p95_s: float = 0.0
-    stamp_latency_max_s: float = 0.0
     correction_m: float = 0.0
     correction_rad: float = 0.0
     correction_held: bool = False
 
     def without_times(self) -> SolveReport:
         """Return a copy that does not depend on the machine, for reproducible files."""
-        return dataclasses.replace(self, solve_time_s=0.0, queue_wait_s=0.0)
+        return dataclasses.replace(self, solve_time_s=0.0)
 
 
 @dataclass(frozen=True)
@@ -213,7 +199,6 @@ class Estimate:
         trajectory: poses of all keyframes that are kept, oldest first, the newest estimate of each.
         cloud: all points that are kept.
         report: how the solve went.
-        arrived_s: when its newest keyframe came in, by the clock of the node; None offline.
         correction: of the front-end's fixed frame; None before the first usable solve of a session.
         covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
             0 for poses that were fixed. None if it was not asked for, or the solve is not usable.
@@ -227,7 +212,6 @@ class Estimate:
     trajectory: Poses
     cloud: Cloud
     report: SolveReport
-    arrived_s: float | None = None
     correction: Correction | None = None
     covariance: FloatArray | None = None
     view: WindowView | None = None

@@ -1,7 +1,8 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 
-// Feed the node from a front-end in C++: a camera passes a grid of points, ten keyframes a second. In a package of yours:
+// Feed the node from a front-end in C++: a camera passes a grid of points, ten keyframes a second. In a package of
+// yours:
 //
 //   find_package(rclcpp REQUIRED)
 //   find_package(ba_msgs REQUIRED)

@@ -9,6 +9,7 @@ import sys
 
 from ba_node.backend import Backend
 from ba_node.config import Config
+from ba_node.estimate import Estimate
 from ba_node.io.mcap import BagReader
 from ba_node.measurements import Keyframe
 
@@ -17,24 +18,16 @@ def main(recording):
     backend = Backend(Config().with_values({"window.max_keyframes": 15}))
     odometry = {}
     with BagReader(recording) as reader:
-        for _, _, measurement in reader.measurements():
-            if backend.completes(measurement):  # a keyframe begins, so the one before has all its tracks
-                tell(backend.solve())
-            backend.add(measurement)
-            if isinstance(measurement, Keyframe):
-                odometry[measurement.keyframe_id] = measurement.position
-    backend.flush(final=True)
-    while backend.ready:
-        tell(backend.solve())
-    estimate = backend.estimate()
-    for number, position in zip(estimate.trajectory.keyframe_id, estimate.trajectory.position, strict=True):
+        stream = (measurement for _, _, measurement in reader.measurements())
+        for event in backend.replay(stream):
+            if isinstance(event, Estimate):
+                report = event.report
+                print(f"solve {report.solve_count}: {report.status.name}, {len(event.refined)} keyframes refined")
+            elif isinstance(event, Keyframe):  # one that was taken in
+                odometry[event.keyframe_id] = event.position
+    trajectory = backend.estimate().trajectory
+    for number, position in zip(trajectory.keyframe_id, trajectory.position, strict=True):
         print(f"keyframe {number}: from {odometry[number].round(3).tolist()} to {position.round(3).tolist()}")
-    print(f"{len(estimate.trajectory)} keyframes, {len(estimate.cloud)} points, rms {backend.rms_px():.3f} px")
-
-
-def tell(estimate):
-    report = estimate.report
-    print(f"solve {report.solve_count}: {report.status.name}, {report.observations} observations: {report.reason}")
 
 
 if __name__ == "__main__":

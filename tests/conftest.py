@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,10 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.io.mcap import BagReader
+from ba_node.io.trajectory import read_tum
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages.report import LatencyReport, QueueReport, Report
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -27,6 +32,41 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("needs the data sets in ../shared/data, which are not part of the repository")
     return folder
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small recording that once went wrong.
+
+    Attributes:
+        bag: the file.
+    """
+
+    bag: Path
+
+    @property
+    def measurements(self) -> list[Measurement]:
+        """Return all that is in it, in the order of the recording."""
+        with BagReader(self.bag) as reader:
+            return [measurement for _, _, measurement in reader.measurements()]
+
+    @property
+    def truth(self) -> Poses:
+        """Return the true poses, numbered from 0."""
+        return read_tum(self.bag.with_suffix(".truth.tum"))
+
+
+@pytest.fixture(scope="session")
+def case() -> Callable[[str], Case]:
+    """Return what gives a recording of ../shared/cases by its name, or skips the test."""
+
+    def find(name: str) -> Case:
+        path = _ROOT.parent / "shared" / "cases" / f"{name}.mcap"
+        if not path.is_file():
+            pytest.skip(f"needs {path.name} in ../shared/cases, which is not part of the repository")
+        return Case(path)
+
+    return find
 
 
 @pytest.fixture
@@ -128,6 +168,16 @@ def report() -> SolveReport:
         outliers=17,
         rejected={"unknown_camera": 2, "malformed": 5},
         solve_time_s=0.025,
+        correction_m=0.25,
+        correction_rad=0.0125,
+        correction_held=True,
+    )
+
+
+@pytest.fixture
+def whole_report(report: SolveReport) -> Report:
+    """Return a report of all three parts, as ``report``."""
+    queue = QueueReport(
         queue_wait_s=0.75,
         dropped=6,
         coalesced=8,
@@ -136,16 +186,18 @@ def report() -> SolveReport:
         dropped_keyframes=11,
         rejected_keyframes=10,
         waiting=1,
+        rejected={"unreadable": 4},
+        warnings=("falling behind",),
+    )
+    latency = LatencyReport(
         latency_p50_s=0.015,
         latency_p95_s=0.031,
         latency_max_s=0.047,
         stamp_latency_p50_s=0.115,
         stamp_latency_p95_s=0.131,
         stamp_latency_max_s=0.147,
-        correction_m=0.25,
-        correction_rad=0.0125,
-        correction_held=True,
     )
+    return Report(report, queue, latency)
 
 
 @pytest.fixture

@@ -11,19 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from tools.draw_architecture import LAYERS
+
 PACKAGE = Path(__file__).resolve().parent.parent / "ba_node"
 
-# Lowest first. A module may import modules of the layers before its own, and of its own layer where SAME says so.
-LAYERS: dict[str, tuple[str, ...]] = {
-    "config": ("config", "licence"),
-    "native": ("native",),
-    "core": ("core",),
-    "scene": ("measurements", "estimate", "scene"),
-    "window": ("window", "check"),
-    "backend": ("backend",),
-    "services": ("messages", "io", "evaluation", "synthetic"),
-    "tools": ("ros", "offline", "cli"),
-}
+# A module may import modules of the layers before its own, and of its own layer where SAME says so.
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
 SAME = {

@@ -129,7 +129,7 @@ def test_cmake_lists_every_message() -> None:
 def test_make_help_lists_every_command() -> None:
     text = (ROOT / "Makefile").read_text()
     commands = set(re.search(r"^\.PHONY: (.*)$", text, re.MULTILINE)[1].split())  # type: ignore[index]
-    assert set(re.findall(r"^(\w+):.*## ", text, re.MULTILINE)) == commands
+    assert set(re.findall(r"^([\w-]+):.*## ", text, re.MULTILINE)) == commands
 
 
 @pytest.mark.slow
@@ -156,5 +156,6 @@ def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
     data = f"ba_node-{ba_node.__version__}.data/data/"
     assert not [name for name in names if "experiments/" in name]
     assert messages == {Path(name).name for name in names if name.startswith("ba_node/io/ba_msgs/")}
+    assert "ba_node/py.typed" in names
     assert modules <= set(names), f"not in the wheel: {modules - set(names)}"
     assert shared <= {name.removeprefix(data) for name in names}

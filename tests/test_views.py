@@ -18,6 +18,7 @@ from ba_node.estimate import SolveReport
 from ba_node.io.parameters import NODE_NAME
 from ba_node.messages.markers import NAMESPACES
 from ba_node.messages.outputs import POINT_DTYPE
+from ba_node.messages.report import LatencyReport, QueueReport
 from ba_node.messages.topics import TOPICS as DECLARED
 from ba_node.messages.topics import Delivery
 
@@ -69,7 +70,9 @@ def test_foxglove_shows_what_is_published() -> None:
     assert named <= set(TOPICS), named - set(TOPICS)
     assert {f"/{NODE_NAME}/{topic}" for topic in ("points", "path", "markers", "report")} | {"/diagnostics"} <= named
     fields = {text.split(".")[1] for text in strings(layout) if re.match(rf"/{NODE_NAME}/report\.", text)}
-    assert fields <= {field.name for field in dataclasses.fields(SolveReport)}
+    assert fields <= {
+        field.name for part in (SolveReport, QueueReport, LatencyReport) for field in dataclasses.fields(part)
+    }
     assert fields
 
 

@@ -2,18 +2,20 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
 #
-# Build the kernels with AddressSanitizer and UndefinedBehaviourSanitizer into out/sanitize/, and run their tests there.
+# Run the tests in C++ under AddressSanitizer, UndefinedBehaviourSanitizer and ThreadSanitizer; then build the kernels
+# with the first two into out/sanitize/, and run their tests in Python there.
 # usage: tools/sanitize.sh [arguments of pytest]
 set -eu
 cd "$(dirname "$0")/.."
 python=$(pwd)/${PYTHON:-.venv/bin/python}
 case ${PYTHON:-} in /*) python=$PYTHON ;; esac
+sh tools/native_tests.sh address undefined thread
 rm -rf out/sanitize
 mkdir -p out/sanitize
 cp -r ba_node experiments tests setup.py setup.cfg package.xml pyproject.toml resource launch config bags out/sanitize/
 cd out/sanitize
 rm -f ba_node/native/*.so
-CFLAGS="-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g" \
+BA_NODE_TARGETS=avx2 BA_NODE_WERROR=1 CFLAGS="-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g" \
   LDFLAGS="-fsanitize=address,undefined" "$python" setup.py -q build_ext --inplace
 ls ba_node/native/*.so >/dev/null
 [ $# -gt 0 ] || set -- tests/core/test_kernels.py tests/core/test_threads.py tests/core/test_linear_solvers.py

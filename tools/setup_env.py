@@ -47,6 +47,9 @@ STEPS = ("packages", "interfaces", "project")
 # Interface packages to build, and where they are defined. One that a wheel has brought is left as it is.
 INTERFACES = {"ba_msgs": "msg_defs", "tf2_msgs": "tests/ros/interfaces/tf2_msgs"}
 
+# What makes the environment: a change in it makes it anew.
+TOOLS = ("env_checks.py", "setup_env.py", "venv_hook.py")
+
 # Variables of a sourced ROS, of another environment or of pip that would lead the steps below outside .venv.
 FOREIGN_VARIABLES = (
     "AMENT_PREFIX_PATH",
@@ -82,10 +85,11 @@ def digest(files: Iterable[Path], root: Path, seed: str = "") -> str:
 
 def wanted_stamps(root: Path) -> dict[str, str]:
     """Return the stamp that each step has to carry for the files as they are now."""
-    packages = digest([*root.glob("requirements/*.txt"), *root.glob("tools/*.py")], root)
+    tools = [root / "tools" / name for name in TOOLS]
+    packages = digest([*root.glob("requirements/*.txt"), *(path for path in tools if path.is_file())], root)
     interfaces = [path for folder in INTERFACES.values() for path in root.glob(f"{folder}/**/*") if path.is_file()]
     project = [root / name for name in ("setup.py", "setup.cfg", "package.xml")]
-    project += [path for path in root.glob("ba_node/native/src/*") if path.is_file()]
+    project += [path for path in root.glob("ba_node/native/src/**/*") if path.is_file()]
     return {
         "packages": packages,
         "interfaces": digest(interfaces, root, packages),

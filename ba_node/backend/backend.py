@@ -12,9 +12,9 @@ came, or when :meth:`Backend.flush` says so. The node drains its inbox and then 
 
 A replay solves once for every keyframe, however the messages are spaced, just before the next one begins::
 
-    for told in backend.replay(recording):
-        if isinstance(told, Estimate):
-            write(told)
+    for event in backend.replay(recording):
+        if isinstance(event, Estimate):
+            write(event)
 
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
@@ -33,8 +33,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING
 
 from ba_node.backend import archive
-from ba_node.backend.completion import Completion
-from ba_node.backend.current_map import CurrentMap
+from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.optimization import Optimization
 from ba_node.backend.replay import MapEnded, replay
 from ba_node.check.watch import Check, SetUpWatch
@@ -42,7 +41,6 @@ from ba_node.estimate import Estimate, Extras, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
-from ba_node.scene.frame_names import check_name
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import full, guard, quality
@@ -66,14 +64,12 @@ def _no_clock() -> float:
 
 
 class Backend:
-    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise on no data whatever.
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data.
 
     Attributes:
         map: the current map.
         finished: session id and last estimate of the sessions before, oldest first, the last few.
         solve_count: solves since the beginning.
-        jumps: sessions that began although the front-end did not raise the session id.
-        jump_note: the last of these in words.
         refused: the last keyframes that were turned away.
         extras: what the next solve is to work out beside the estimate.
         setup: the check of the set-up; while it gives a reason, every solve is held.
@@ -85,8 +81,6 @@ class Backend:
         self.map = CurrentMap(config, Scene(config.scene), 0)
         self.finished: list[tuple[int, Estimate]] = []
         self.solve_count = 0
-        self.jumps = 0
-        self.jump_note = ""
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
         self.extras = Extras()
         self.setup = SetUpWatch()
@@ -205,7 +199,7 @@ class Backend:
         if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
             self.refused.append(measurement)
             return
-        check_name(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
+        ingest.check_frame(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
         self.map.completion.begin(self.scene, measurement.keyframe_id)
 
     def flush(self, final: bool = False) -> None:
@@ -303,8 +297,8 @@ class Backend:
             return None
         self.solve_count += 1
         newest = int(self.scene.order[-1])
-        figures = quality.figures(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
-        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **figures)
+        statistics = quality.statistics(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
+        self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
         return self.estimate(), followed
 
@@ -376,8 +370,6 @@ class Backend:
             refuse_lone(before, self.scene.log)
         if begin.kind:
             self.scene.log.warn(begin.kind, begin.text)
-            self.jumps += 1
-            self.jump_note = begin.text
 
     def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
         scene = Scene(self.config.scene, session_id)

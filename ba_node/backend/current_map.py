@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ba_node import window
-from ba_node.backend.completion import Completion, end_of_solve, reached
 from ba_node.backend.summary import MapSummary, summary_of
 from ba_node.check import two_view
 from ba_node.check.examine import examine
@@ -25,22 +25,64 @@ from ba_node.window.trust import Trust
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from ba_node.check.diagnosis import Diagnosis
     from ba_node.config import Config
     from ba_node.core.problem import State
     from ba_node.estimate import Iteration
     from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import IntArray
+    from ba_node.scene.tables import BoolArray, IntArray
 
 # The front-end's frame where neither it nor the parameters name one.
 _ODOM_FRAME = "odom"
+# Keyframes from which it is learned how many cameras deliver.
+_LEARN_FROM = 5
 
 
 def can_examine() -> bool:
     """Return True where OpenCV is installed, which :meth:`CurrentMap.examine` needs."""
     return two_view.available()
+
+
+class Completion:
+    """What is known of the newest keyframe and of the cameras that delivered for those before it.
+
+    Attributes:
+        newest: id of the newest keyframe that came, None before the first.
+        closed: True if it counts as complete with what has come.
+        delivered: cameras that delivered for each of the last keyframes before it.
+    """
+
+    def __init__(self, newest: int | None = None, closed: bool = False, delivered: Iterable[int] = ()) -> None:
+        """Take up what is known."""
+        self.newest, self.closed = newest, closed
+        self.delivered = deque(delivered, maxlen=_LEARN_FROM)
+
+    def begin(self, scene: Scene, keyframe_id: int) -> None:
+        """Take a keyframe that the scene has now for the newest."""
+        if self.newest is not None:
+            row = scene.find_keyframe(self.newest)
+            self.delivered.append(0 if row is None else len(scene.cameras_of(row)))
+        self.newest, self.closed = keyframe_id, False
+
+    def row(self, scene: Scene) -> int | None:
+        """Return the row of the newest keyframe, None if there is none."""
+        return None if self.newest is None else scene.find_keyframe(self.newest)
+
+    def due(self, scene: Scene) -> IntArray:
+        """Return the rows of complete keyframes that were not solved."""
+        due = ~scene.keyframes.solved
+        newest = self.row(scene)
+        if newest is not None and not self._complete(scene, newest):
+            due[newest] = False
+        return np.flatnonzero(due)
+
+    def _complete(self, scene: Scene, row: int) -> bool:
+        if self.closed:
+            return True
+        expected = max(self.delivered, default=0) or (len(scene.cameras.model) if scene.cameras is not None else 1)
+        return len(scene.cameras_of(row)) >= expected
 
 
 class CurrentMap:
@@ -134,7 +176,7 @@ class CurrentMap:
     def due(self) -> IntArray:
         """Return the rows of complete keyframes that were not solved and that the next solve refines, oldest first."""
         due = self.completion.due(self.scene)
-        return reached(self.scene, due, self._end(due))
+        return _reached(self.scene, due, self._end(due))
 
     def solve(
         self,
@@ -167,7 +209,7 @@ class CurrentMap:
             if state is not None:
                 self.correct(int(taking_part[-1]))
                 extra = extras.work_out(wanted, self.scene, self.config, selection, state, taking_part)
-        self.scene.keyframes.solved[reached(self.scene, due, end)] = True
+        self.scene.keyframes.solved[_reached(self.scene, due, end)] = True
         return dataclasses.replace(self.estimate(taking_part), **extra)
 
     def _solve(
@@ -196,10 +238,10 @@ class CurrentMap:
         elif state is not None:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
-        figures = quality.figures(selection, tried.result, norms) | dataclasses.asdict(tried.health)
+        statistics = quality.statistics(selection, tried.result, norms) | dataclasses.asdict(tried.health)
         if tried.held:
-            figures |= {"status": Status.HELD, "reason": tried.held}
-        self.report = dataclasses.replace(self.base_report(*which), **figures, solve_time_s=tried.solve_time_s)
+            statistics |= {"status": Status.HELD, "reason": tried.held}
+        self.report = dataclasses.replace(self.base_report(*which), **statistics, solve_time_s=tried.solve_time_s)
         return selection, state
 
     def hold(self, reason: str) -> None:
@@ -279,7 +321,7 @@ class CurrentMap:
         return Correction(self.odom_frame, transform.translation, orientation)
 
     def _end(self, due: IntArray) -> int:
-        return end_of_solve(self.scene, due, self.config.window.max_keyframes)
+        return _end_of_solve(self.scene, due, self.config.window.max_keyframes)
 
 
 def _cloud_of(scene: Scene, rows: IntArray) -> Cloud:
@@ -306,3 +348,26 @@ def _taking_part_of(scene: Scene, selection: window.Selection) -> IntArray:
     marked[selection.window] = True
     marked[selection.keyframes] = True
     return scene.order[marked[scene.order]]
+
+
+def _end_of_solve(scene: Scene, due: IntArray, window_size: int) -> int:
+    """Return how many keyframes, oldest first, there are up to the newest that the next solve is to refine."""
+    n = len(scene.order)
+    waiting = np.flatnonzero(_marked(scene, due)[scene.order])
+    # With one solved keyframe at least in the window the newest can be reached at once.
+    if not len(waiting) or n - waiting[0] < window_size or n <= window_size:
+        return n
+    return int(waiting[0]) + window_size // 2
+
+
+def _reached(scene: Scene, due: IntArray, end: int) -> IntArray:
+    """Return which keyframes of those that are due stand among the first ``end``, oldest first."""
+    first = scene.order[:end]
+    rows: IntArray = first[_marked(scene, due)[first]]
+    return rows
+
+
+def _marked(scene: Scene, due: IntArray) -> BoolArray:
+    marked = np.zeros(len(scene.keyframes), bool)
+    marked[due] = True
+    return marked

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from ba_node.estimate import Status
 from ba_node.window import full, quality
 
 if TYPE_CHECKING:
@@ -74,16 +73,6 @@ class Optimization:
         assert self.solved is not None, "solve() comes first"
         return self.solved.result
 
-    @property
-    def status(self) -> Status:
-        """Return why the solve stopped."""
-        return self.result.status
-
-    @property
-    def reason(self) -> str:
-        """Return the same in words."""
-        return self.result.reason
-
     def with_result(self, **changes: Any) -> Optimization:
         """Return the same with another result of the solver: other words, for example, for why it stopped."""
         assert self.solved is not None, "solve() comes first"
@@ -94,5 +83,5 @@ class Optimization:
     def statistics(self) -> dict[str, Any]:
         """Return how the solve went, by the names of a report."""
         assert self.solved is not None, "solve() comes first"
-        figures = quality.figures(self.snapshot.selection, self.result, self.solved.norms)
-        return {name: figures[name] for name in _TOLD}
+        statistics = quality.statistics(self.snapshot.selection, self.result, self.solved.norms)
+        return {name: statistics[name] for name in _TOLD}

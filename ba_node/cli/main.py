@@ -9,6 +9,7 @@ import, and ``ba --help`` is not to wait for them.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 import traceback
@@ -17,43 +18,18 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from ba_node import __version__
-from ba_node.cli import (
-    check,
-    convert,
-    demo,
-    evaluate,
-    interrupts,
-    params,
-    play,
-    replay,
-    solve,
-    synth,
-)
-from ba_node.cli import map as map_command
+from ba_node.cli import interrupts
 from ba_node.cli.checkout import CheckoutCommand
 
+_INSTALLED = ("replay", "check", "map", "play", "solve", "convert", "evaluate", "synth", "demo", "params")
+_IN_A_CHECKOUT = (
+    CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
+    CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
+    CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
+)
 COMMANDS: dict[str, ModuleType | CheckoutCommand] = {
-    module.__name__.rsplit(".", 1)[1]: module
-    for module in (
-        replay,
-        check,
-        map_command,
-        play,
-        solve,
-        convert,
-        evaluate,
-        synth,
-        demo,
-        params,
-    )
-}
-COMMANDS |= {
-    command.name: command
-    for command in (
-        CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
-        CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
-        CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
-    )
+    **{name: importlib.import_module(f"ba_node.cli.{name}") for name in _INSTALLED},
+    **{command.name: command for command in _IN_A_CHECKOUT},
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -86,6 +62,19 @@ class Overview(argparse.HelpFormatter):
         self._action_max_length = 2 + max(map(len, COMMANDS)) + 2
 
 
+class _Version(argparse.Action):
+    """Print the version and which kernels there are; these are asked only then, as to load them takes a while."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **fields: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, **fields)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Print and exit."""
+        native = importlib.import_module("ba_node.native")
+        print(f"ba_node {__version__} (kernels: {native.description()})")
+        parser.exit()
+
+
 def build_parser(command: str) -> argparse.ArgumentParser:
     """Return the parser, with the options of one command."""
     parser = Parser(
@@ -94,7 +83,7 @@ def build_parser(command: str) -> argparse.ArgumentParser:
         epilog="ba COMMAND --help tells more about each.",
         formatter_class=Overview,
     )
-    parser.add_argument("--version", action="version", version=f"ba_node {__version__}")
+    parser.add_argument("--version", action=_Version, help="show the versions of ba_node and of its kernels")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, entry in COMMANDS.items():
         if name != command:

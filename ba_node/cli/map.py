@@ -28,19 +28,20 @@ def run(args: argparse.Namespace) -> int:
     """Tell or export."""
     from ba_node.io.ply import write_ply  # noqa: PLC0415
     from ba_node.io.trajectory import write_tum  # noqa: PLC0415
-    from ba_node.offline.saved_map import SavedMap  # noqa: PLC0415
+    from ba_node.offline import saved_map  # noqa: PLC0415
 
     if (args.what == "export") != bool(args.tum or args.ply):
         raise TargetError("export writes what --tum and --ply name, info writes nothing: name one, or leave both out")
     for path in (args.tum, args.ply):
         require_folder(path)
-    saved = SavedMap(args.map)
+    backend = saved_map.open_map(args.map)
+    estimate = backend.estimate()
     if args.what == "info":
-        print(facts(saved.facts()))
+        print(facts(saved_map.facts(backend)))
     if args.tum:
-        write_tum(args.tum, saved.estimate.trajectory)
-        print(f"{args.tum}: {len(saved.estimate.trajectory)} poses")
+        write_tum(args.tum, estimate.trajectory)
+        print(f"{args.tum}: {len(estimate.trajectory)} poses")
     if args.ply:
-        write_ply(args.ply, saved.estimate.cloud, saved.estimate.frame_id)
-        print(f"{args.ply}: {len(saved.estimate.cloud)} points")
+        write_ply(args.ply, estimate.cloud, estimate.frame_id)
+        print(f"{args.ply}: {len(estimate.cloud)} points")
     return 0

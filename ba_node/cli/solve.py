@@ -34,14 +34,26 @@ _WIDTHS = (4, 9, 18, 11, 7, 9, 10, 10)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    from ba_node.config import SolverOptions, declared  # noqa: PLC0415
+
+    options = {option.name: option for option in declared(SolverOptions)}
+    iterations = options["max_iterations"]
     parser.add_argument("problem", type=Path, metavar="PROBLEM")
     parser.add_argument(
-        "--method", default="local_dinm", help="named method, see docs/methods.md (default: local_dinm)"
+        "--method",
+        default="local_dinm",
+        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: local_dinm)",
     )
     parser.add_argument(
-        "--iterations", type=int, metavar="N", help="cap on outer iterations (default: the method's, 50)"
+        "--iterations", type=int, metavar="N", help=f"{iterations.doc} (default: the method's, {iterations.default})"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="change an option; repeatable")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"change an option, one of {', '.join(name for name in options if name != 'method')}; repeatable",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write trace, options and statistics as JSON")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem as a BAL file")
 

@@ -112,14 +112,15 @@ def _spheres() -> ModuleType:
 
 def _declared() -> dict[str, dict[str, Parameter]]:
     """Return, by name of the option, its declaration for each kind that has it."""
-    from ba_node.synthetic import declarations  # noqa: PLC0415
+    from ba_node.config import declared  # noqa: PLC0415
+    from ba_node.synthetic import SyntheticOptions  # noqa: PLC0415
 
-    kinds = {_RECORDING: declarations()}
+    kinds: dict[str, type] = {_RECORDING: SyntheticOptions}
     if checkout.present():
-        kinds[_SPHERE] = _spheres().sphere_declarations()
+        kinds[_SPHERE] = _spheres().SphereOptions
     found: dict[str, dict[str, Parameter]] = {}
     for kind, options in kinds.items():
-        for option in options:
+        for option in declared(options):
             found.setdefault(option.name, {})[kind] = option
     return found
 

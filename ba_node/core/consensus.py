@@ -12,7 +12,6 @@ that agree with them, so these triangulate it, and then all rays are classified 
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,34 +28,33 @@ _MAX_SINGLES = 8
 _LEAST_SINE2 = 1e-12
 
 
-def triangulate(rays: Rays, n_points: int, gate: float, backend: str = "auto") -> tuple[Triangulation, BoolArray]:
+def triangulate(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -> tuple[Triangulation, BoolArray]:
     """Return the points as those of their rays see them that agree, and which these are, (n,).
 
     Args: as of :func:`agreeing`.
     """
-    agrees = agreeing(rays, n_points, gate, backend)
-    found = triangulation.triangulate(rays.part(agrees), n_points, backend)
+    agrees = agreeing(rays, n_points, gate, kernels)
+    found = triangulation.triangulate(rays.part(agrees), n_points, kernels)
     near = triangulation.errors(rays, found.points) <= gate
     if np.array_equal(near, agrees):
         return found, agrees
     # A point that lost views by it keeps those it had.
     fewer = np.bincount(rays.point, near, n_points) < np.bincount(rays.point, agrees, n_points)
     agrees = np.where(fewer.take(rays.point), agrees, near)
-    return triangulation.triangulate(rays.part(agrees), n_points, backend), agrees
+    return triangulation.triangulate(rays.part(agrees), n_points, kernels), agrees
 
 
-def agreeing(rays: Rays, n_points: int, gate: float, backend: str = "auto") -> BoolArray:
+def agreeing(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -> BoolArray:
     """Return which rays agree with the place that most rays of their point agree on, (n,).
 
     Args:
         rays: in any order.
         n_points: number of points.
         gate: largest angle between a ray and the place, sigmas.
-        backend: numpy; otherwise the C++ kernels, where they are built.
+        kernels: numpy; otherwise the C++ kernels, where they are built.
     """
-    if backend != "numpy" and native.kernels is not None:
-        columns = {item.name: getattr(rays, item.name) for item in dataclasses.fields(rays)}
-        found: BoolArray = native.kernels.agreeing(**columns, n_points=n_points, gate=gate)
+    if kernels != "numpy" and native.kernels is not None:
+        found: BoolArray = native.kernels.agreeing(rays, n_points, gate)
         return found
     agrees = np.zeros(len(rays.point), bool)
     order = np.argsort(rays.point, kind="stable")

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
+from ba_node.core.factors import FactorSum, FactorTerms, KeyframeFactors, RelativePoses
 from ba_node.core.kernels import Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
-from ba_node.core.native_factors import NativeFactorSum
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Problem, State
 
-FloatArray = NDArray[np.float64]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
-# As in the enums of kernel.hpp.
-_LOSSES = ("squared", "huber", "cauchy")
-_CHEIRALITY = ("keep", "constant", "drop")
-_PRECONDITIONERS = ("none", "schur_block", "schur_diag", "b_block", "b_diag")
+    from ba_node.native._kernels import Kernel
+    from ba_node.native._kernels import RelativePoses as CompiledPoses
+
+FloatArray = NDArray[np.float64]
 
 
 class KernelsError(ValueError):
@@ -59,22 +60,10 @@ def missing(options: SolverOptions) -> str:
     return reason
 
 
-def residual_norms(problem: Problem, state: State, backend: str = "auto") -> FloatArray:
+def residual_norms(problem: Problem, state: State, kernels: str = "auto") -> FloatArray:
     """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see."""
-    if backend != "numpy" and native.kernels is not None and not problem.free_intrinsics:
-        obs, cams = problem.observations, problem.cameras
-        norms: FloatArray = native.kernels.residual_norms(
-            keyframe=obs.keyframe,
-            camera=obs.camera,
-            point=obs.point,
-            uv=obs.uv,
-            sigma_px=obs.sigma_px,
-            camera_rotation=cams.rotation,
-            camera_translation=cams.translation,
-            camera_model=cams.model,
-            camera_params=cams.params,
-            state=_arrays(state),
-        )
+    if kernels != "numpy" and native.kernels is not None and not problem.free_intrinsics:
+        norms: FloatArray = native.kernels.residual_norms(problem, state)
         return norms
     error = reprojection_errors(problem, state)
     return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
@@ -85,30 +74,12 @@ class NativeKernels:
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
         """Hand the problem over; it is copied and sorted once."""
-        obs, cams = problem.observations, problem.cameras
         self.size = 9 if problem.free_intrinsics else 6
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
-        make_kernel = native.kernels.Kernel9 if problem.free_intrinsics else native.kernels.Kernel6
-        self._kernel: Any = make_kernel(
-            keyframe=obs.keyframe,
-            camera=obs.camera,
-            point=obs.point,
-            uv=obs.uv,
-            sigma_px=obs.sigma_px,
-            depth_m=obs.depth_m,
-            depth_sigma_m=obs.depth_sigma_m,
-            camera_rotation=cams.rotation,
-            camera_translation=cams.translation,
-            camera_model=cams.model,
-            camera_params=cams.params,
-            fixed=problem.fixed,
-            loss=_LOSSES.index(options.loss),
-            loss_scale=options.loss_scale_px,
-            cheirality=_CHEIRALITY.index(options.cheirality),
-            factor_pairs=_NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns),
-            threads=options.threads or len(os.sched_getaffinity(0)),
-            start=_arrays(problem.start),
-        )
+        pairs = _NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns)
+        threads = options.threads or len(os.sched_getaffinity(0))
+        cost = (options.loss, options.loss_scale_px, options.cheirality)
+        self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
         self._system = NativeSystem(self._kernel, self.size)
@@ -120,10 +91,10 @@ class NativeKernels:
         """Linearise at a state and keep the normal equations; return the objective there."""
         stepped, self._stepped = self._stepped, None
         # The inner iterations have seen all of it where they ended.
-        if stepped is not None and state is stepped.state and self._kernel.linearise_polished():
+        if stepped is not None and state is stepped.state and self._kernel.linearise_prepared():
             value = stepped.objective
         else:
-            stepped, value = None, self._kernel.linearise(_arrays(state))
+            stepped, value = None, self._kernel.linearise(state)
         if self._factors is not None:
             terms = self._factors.linearise(state)
             self._kernel.add_factors(terms.diagonal, terms.gradient, terms.pairs.blocks)
@@ -152,7 +123,7 @@ class NativeKernels:
     def step(self, state: State, _system: System, x: FloatArray, inner_iterations: int) -> StepResult:
         """Take the step whose part in the system is x, and the inner iterations after it; see Kernels."""
         target = self._states[self._states[0] is state]
-        predicted, damping, value, inner = self._kernel.move(_arrays(state), x, inner_iterations, _arrays(target))
+        predicted, damping, value, inner = self._kernel.step(state, x, inner_iterations, target)
         if self._factors is not None and np.isfinite(value):
             factors = self._factors.value(target)
             value, inner = value + factors, inner + factors
@@ -162,13 +133,13 @@ class NativeKernels:
 
     def objective(self, state: State) -> float:
         """Return the robust objective."""
-        value: float = self._kernel.objective(_arrays(state))
+        value: float = self._kernel.objective(state)
         return value + self._value_of_factors(state)
 
     def iterate_points(self, state: State, iterations: int) -> tuple[float, State]:
         """Improve every point alone by up to so many damped Newton steps; return the objective and the state."""
         self._stepped = None
-        _before, value, points = self._kernel.polish_points(_arrays(state), iterations)
+        _before, value, points = self._kernel.inner_iterations(state, iterations)
         value += self._value_of_factors(state)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
 
@@ -176,13 +147,10 @@ class NativeKernels:
         return 0.0 if self._factors is None else self._factors.value(state)
 
 
-def _arrays(state: State) -> tuple[FloatArray, ...]:
-    return state.rotation, state.translation, state.points, state.intrinsics
-
-
 def _like(state: State) -> State:
     """Return room for a state of the same size."""
-    return State(*(np.empty(array.shape) for array in _arrays(state)))
+    arrays = (state.rotation, state.translation, state.points, state.intrinsics)
+    return State(*(np.empty(array.shape) for array in arrays))
 
 
 class NativeSystem:
@@ -191,7 +159,7 @@ class NativeSystem:
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, kernel: Any, size: int) -> None:
+    def __init__(self, kernel: Kernel, size: int) -> None:
         self._kernel, self._size = kernel, size
         n = kernel.n_free * size
         self.rhs: FloatArray = np.empty(n)
@@ -259,8 +227,7 @@ class NativeSystem:
 
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
-        bounds = (limits.t_eps, limits.max_iterations, limits.radius, limits.q_eps)
-        found, steps, on_boundary = self._kernel.pcg(scale, _PRECONDITIONERS.index(kind), bounds, formed, self._x)
+        found, steps, on_boundary = self._kernel.pcg(scale, kind, limits, formed, self._x)
         return Solution(self._x if found else None, steps, on_boundary)
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
@@ -275,3 +242,31 @@ class NativeSystem:
         """Return both steps and the reduction of the undamped model."""
         step_p, reduction = self._kernel.back_substitute(x)
         return x.reshape(-1, self._size), step_p, reduction
+
+
+class NativeFactorSum(FactorSum):
+    """The sum of all factors of a problem, stepped locally."""
+
+    def __init__(self, factors: Sequence[KeyframeFactors], fixed: NDArray[np.bool_]) -> None:
+        """Hand those on relative poses over; they are copied."""
+        super().__init__(factors, fixed)
+        self._kernels = [self._kernel(kind, number) for number, kind in enumerate(self._factors)]
+
+    def value(self, state: State) -> float:
+        """Return 1/2 sum Psi."""
+        total = 0.0
+        for kind, kernel in zip(self._factors, self._kernels, strict=True):
+            total += self._value(kind, state) if kernel is None else kernel.value(state)
+        return total
+
+    def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms) -> float:
+        kernel = self._kernels[number]
+        if kernel is None:
+            return super()._add(kind, number, state, terms)
+        return kernel.linearise(state, terms.gradient, terms.diagonal, terms.pairs.blocks)
+
+    def _kernel(self, kind: KeyframeFactors, number: int) -> CompiledPoses | None:
+        if not isinstance(kind, RelativePoses) or kind.loss not in native.LOSSES:
+            return None
+        kernel: CompiledPoses = native.kernels.RelativePoses(kind, self._column, self._pair[number][:, 0])
+        return kernel

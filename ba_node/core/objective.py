@@ -10,7 +10,7 @@ are weighed by the loss separately.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,26 +26,6 @@ BoolArray = NDArray[np.bool_]
 
 # What a point behind its camera costs under ``constant``: as much as a residual of this norm.
 _BEHIND_NORM = 100.0
-
-
-class CostModel(Protocol):
-    """What the objective reads of the options of a solve (``SolverOptions``, which declares them)."""
-
-    @property
-    def parameterisation(self) -> str:
-        """Return how a pose is stepped."""
-
-    @property
-    def loss(self) -> str:
-        """Return the name of the robust loss."""
-
-    @property
-    def loss_scale_px(self) -> float:
-        """Return where the loss leaves the square, in sigmas."""
-
-    @property
-    def cheirality(self) -> str:
-        """Return what points behind their camera cost."""
 
 
 @dataclass(frozen=True)
@@ -121,17 +101,18 @@ class _Observed:
 
 
 class Objective:
-    """The objective of one problem with a cost model; knows which image each observation belongs to.
+    """The objective of one problem; knows which image each observation belongs to.
 
     Attributes:
+        options: of which the cost model counts here: parameterisation, loss, its scale, cheirality.
         factors: the sum of the problem's factors; None if it has none.
     """
 
-    def __init__(self, problem: Problem, cost: CostModel) -> None:
+    def __init__(self, problem: Problem, options: SolverOptions) -> None:
         """Prepare what stays the same over all iterations."""
         self.problem = problem
-        self.cost_model = cost
-        self.factors = FactorSum(problem.factors, problem.fixed, cost.parameterisation) if problem.factors else None
+        self.options = options
+        self.factors = FactorSum(problem.factors, problem.fixed, options.parameterisation) if problem.factors else None
         # mu of the surrogate that stands in for a truncated quadratic; infinite for the loss itself.
         self.graduation = np.inf
         obs, cams = problem.observations, problem.cameras
@@ -153,7 +134,7 @@ class Objective:
             depth_weight,
             np.zeros(0, dtype=bool),
         )
-        if cost.cheirality == "drop":
+        if options.cheirality == "drop":
             self._all = replace(self._all, ignored=cameras.behind(self.in_camera(problem.start), self._all.model))
 
     def in_camera(self, state: State) -> FloatArray:
@@ -199,7 +180,7 @@ class Objective:
             rows, d_intrinsics = self._rows(state, self._all, intrinsics=intrinsics)
         points = columns.take(state.points, obs.point)
         d_keyframe = parameterisation.pose_jacobian(
-            self.cost_model.parameterisation, rows.d_point, points, state.rotation, obs.keyframe
+            self.options.parameterisation, rows.d_point, points, state.rotation, obs.keyframe
         )
         if intrinsics:
             d_keyframe = np.concatenate([d_keyframe.T, d_intrinsics.T]).T
@@ -248,7 +229,7 @@ class Objective:
         """
         rotation, translation, intrinsics = state.rotation.copy(), state.translation.copy(), state.intrinsics
         rotation[of], translation[of] = parameterisation.retract(
-            self.cost_model.parameterisation, rotation[of], translation[of], step_keyframes[:, :6]
+            self.options.parameterisation, rotation[of], translation[of], step_keyframes[:, :6]
         )
         if len(intrinsics):
             intrinsics = intrinsics.copy()
@@ -280,7 +261,7 @@ class Objective:
     def _mask(self, x_cam: FloatArray, of: _Observed) -> IntArray:
         """Return which observations push nothing, and move their points off the plane so that nothing is infinite."""
         hidden = cameras.behind(x_cam, of.model)
-        if self.cost_model.cheirality == "keep":
+        if self.options.cheirality == "keep":
             on_plane = np.abs(x_cam[:, 2]) < cameras.MIN_DEPTH * 1e-6
             hidden = np.where(of.model == cameras.Model.EQUIDISTANT, hidden, on_plane)
         masked = np.flatnonzero(hidden | of.ignored if len(of.ignored) else hidden)
@@ -307,7 +288,7 @@ class Objective:
         """Return Psi of each observation and the square root of the weight of each row, (n, 1) or (n, 3)."""
         norm = np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)
         cost, weight = self._loss(norm)
-        if self.cost_model.cheirality != "keep" and len(masked):
+        if self.options.cheirality != "keep" and len(masked):
             behind, _ = self._loss(np.array([_BEHIND_NORM]))
             cost[masked] = behind[0]
         if len(of.ignored):
@@ -320,7 +301,7 @@ class Objective:
         return cost, root
 
     def _loss(self, norm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return loss.evaluate(self.cost_model.loss, norm, self.cost_model.loss_scale_px, self.graduation)
+        return loss.evaluate(self.options.loss, norm, self.options.loss_scale_px, self.graduation)
 
     def _row_scale(self, root_weight: FloatArray, of: _Observed) -> FloatArray:
         """Return sqrt(weight) / sigma of each row, (n, 1 or 3)."""

@@ -111,17 +111,16 @@ def rays_of(problem: Problem) -> Rays:
     )
 
 
-def triangulate(rays: Rays, n_points: int, backend: str = "auto") -> Triangulation:
+def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulation:
     """Return the point of each group of rays. No ray is rejected here: look at the parallax before using a point.
 
     Args:
         rays: in any order.
         n_points: number of points.
-        backend: numpy; otherwise the C++ kernels, where they are built.
+        kernels: numpy; otherwise the C++ kernels, where they are built.
     """
-    if backend != "numpy" and native.kernels is not None:
-        columns = {item.name: getattr(rays, item.name) for item in dataclasses.fields(rays)}
-        return Triangulation(*native.kernels.triangulate(**columns, n_points=n_points))
+    if kernels != "numpy" and native.kernels is not None:
+        return Triangulation(*native.kernels.triangulate(rays, n_points))
     measured_row = np.isfinite(rays.distance_m)
     measured = np.bincount(rays.point[measured_row], minlength=n_points) > 0
     count = np.bincount(rays.point, minlength=n_points)

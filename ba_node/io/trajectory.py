@@ -84,20 +84,17 @@ def parse_stamp(text: str) -> int:
     Raises:
         ValueError: not a finite number, or beyond int64.
     """
-    with localcontext() as context:
-        context.prec = 60
-        try:
-            stamp = Decimal(text)
-            if not stamp.is_finite() or abs(stamp) > 2**63:
-                raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
-            stamp_ns = int((stamp * _NS).to_integral_value(rounding=ROUND_HALF_EVEN))
-        except InvalidOperation:
-            raise ValueError(f"stamp {text[:40]!r} is not a number") from None
-        except DecimalException:
-            raise ValueError(f"stamp {text[:40]!r}: expected finite seconds, within int64 nanoseconds") from None
-    if not -(2**63) <= stamp_ns < 2**63:
-        raise ValueError(f"stamp {text!r}: expected finite seconds, within int64 nanoseconds")
-    return stamp_ns
+    try:
+        with localcontext() as context:
+            context.prec = 60
+            stamp_ns = (Decimal(text) * _NS).to_integral_value(rounding=ROUND_HALF_EVEN)
+    except InvalidOperation:
+        raise ValueError(f"stamp {text[:40]!r} is not a number") from None
+    except DecimalException:
+        stamp_ns = Decimal("inf")
+    if not (stamp_ns.is_finite() and -(2**63) <= stamp_ns < 2**63):
+        raise ValueError(f"stamp {text[:40]!r}: expected finite seconds, within int64 nanoseconds")
+    return int(stamp_ns)
 
 
 def _parse_pose(words: list[str]) -> list[float]:

@@ -1,38 +1,54 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a message as little-endian CDR, field by field: what DDS sends and MCAP files hold.
+"""Write what is many things in one message as little-endian CDR: what DDS sends and MCAP files hold.
 
-Numbers are aligned to their size, counted from behind the 4 bytes that name the encoding. An array of rows is appended
-as it lies in memory: no object is made for a row.
+A path of 1000 poses is 6000 Python objects: 20 ms to build, during which nothing else is answered; a cloud is copied
+four times on its way through a message object. Here a row of an array is a pose, a point, or the end of a line, and the
+array is the message but for its head.
+
+Numbers are aligned to their size, counted from behind the 4 bytes that name the encoding. So a
+``geometry_msgs/PoseStamped`` is
+
+    sec int32, nanosec uint32, length of the name uint32, name and a zero, gap to a multiple of 8,
+    x, y, z, qx, qy, qz, qw float64
+
+and the gap depends on where it begins: at a multiple of 8, but for the first pose of a path, which may begin 4 later.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import TYPE_CHECKING, Any
 
-from ba_node.messages.factory import stamp_parts
+import numpy as np
+
+from ba_node.messages.factory import NS_PER_S, stamp_parts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ba_node.estimate import Poses
+
 _ENCODING = b"\x00\x01\x00\x00"
+# Values of sensor_msgs/PointField.
+_POINT_FIELD = {"<f4": 7, "<u4": 6}
 
 
 class Cdr:
-    """A message that grows."""
+    """A message that grows. Its stamps raise ConversionError if their seconds exceed 32 bits."""
 
     def __init__(self) -> None:
         """Start empty."""
-        self._parts: list[bytes] = []
+        self._parts: list[bytes | memoryview] = []
         self._size = 0
 
     def pack(self, layout: str, *values: float) -> None:
         """Append numbers, given by the letters of ``struct``, each aligned to its size; ``3d`` is three of them."""
-        kinds = _kinds(layout)
+        kinds = re.sub(r"(\d+)(.)", lambda found: found[2] * int(found[1]), layout)
         for kind, value in zip(kinds, values, strict=True):
-            size = struct.calcsize(f"<{kind}")
-            self._append(bytes(-self._size % size) + struct.pack(f"<{kind}", value))
+            self._align(struct.calcsize(f"<{kind}"))
+            self._append(struct.pack(f"<{kind}", value))
 
     def text(self, text: str) -> None:
         """Append a string."""
@@ -41,7 +57,7 @@ class Cdr:
         self._append(data)
 
     def header(self, stamp_ns: int, frame_id: str) -> None:
-        """Append a ``std_msgs/Header``; raise ConversionError if the stamp exceeds it."""
+        """Append a ``std_msgs/Header``."""
         self.pack("iI", *stamp_parts(stamp_ns))
         self.text(frame_id)
 
@@ -49,25 +65,77 @@ class Cdr:
         """Append a sequence of rows of little-endian numbers of one kind, (n, k)."""
         self.pack("I", len(rows))
         if len(rows):
-            self._append(bytes(-self._size % rows.dtype.itemsize))
-            self._append(rows.tobytes())
+            self._align(rows.dtype.itemsize)
+            self._append(np.ascontiguousarray(rows).data.cast("B"))
+
+    def poses(self, poses: Poses, frame_id: str) -> None:
+        """Append a sequence of ``geometry_msgs/PoseStamped``."""
+        self.pack("I", len(poses))
+        for some in (poses[:1], poses[1:]):
+            self._append(_stamped(some, frame_id, self._size % 8).tobytes())
 
     def data(self) -> bytes:
         """Return the message."""
         return b"".join([_ENCODING, *self._parts])
 
-    def _append(self, data: bytes) -> None:
+    def _align(self, size: int) -> None:
+        self._append(bytes(-self._size % size))
+
+    def _append(self, data: bytes | memoryview) -> None:
         self._parts.append(data)
         self._size += len(data)
 
 
-def _kinds(layout: str) -> str:
-    """Write repeated letters out: ``3d`` -> ``ddd``."""
-    out, count = "", ""
-    for letter in layout:
-        if letter.isdigit():
-            count += letter
-        else:
-            out += letter * int(count or 1)
-            count = ""
-    return out
+def pose_messages(poses: Poses, frame_id: str) -> list[bytes]:
+    """Return a ``geometry_msgs/PoseStamped`` for each pose."""
+    return [_ENCODING + row.tobytes() for row in _stamped(poses, frame_id, 0)]
+
+
+def path_message(poses: Poses, stamp_ns: int, frame_id: str) -> bytes:
+    """Return a ``nav_msgs/Path``."""
+    out = Cdr()
+    out.header(stamp_ns, frame_id)
+    out.poses(poses, frame_id)
+    return out.data()
+
+
+def cloud_message(points: NDArray[np.void], stamp_ns: int, frame_id: str, *, dense: bool) -> bytes:
+    """Return a ``sensor_msgs/PointCloud2`` of one row.
+
+    Args:
+        points: (n,) records of little-endian float32 and uint32 fields.
+        stamp_ns: stamp, ns.
+        frame_id: frame of the points.
+        dense: no coordinate is NaN or infinite.
+    """
+    layout, size = points.dtype.fields, points.dtype.itemsize
+    assert layout is not None
+    out = Cdr()
+    out.header(stamp_ns, frame_id)
+    out.pack("3I", 1, len(points), len(layout))
+    for name, (kind, offset, *_) in layout.items():
+        out.text(name)
+        out.pack("IBI", offset, _POINT_FIELD[kind.str], 1)
+    out.pack("?2I", False, size, size * len(points))
+    out.sequence(points.view(np.uint8))
+    out.pack("?", dense)
+    return out.data()
+
+
+def _stamped(poses: Poses, frame_id: str, begin: int) -> NDArray[np.uint8]:
+    """Return the bytes of each pose as a row, for a pose that begins at a place modulo 8."""
+    sec, nanosec = np.divmod(poses.stamp_ns, NS_PER_S)
+    wrong = np.flatnonzero(sec != sec.astype(np.int32))
+    if len(wrong):
+        stamp_parts(int(poses.stamp_ns[wrong[0]]))
+    name = Cdr()
+    name.text(frame_id)
+    head = np.frombuffer(name.data()[len(_ENCODING) :], np.uint8)
+    numbers = 8 + len(head) + -(begin + 8 + len(head)) % 8
+    rows = np.zeros((len(poses), numbers + 56), np.uint8)
+    rows[:, :4] = sec.astype("<i4")[:, None].view(np.uint8)
+    rows[:, 4:8] = nanosec.astype("<u4")[:, None].view(np.uint8)
+    rows[:, 8 : 8 + len(head)] = head
+    pose = np.concatenate([poses.position, poses.orientation], axis=1).astype("<f8")
+    rows[:, numbers:] = pose.view(np.uint8)
+    return rows

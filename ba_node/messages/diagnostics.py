@@ -13,8 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ba_node.estimate import SolveReport, Status
+from ba_node.estimate import Status
 from ba_node.messages.factory import MessageFactory, header_message
+from ba_node.messages.report import Report
 from ba_node.messages.topics import DIAGNOSTICS, TOPICS
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class Health:
     inbox_waiting: int = 0
     inbox_size: int = 1
     recent: Mapping[str, int] = field(default_factory=dict)
-    report: SolveReport | None = None
+    report: Report | None = None
     tf: str = ""
     memory_mb: float = 0.0
     clock: str = ""
@@ -143,7 +144,7 @@ _QUEUE = ("dropped", "coalesced")
 
 
 def _queue(health: Health, limits: DiagnosticsConfig) -> Finding:
-    report = health.report or SolveReport()
+    report = (health.report or Report()).queue
     names = ("received", "solved", "coalesced", "dropped_keyframes", "rejected_keyframes", "waiting", "dropped")
     found = Finding(
         "queue",
@@ -161,11 +162,11 @@ def _queue(health: Health, limits: DiagnosticsConfig) -> Finding:
 
 
 def _solver(health: Health, limits: DiagnosticsConfig) -> Finding:
-    report = health.report
     if not health.solver_alive:
         return Finding("solver", {}, Level.ERROR, ["the solver's thread has ended: start the node anew"])
-    if report is None:
+    if health.report is None:
         return Finding("solver", {}, words=["no solve yet"])
+    report = health.report.solve
     share = report.observations / max(report.observations + report.outliers, 1)
     found = Finding(
         "solver",
@@ -184,7 +185,7 @@ def _solver(health: Health, limits: DiagnosticsConfig) -> Finding:
             "observations": str(report.observations),
         },
     )
-    for warning in report.warnings:
+    for warning in health.report.warnings:
         found.find(Level.WARN, warning)
     if report.status is Status.FAILED:
         found.find(Level.ERROR, f"the last solve failed: {report.reason}")
@@ -197,13 +198,13 @@ def _solver(health: Health, limits: DiagnosticsConfig) -> Finding:
     else:
         text = f"rms {report.rms_px_after:.1f} px"
         found.above(report.rms_px_after, limits.rms_warn_px, limits.rms_error_px, text)
-        text = f"only {100 * share:.0f} % of the observations are believed"
+        text = f"only {100 * share:.0f} % of the observations are inliers"
         found.above(-share, -limits.inliers_warn_share, -limits.inliers_error_share, text)
     return found
 
 
 def _latency(health: Health, limits: DiagnosticsConfig) -> Finding:
-    report = health.report or SolveReport()
+    report = (health.report or Report()).latency
     names = [f"{which}latency_{part}_s" for which in ("", "stamp_") for part in ("p50", "p95", "max")]
     found = Finding("latency", {f"{name[:-2]} [ms]": f"{1e3 * getattr(report, name):.1f}" for name in names})
     p95 = report.latency_p95_s
@@ -212,7 +213,7 @@ def _latency(health: Health, limits: DiagnosticsConfig) -> Finding:
 
 
 def _map(health: Health) -> Finding:
-    report = health.report or SolveReport()
+    report = (health.report or Report()).solve
     found = Finding(
         "map",
         {

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ba_node.estimate import Cloud, Estimate, SolveReport
+from ba_node.estimate import Cloud, Estimate
+from ba_node.messages.cdr import cloud_message, path_message, pose_messages
 from ba_node.messages.factory import MessageFactory, float32, header_message
-from ba_node.messages.serialised import cloud_message, path_message, pose_messages
+from ba_node.messages.report import Report, report_message
 from ba_node.messages.topics import OUTPUT_TYPES
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def output_messages(
 
     Returns:
         (topic below the node's name, type, message) in the order to publish; one pose for each refined keyframe.
-        Poses, path and points are bytes, serialised already (``serialised.py``).
+        Poses, path and points are bytes, serialised already (``cdr.py``).
     """
     out: list[tuple[str, Any]] = []
     if estimate.report.status.usable:
@@ -50,7 +51,7 @@ def output_messages(
         if "pose" in wanted:
             out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
     if "report" in wanted:
-        out.append(("report", report_message(factory, estimate.report, estimate.stamp_ns, estimate.frame_id)))
+        out.append(("report", report_message(factory, Report(estimate.report), estimate.stamp_ns, estimate.frame_id)))
     if estimate.replaces_map:
         if "path" in wanted:
             poses = estimate.trajectory[-config.path_max_poses :]
@@ -91,16 +92,3 @@ def _points(estimate: Estimate, limit: int) -> bytes:
     records = point_records(estimate.cloud, limit)
     dense = all(bool(np.isfinite(records[name]).all()) for name in "xyz")
     return cloud_message(records, estimate.stamp_ns, estimate.frame_id, dense=dense)
-
-
-def report_message(factory: MessageFactory, report: SolveReport, stamp_ns: int, frame_id: str) -> Any:
-    """Return the message of a report, with the stamp of the newest keyframe and the frame of the map."""
-    fields = {name: getattr(report, name) for name in SolveReport.__dataclass_fields__ if name != "rejected"}
-    reasons = sorted(report.rejected)
-    return factory.make(
-        OUTPUT_TYPES["report"],
-        header=header_message(factory, stamp_ns, frame_id),
-        rejected_reason=reasons,
-        rejected_count=factory.array(np.array([report.rejected[reason] for reason in reasons], dtype=np.uint64)),
-        **(fields | {"status": int(report.status), "warnings": list(report.warnings)}),
-    )

@@ -3,11 +3,17 @@
 """The compiled kernels, if they were built; src/ holds the C++.
 
 ``setup.py`` builds them where it finds a C++17 compiler. Without them everything works, some ten times slower.
+
+On x86-64 they are there three times: for any processor (``baseline``), with AVX2 and FMA (``avx2``), and with AVX-512
+(``avx512``). The widest that the processor runs is taken, or the one that the environment variable BA_NODE_SIMD names.
+They differ by rounding.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
+import warnings
 from typing import Any
 
 try:
@@ -15,7 +21,31 @@ try:
 except ImportError:
     kernels = None
 
-_LOSSES = ("squared", "huber", "cauchy")
+VARIABLE = "BA_NODE_SIMD"
+_TARGETS = ("baseline", "avx2", "avx512")
+# That the kernels have; as in src/bindings/arrays.hpp.
+LOSSES = ("squared", "huber", "cauchy")
+
+
+def choose_target(wanted: str) -> str:
+    """Have the kernels for a kind of processor do the work, the widest if none is wanted; return its name.
+
+    Warns and takes the widest if what is wanted does not exist, or this processor or this build does not have it.
+    """
+    supported: tuple[str, ...] = kernels.targets()
+    chosen = wanted or supported[0]
+    if chosen not in supported:
+        reason = "this processor or this build lacks it" if wanted in _TARGETS else f"known are {', '.join(_TARGETS)}"
+        text = f"{VARIABLE} = {wanted!r}: {reason}; taking {supported[0]} (here run {', '.join(supported)})"
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
+        chosen = supported[0]
+    kernels.use_target(chosen)
+    return chosen
+
+
+def description(backend: str = "auto") -> str:
+    """Return which kernels work: numpy, or C++ and what they are compiled for."""
+    return "numpy" if kernels is None or backend == "numpy" else f"C++, {kernels.target()}"
 
 
 def missing(parameterisation: str, loss: str) -> str:
@@ -24,6 +54,10 @@ def missing(parameterisation: str, loss: str) -> str:
         return "the C++ kernels are not built: install a C++17 compiler and install ba_node again"
     if parameterisation != "local":
         return f"the C++ kernels have no {parameterisation} parameterisation"
-    if loss not in _LOSSES:
+    if loss not in LOSSES:
         return f"the C++ kernels have no {loss} loss"
     return ""
+
+
+if kernels is not None:
+    choose_target(os.environ.get(VARIABLE, ""))

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ba_node import native
 from ba_node.backend import Backend, MapEnded, MapSummary
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Poses
@@ -125,7 +126,11 @@ def replay(
                 refused = run.sessions[-1].summary.refused_rig or "none came"
                 raise ReplayError(f"{reader.path}: no camera rig that can be used: {refused}")
         truth = read_truth(reader)
-        report = {"bag": reader.path.name, **_write(out, run.sessions, truth)}
+        report = {
+            "bag": reader.path.name,
+            "kernels": native.description(config.solver.kernels),
+            **_write(out, run.sessions, truth),
+        }
         report |= {"topics_taken": reader.taken, "topics_left": reader.left, "cameras_adjusted": run.camera_notes}
         report["bag_warnings"] = dict(reader.warnings)
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
@@ -164,15 +169,15 @@ class _Run:
         self._inputs = {keyframe.keyframe_id: keyframe for keyframe in inputs}
 
     def read(self, measurements: Iterable[Measurement], total: int) -> None:
-        for told in self.backend.replay(self._counting(measurements, total)):
-            if isinstance(told, Estimate):
-                self._record(told)
-            elif isinstance(told, Keyframe):
-                if told.keyframe_id in self._known and told.session_id == self.backend.map.session_id:
-                    self.known_already.add(told.keyframe_id)
-                self._inputs.setdefault(told.keyframe_id, told)
+        for event in self.backend.replay(self._counting(measurements, total)):
+            if isinstance(event, Estimate):
+                self._record(event)
+            elif isinstance(event, Keyframe):
+                if event.keyframe_id in self._known and event.session_id == self.backend.map.session_id:
+                    self.known_already.add(event.keyframe_id)
+                self._inputs.setdefault(event.keyframe_id, event)
             else:
-                self._map_ended(told)
+                self._map_ended(event)
 
     def _counting(self, measurements: Iterable[Measurement], total: int) -> Iterator[Measurement]:
         for done, measurement in enumerate(measurements, start=1):

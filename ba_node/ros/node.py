@@ -42,7 +42,7 @@ from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.throttle import Throttle
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.setup_check import on_a_thread
-from ba_node.ros.worker.worker import Account, Notice, Worker
+from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 if TYPE_CHECKING:
     from ba_node.config import Config
@@ -182,22 +182,21 @@ class BaNode(ManagedNode):
         if host is None:
             return
         outputs = host.worker.outputs()
-        estimates = [output for output in outputs if isinstance(output, Estimate)]
-        newest = next((e for e in reversed(estimates) if e.replaces_map), None)
+        estimates = [output.estimate for output in outputs if isinstance(output, Outcome)]
+        newest = next((e for e in reversed(estimates) if e is not None and e.replaces_map), None)
         for output in outputs:
             if isinstance(output, Notice):
                 self._log(output)
             elif host.active:
                 for component in self._components:
-                    self._deliver(component, output, newest=output is newest)
+                    self._deliver(component, output, newest)
 
-    def _deliver(self, component: Component, output: Estimate | Account, newest: bool) -> None:
-        """Give an estimate or an account to a component; a fault in one must not keep it from the others."""
+    def _deliver(self, component: Component, outcome: Outcome, newest: Estimate | None) -> None:
+        """Give a component what came out; a fault in one must not keep it from the others."""
         try:
-            if isinstance(output, Estimate):
-                component.take(output, newest)
-            else:
-                component.take_account(output)
+            component.take_report(outcome)
+            if outcome.estimate is not None:
+                component.take(outcome.estimate, outcome.estimate is newest)
         except Exception as error:
             if not self.context.ok():
                 raise  # a signal ended the context between two messages

@@ -12,7 +12,7 @@ import numpy as np
 
 from ba_node.core import geometry
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.scene.frame_names import plain
+from ba_node.scene.ingest import plain_name
 
 if TYPE_CHECKING:
     from ba_node.measurements import Measurement
@@ -114,14 +114,14 @@ class State:
 
     Attributes:
         candidate: what is held.
-        ahead: tracks and guesses of sessions that no keyframe has begun.
+        waiting: tracks and guesses of sessions that no keyframe has begun.
         lower: session and number of the keyframes in a row that are of a session before the current one.
         distrust: added to what is needed.
         calm: keyframes that went on as before, since distrust changed.
     """
 
     candidate: Candidate | None = None
-    ahead: tuple[FeatureTracks | LandmarkGuesses, ...] = ()
+    waiting: tuple[FeatureTracks | LandmarkGuesses, ...] = ()
     lower: tuple[int, int] = (-1, 0)
     distrust: int = 0
     calm: int = 0
@@ -155,7 +155,7 @@ def agree(scene: Scene, candidate: Candidate, keyframe: Keyframe) -> bool:
     if candidate.kind is Kind.HIGHER:
         return keyframe.session_id == last.session_id
     if candidate.kind is Kind.FRAME:
-        return plain(keyframe.frame_id) == plain(last.frame_id)
+        return plain_name(keyframe.frame_id) == plain_name(last.frame_id)
     if candidate.kind is Kind.REUSED:
         return keyframe.stamp_ns > last.stamp_ns
     if candidate.kind is Kind.LATE:

@@ -62,6 +62,33 @@ def keyframe_pose(keyframe: Keyframe, log: RejectionLog) -> Pose | None:
     return Pose(geometry.matrix_from_quaternion(quaternion), position)
 
 
+def plain_name(frame_id: str) -> str:
+    """Return the name of a frame as tf2 has it: without the slash that tf of ROS 1 put before it."""
+    return frame_id.strip().lstrip("/")
+
+
+def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -> None:
+    """Say so if the name of a keyframe's fixed frame is none, or one that tf2 refuses.
+
+    Args:
+        keyframe: as it came.
+        named: by a parameter, empty if it names none; then an empty name does no harm.
+        taken: what is taken for an empty name.
+        log: where it is said.
+    """
+    name = plain_name(keyframe.frame_id)
+    if name == keyframe.frame_id and name:
+        return
+    log.notice("frame_name")
+    if "frame_name" in log.warnings:
+        return
+    where = f"keyframe {keyframe.keyframe_id}: header.frame_id = {keyframe.frame_id!r}"
+    if name:
+        log.warn("frame_name", f"{where} is no name for tf2, taken as {name!r}: leave out the slash")
+    elif not named:
+        log.warn("frame_name", f"{where} names no frame, taken as {taken!r}: name the fixed frame of the poses")
+
+
 def _check_distance(name: str, frame_id: str, position: FloatArray, log: RejectionLog) -> None:
     """Warn where the cloud, as viewers take it, cannot tell points apart any more that the map can."""
     step_m = float(np.spacing(np.abs(position).max().astype(np.float32)))

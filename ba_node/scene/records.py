@@ -4,15 +4,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.scene.tables import BoolArray, Column, FloatArray, IdArray, IntArray, Table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray, Table, column
 
 Float32Array = NDArray[np.float32]
 
@@ -27,72 +24,41 @@ class Keyframes(Table):
     was made for it with all that matters (see ``Backend``).
     """
 
-    COLUMNS: ClassVar[Mapping[str, Column]] = {
-        "keyframe_id": Column(np.uint64),
-        "stamp_ns": Column(np.int64),
-        "input_rotation": Column(np.float64, (3, 3)),
-        "input_position": Column(np.float64, (3,)),
-        "rotation": Column(np.float64, (3, 3)),
-        "position": Column(np.float64, (3,)),
-        "refined": Column(np.bool_),
-        "solved": Column(np.bool_),
-    }
-    keyframe_id: IdArray
-    stamp_ns: NDArray[np.int64]
-    input_rotation: FloatArray
-    input_position: FloatArray
-    rotation: FloatArray
-    position: FloatArray
-    refined: BoolArray
-    solved: BoolArray
+    keyframe_id: IdArray = column(np.uint64)
+    stamp_ns: NDArray[np.int64] = column(np.int64)
+    input_rotation: FloatArray = column(np.float64, (3, 3))
+    input_position: FloatArray = column(np.float64, (3,))
+    rotation: FloatArray = column(np.float64, (3, 3))
+    position: FloatArray = column(np.float64, (3,))
+    refined: BoolArray = column(np.bool_)
+    solved: BoolArray = column(np.bool_)
 
 
 class Landmarks(Table):
     """One row a track. ``guess`` is as given, in the front-end's fixed frame; ``last`` the newest observation row."""
 
-    COLUMNS: ClassVar[Mapping[str, Column]] = {
-        "track_id": Column(np.uint64),
-        "position": Column(np.float64, (3,), np.nan),
-        "guess": Column(np.float64, (3,), np.nan),
-        "has_position": Column(np.bool_),
-        "has_guess": Column(np.bool_),
-        "last": Column(np.intp, (), -1),
-        "last_seen": Column(np.int64, (), _LONG_AGO),
-        "views": Column(np.int32),
-        "rms_px": Column(np.float32, (), np.nan),
-    }
-    track_id: IdArray
-    position: FloatArray
-    guess: FloatArray
-    has_position: BoolArray
-    has_guess: BoolArray
-    last: IntArray
-    last_seen: NDArray[np.int64]
-    views: NDArray[np.int32]
-    rms_px: Float32Array
+    track_id: IdArray = column(np.uint64)
+    position: FloatArray = column(np.float64, (3,), np.nan)
+    guess: FloatArray = column(np.float64, (3,), np.nan)
+    has_position: BoolArray = column(np.bool_)
+    has_guess: BoolArray = column(np.bool_)
+    last: IntArray = column(np.intp, (), -1)
+    last_seen: NDArray[np.int64] = column(np.int64, (), _LONG_AGO)
+    views: NDArray[np.int32] = column(np.int32)
+    rms_px: Float32Array = column(np.float32, (), np.nan)
 
 
 class ObservationTable(Table):
     """One row an observation. Pixels are kept in float32, the precision of the messages."""
 
-    COLUMNS: ClassVar[Mapping[str, Column]] = {
-        "keyframe": Column(np.int32),
-        "camera": Column(np.int32),
-        "landmark": Column(np.int32),
-        "previous": Column(np.intp, (), -1),
-        "uv": Column(np.float32, (2,)),
-        "sigma_px": Column(np.float32),
-        "depth_m": Column(np.float32),
-        "outlier": Column(np.bool_),
-    }
-    keyframe: NDArray[np.int32]
-    camera: NDArray[np.int32]
-    landmark: NDArray[np.int32]
-    previous: IntArray
-    uv: Float32Array
-    sigma_px: Float32Array
-    depth_m: Float32Array
-    outlier: BoolArray
+    keyframe: NDArray[np.int32] = column(np.int32)
+    camera: NDArray[np.int32] = column(np.int32)
+    landmark: NDArray[np.int32] = column(np.int32)
+    previous: IntArray = column(np.intp, (), -1)
+    uv: Float32Array = column(np.float32, (2,))
+    sigma_px: Float32Array = column(np.float32)
+    depth_m: Float32Array = column(np.float32)
+    outlier: BoolArray = column(np.bool_)
 
 
 class Block(NamedTuple):

@@ -14,7 +14,6 @@ import numpy as np
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene import ingest
-from ba_node.scene.frame_names import plain
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, RejectionLog
@@ -133,7 +132,7 @@ class Scene(MapTables):
         if len(self.keyframes) and keyframe.stamp_ns < self.keyframes.stamp_ns.max():
             self.log.notice("reordered")
         ingest.check_stamp(keyframe, self.keyframes, self.log)
-        self.frame_id = self.frame_id or plain(keyframe.frame_id)
+        self.frame_id = self.frame_id or ingest.plain_name(keyframe.frame_id)
         row = self.keyframes.append(
             1,
             keyframe_id=keyframe.keyframe_id,

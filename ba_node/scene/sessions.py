@@ -20,6 +20,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.scene import ingest
 from ba_node.scene.candidates import (
     NS,
     Admitted,
@@ -39,7 +40,6 @@ from ba_node.scene.candidates import (
     same_pose,
     unusual_s,
 )
-from ba_node.scene.frame_names import plain
 
 if TYPE_CHECKING:
     from ba_node.measurements import Measurement
@@ -103,8 +103,8 @@ class Sessions:
     def end(self, scene: Scene) -> Decision:
         """Return what becomes of all that is held when nothing more comes: a pause at the end is taken for one."""
         state, candidate = self.state, self.state.candidate
-        refused = tuple(never_began(item) for item in state.ahead)
-        rest = Decision(dataclasses.replace(state, candidate=None, ahead=()), (), refused)
+        refused = tuple(never_began(item) for item in state.waiting)
+        rest = Decision(dataclasses.replace(state, candidate=None, waiting=()), (), refused)
         if candidate is None:
             return rest
         gap_s = (candidate.keyframes[0].stamp_ns - newest_ns(scene)) * NS
@@ -146,7 +146,7 @@ class Sessions:
 
     def _odd(self, scene: Scene, keyframe: Keyframe) -> tuple[Kind, Keyframe, str] | None:
         """Return how a keyframe of the current session does not go on where it is, None if it does."""
-        name, frame = f"keyframe {keyframe.keyframe_id}", plain(keyframe.frame_id)
+        name, frame = f"keyframe {keyframe.keyframe_id}", ingest.plain_name(keyframe.frame_id)
         limit_s, ahead_s = scene.config.max_reorder_s, (keyframe.stamp_ns - newest_ns(scene)) * NS
         is_back = 0.0 < limit_s < -ahead_s
         back = f"{name} is {-ahead_s:.1f} s older than the newest (scene.max_reorder_s = {limit_s:g})"
@@ -208,11 +208,11 @@ class Sessions:
     def _begun(self, session_id: int, admitted: tuple[Admitted, ...], distrust: int = 0) -> Decision:
         """Return the decision that begins a session, with the tracks and guesses that came before its keyframe."""
         state = self.state
-        mine = tuple(Admitted(item) for item in state.ahead if item.session_id <= session_id)
+        mine = tuple(Admitted(item) for item in state.waiting if item.session_id <= session_id)
         after = dataclasses.replace(
             state,
             candidate=None,
-            ahead=tuple(item for item in state.ahead if item.session_id > session_id),
+            waiting=tuple(item for item in state.waiting if item.session_id > session_id),
             lower=(-1, 0),
             distrust=_more(state.distrust, distrust),
             calm=0,
@@ -253,9 +253,9 @@ class Sessions:
 
     def _wait(self, scene: Scene, item: FeatureTracks | LandmarkGuesses) -> Decision:
         """Let tracks and guesses wait for the first keyframe of their session."""
-        ahead, n = (*self.state.ahead, item), scene.config.max_pending
-        refused = tuple(never_began(one) for one in ahead[:-n])
-        return Decision(dataclasses.replace(self.state, ahead=ahead[-n:]), (), refused)
+        waiting, n = (*self.state.waiting, item), scene.config.max_pending
+        refused = tuple(never_began(one) for one in waiting[:-n])
+        return Decision(dataclasses.replace(self.state, waiting=waiting[-n:]), (), refused)
 
     def _of_current(self, scene: Scene, item: FeatureTracks | LandmarkGuesses) -> Decision:
         """Take in tracks and guesses, but hold those that belong to a keyframe that is held under a known id."""

@@ -174,8 +174,8 @@ def _blocks(content: MapContent, seen: Mapping[str, NDArray[Any]], n: Mapping[st
     whole = len(order) == 0 or (begin[order[0]] == 0 and bool((begin[order[1:]] == end[order[:-1]]).all()))
     require(whole and length.sum() == n["sightings"], "blocks do not cover the rows of sightings once each")
     for name in ("keyframe", "camera"):
-        told = np.repeat(found[name][order], length)
-        require(np.array_equal(told, seen[name]), f"blocks/{name} contradicts sightings/{name}")
+        stored = np.repeat(found[name][order], length)
+        require(np.array_equal(stored, seen[name]), f"blocks/{name} contradicts sightings/{name}")
     blocks: list[list[Block]] = [[] for _ in range(n["keyframes"])]
     for row, *block in zip(*(found[name].tolist() for name in _BLOCKS), strict=True):
         blocks[row].append(Block(*block))

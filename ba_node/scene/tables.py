@@ -30,14 +30,23 @@ class Column(NamedTuple):
     fill: float = 0
 
 
+def column(dtype: DTypeLike, shape: tuple[int, ...] = (), fill: float = 0) -> Any:
+    """Declare an attribute of a Table as one of its columns."""
+    return Column(dtype, shape, fill)
+
+
 class Table:
-    """Columns of equal length. A subclass names them in ``COLUMNS`` and annotates them as attributes.
+    """Columns of equal length. A subclass declares each as an attribute with :func:`column`.
 
     The attributes are views of the rows in use; writing to them changes the table. They are replaced when the table
     grows or shrinks, so nobody may hold on to one.
     """
 
     COLUMNS: ClassVar[Mapping[str, Column]] = {}
+
+    def __init_subclass__(cls) -> None:
+        """Find the columns."""
+        cls.COLUMNS = {name: value for name, value in vars(cls).items() if isinstance(value, Column)}
 
     def __init__(self) -> None:
         """Start empty."""

@@ -3,6 +3,6 @@
 """Make data with ground truth: what a front-end would publish in a known world."""
 
 from ba_node.synthetic.generate import SyntheticData, generate
-from ba_node.synthetic.options import SyntheticOptions, declarations
+from ba_node.synthetic.options import SyntheticOptions
 
-__all__ = ["SyntheticData", "SyntheticOptions", "declarations", "generate"]
+__all__ = ["SyntheticData", "SyntheticOptions", "generate"]

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declare every choice in a synthetic recording once, with unit, range and meaning.
 
-``ba synth`` is a loop over :func:`declarations`, as the other tools are over those of ``config/``.
+``ba synth`` is a loop over its fields, as the other tools are over those of ``config/``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ba_node.config import Checked, ConfigError, Parameter, declared, option
+from ba_node.config import Checked, ConfigError, option
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,3 @@ class SyntheticOptions(Checked):
                 f"max_track_keyframes = {self.max_track_keyframes} is below min_track_keyframes ="
                 f" {self.min_track_keyframes}: no track could be published; raise it, or 0 for no limit"
             )
-
-
-def declarations() -> tuple[Parameter, ...]:
-    """Return every option, in the order of the class."""
-    return declared(SyntheticOptions, live=False)

@@ -69,7 +69,7 @@ class Agreed:
 
 
 def initial_points(
-    problem: Problem, guess: FloatArray, config: TracksConfig, gate: float, backend: str = "auto"
+    problem: Problem, guess: FloatArray, config: TracksConfig, gate: float, kernels: str = "auto"
 ) -> FloatArray:
     """Return first positions (n_pt, 3) of the points of a problem, NaN where none can be had yet.
 
@@ -78,20 +78,20 @@ def initial_points(
         guess: (n_pt, 3) guesses in the frame of the problem, NaN for none.
         config: for the parallax.
         gate: how far off a view may be and agree, sigmas.
-        backend: kernels.
+        kernels: native, numpy or auto.
     """
-    found = agreed_points(problem, config, gate, backend)
+    found = agreed_points(problem, config, gate, kernels)
     points = np.where(found.good[:, None], found.points, np.nan)
     if np.isnan(guess).all():
         return points
-    fit, guess_fit = _fit(problem, points, backend), _fit(problem, guess, backend)
+    fit, guess_fit = _fit(problem, points, kernels), _fit(problem, guess, kernels)
     needed = np.where(found.measured, 1, 2)
     guess_usable = guess_fit.in_front >= needed
     take_guess = guess_usable & ((guess_fit.median <= gate) | ~found.good | (guess_fit.robust <= fit.robust))
     return np.where(take_guess[:, None], guess, points)
 
 
-def poses_gate(problem: Problem, config: TracksConfig, backend: str = "auto") -> float:
+def poses_gate(problem: Problem, config: TracksConfig, kernels: str = "auto") -> float:
     """Return how far off a view may be, sigmas: more where hardly any view agrees with another, so bad the poses are.
 
     Args: as of :func:`initial_points`.
@@ -99,22 +99,22 @@ def poses_gate(problem: Problem, config: TracksConfig, backend: str = "auto") ->
     rays, n = triangulation.rays_of(problem), problem.n_points
     gate = config.max_triangulation_px
     views = np.bincount(rays.point, minlength=n)
-    agrees = consensus.agreeing(rays, n, gate, backend) & (views > 1).take(rays.point)
+    agrees = consensus.agreeing(rays, n, gate, kernels) & (views > 1).take(rays.point)
     if np.count_nonzero(agrees) >= _LEAST_AGREEMENT * int(views[views > 1].sum()):
         return gate
-    rough = triangulation.triangulate(rays, n, backend)
-    fit = _fit(problem, rough.points, backend)
+    rough = triangulation.triangulate(rays, n, kernels)
+    fit = _fit(problem, rough.points, kernels)
     wide = rough.parallax_rad >= np.deg2rad(config.min_parallax_deg)
     return widened(gate, fit.median[(wide | rough.measured) & (fit.in_front == views) & (views > 0)])
 
 
-def agreed_points(problem: Problem, config: TracksConfig, gate: float, backend: str = "auto") -> Agreed:
+def agreed_points(problem: Problem, config: TracksConfig, gate: float, kernels: str = "auto") -> Agreed:
     """Return where most views of each point agree that it is; where they do not, the newest third of them.
 
     Args: as of :func:`initial_points`.
     """
     rays, n = triangulation.rays_of(problem), problem.n_points
-    found = _agreed(rays, n, config, gate, backend)
+    found = _agreed(rays, n, config, gate, kernels)
     views = np.bincount(rays.point, minlength=n)
     # An id may have become another point's.
     divided = ~found.good & (views >= _DIVIDED_VIEWS)
@@ -122,7 +122,7 @@ def agreed_points(problem: Problem, config: TracksConfig, gate: float, backend: 
         return found
     rank = np.arange(len(rays.point)) - (np.cumsum(views) - views).take(rays.point)
     newest = divided.take(rays.point) & (3 * rank >= 2 * views.take(rays.point))
-    later = _agreed(rays.part(newest), n, config, gate, backend)
+    later = _agreed(rays.part(newest), n, config, gate, kernels)
     return Agreed(
         np.where(later.good[:, None], later.points, found.points),
         found.good | later.good,
@@ -130,8 +130,8 @@ def agreed_points(problem: Problem, config: TracksConfig, gate: float, backend: 
     )
 
 
-def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float, backend: str) -> Agreed:
-    found, agrees = consensus.triangulate(rays, n, gate, backend)
+def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float, kernels: str) -> Agreed:
+    found, agrees = consensus.triangulate(rays, n, gate, kernels)
     of = rays.part(agrees)
     views, support = np.bincount(rays.point, minlength=n), np.bincount(of.point, minlength=n)
     sharpness, worst = np.zeros(n), np.zeros(n)
@@ -162,11 +162,11 @@ def _median_exceeds(gate: float, errors: FloatArray) -> bool:
     return 2 * int(np.count_nonzero(SPREAD * errors > gate)) >= len(errors)
 
 
-def _fit(problem: Problem, points: FloatArray, backend: str) -> _Fit:
+def _fit(problem: Problem, points: FloatArray, kernels: str) -> _Fit:
     obs, n = problem.observations, problem.n_points
     missing: BoolArray = np.asarray(np.isnan(points).any(axis=1))
     state = dataclasses.replace(problem.start, points=np.where(missing[:, None], 0.0, points))
-    norm = native_kernels.residual_norms(problem, state, backend)
+    norm = native_kernels.residual_norms(problem, state, kernels)
     in_front = np.isfinite(norm) & ~missing[obs.point]
     norm = np.where(in_front, norm, _BEHIND)
     cost, _ = loss.evaluate("huber", norm, 1.0)

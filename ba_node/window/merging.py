@@ -48,23 +48,23 @@ class Merged(NamedTuple):
     explained: Explained | None = None
 
 
-def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
+def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
     """Put the refined poses and points of a usable, finite result into the scene and classify its observations anew."""
-    found = outcome(scene, selection, result, tracks, backend)
+    found = outcome(scene, selection, result, tracks, kernels)
     if found.state is None:
         return found
-    return found._replace(norms=apply(scene, selection, found.state, found.norms, tracks, backend))
+    return found._replace(norms=apply(scene, selection, found.state, found.norms, tracks, kernels))
 
 
-def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, backend: str = "auto") -> Merged:
+def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
     """Return what came of a result, in the scale of the map; the scene stays as it is."""
     if not result.status.usable or not result.state.is_finite():
         return Merged(selection.norms, None)
     state = scaled(selection, scene.keyframes.input_position[selection.keyframes], result.state)
-    return settled(selection, state, tracks, backend)
+    return settled(selection, state, tracks, kernels)
 
 
-def settled(selection: Selection, state: State, tracks: TracksConfig, backend: str = "auto") -> Merged:
+def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: str = "auto") -> Merged:
     """Return a solution with its points where they may be published, see ``Merged``.
 
     Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
@@ -74,20 +74,20 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, backend: s
         selection: what was solved.
         state: the solution, in the scale of the map.
         tracks: the outlier gate.
-        backend: kernels.
+        kernels: native, numpy or auto.
     """
-    explained = selection.trial(backend).explained(selection.measured, (state.rotation, state.translation))
+    explained = selection.trial(kernels).explained(selection.measured, (state.rotation, state.translation))
     found = explained.points
     if len(found):
         points, aside = state.points.copy(), selection.tried[: len(found)]
         points[aside] = np.where(np.isnan(found), points[aside], found)
         state = dataclasses.replace(state, points=points)
-    norms = native_kernels.residual_norms(selection.whole, state, backend)
-    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, backend)
+    norms = native_kernels.residual_norms(selection.whole, state, kernels)
+    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, kernels)
     return Merged(norms, state, explained)
 
 
-def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, backend: str) -> State:
+def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str) -> State:
     """Return a state whose points that ran away are back where they began; their norms are written over."""
     whole, point, n = selection.whole, selection.observations.point, selection.problem.n_points
     limit = _noticed_m(selection, state)
@@ -102,7 +102,7 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
         return state
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
     start = dataclasses.replace(state, points=whole.start.points[doubted])
-    before = native_kernels.residual_norms(views, start, backend)
+    before = native_kernels.residual_norms(views, start, kernels)
     support = np.bincount(views.observations.point[before <= gate], minlength=views.n_points)
     # A leap has to be borne out by more views than there were.
     better = support + leapt[doubted] > agreeing[doubted]
@@ -124,7 +124,7 @@ def _noticed_m(selection: Selection, state: State) -> float:
 
 
 def apply(
-    scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, backend: str = "auto"
+    scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, kernels: str = "auto"
 ) -> FloatArray:
     """Put a solution, in the scale of the map, into the scene and classify its observations anew.
 
@@ -134,7 +134,7 @@ def apply(
         state: the solution.
         norms: (n_all,) sizes of its residuals, as ``Selection.norms``; written over.
         tracks: the gates.
-        backend: kernels.
+        kernels: native, numpy or auto.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
@@ -147,7 +147,7 @@ def apply(
     scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
-    classify(scene, selection, state, norms, tracks, backend)
+    classify(scene, selection, state, norms, tracks, kernels)
     _displace(scene, selection.lost)
     _note_moving(scene, selection)
     return norms
@@ -188,7 +188,7 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
 
 
 def classify(
-    scene: Scene, selection: Selection, state: State, norm: FloatArray, tracks: TracksConfig, backend: str = "auto"
+    scene: Scene, selection: Selection, state: State, norm: FloatArray, tracks: TracksConfig, kernels: str = "auto"
 ) -> None:
     """Mark the observations to leave out next time, and note the error of each point.
 
@@ -204,7 +204,7 @@ def classify(
     gate = widened(outlier_px, norm[selection.inlier]) if outlier_px > 0 else np.inf
     outlier = norm > gate
     if outlier_px > 0:
-        _place_anew(scene, selection, whole, (norm, outlier), tracks, backend)
+        _place_anew(scene, selection, whole, (norm, outlier), tracks, kernels)
     scene.observations.outlier[selection.rows] = outlier
     if outlier_px > 0:
         worth = ~outlier * np.where(np.isfinite(obs.depth_m), 2, 1) if len(obs.depth_m) else ~outlier
@@ -213,7 +213,7 @@ def classify(
     error = norm * obs.sigma_px
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
     if outlier_px > 0:
-        note_reuse(scene, part_reused(scene, selection, whole, norm, gate, backend))
+        note_reuse(scene, part_reused(scene, selection, whole, norm, gate, kernels))
 
 
 def _place_anew(
@@ -222,7 +222,7 @@ def _place_anew(
     whole: Problem,
     classified: tuple[FloatArray, BoolArray],
     tracks: TracksConfig,
-    backend: str,
+    kernels: str,
 ) -> None:
     """Move the points that most views contradict to where more of them agree; write their norms and outliers over."""
     norm, outlier = classified
@@ -233,9 +233,9 @@ def _place_anew(
     if not len(rows):
         return
     views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
-    found = agreed_points(views, tracks, tracks.outlier_px, backend)
+    found = agreed_points(views, tracks, tracks.outlier_px, kernels)
     start = dataclasses.replace(views.start, points=found.points)
-    at = native_kernels.residual_norms(views, start, backend)
+    at = native_kernels.residual_norms(views, start, kernels)
     supports = at <= tracks.outlier_px
     better = found.good & (np.bincount(views.observations.point, supports, views.n_points) > good[doubted])
     moved = better.take(views.observations.point)

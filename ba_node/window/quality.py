@@ -41,7 +41,7 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
     return float(np.sqrt(np.mean(error * error) / 2.0)) if len(error) else 0.0
 
 
-def figures(selection: Selection, result: Result, norms: FloatArray) -> dict[str, Any]:
+def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[str, Any]:
     """Return how a solve went, by the names of a report.
 
     Args:

@@ -39,7 +39,7 @@ _WARN_SHARE = 0.05
 
 
 def part_reused(
-    scene: Scene, selection: Selection, whole: Problem, norm: FloatArray, gate: float, backend: str = "auto"
+    scene: Scene, selection: Selection, whole: Problem, norm: FloatArray, gate: float, kernels: str = "auto"
 ) -> int:
     """Give the older views of tracks whose id was used again a landmark of their own; return how many.
 
@@ -49,7 +49,7 @@ def part_reused(
         whole: its problem with all observations, at the solution.
         norm: (n_all,) sizes of the residuals.
         gate: of outliers, sigmas.
-        backend: kernels.
+        kernels: native, numpy or auto.
     """
     obs, n = whole.observations, whole.n_points
     outlier = norm > gate
@@ -61,7 +61,7 @@ def part_reused(
     cut, other = _cut(whole, rows, norm, (gate, least))
     if not len(cut):
         return 0
-    other = other[_agrees(whole, other, gate, backend).take(obs.point[other])]
+    other = other[_agrees(whole, other, gate, kernels).take(obs.point[other])]
     points = np.unique(obs.point[other])
     cut = cut[np.isin(obs.point[cut], points)]
     if not len(cut):
@@ -126,10 +126,10 @@ def _keyframes_of(track: IntArray, keyframe: IntArray, n: int) -> IntArray:
     return np.bincount(track[fresh], minlength=n)
 
 
-def _agrees(whole: Problem, rows: IntArray, gate: float, backend: str) -> BoolArray:
+def _agrees(whole: Problem, rows: IntArray, gate: float, kernels: str) -> BoolArray:
     """Return for each point whether most of some of its views agree with each other."""
     rays = triangulation.rays_of(part_of(whole, rows, np.ones(whole.n_keyframes, bool), np.ones(whole.n_points, bool)))
-    agree = consensus.agreeing(rays, whole.n_points, gate, backend)
+    agree = consensus.agreeing(rays, whole.n_points, gate, kernels)
     views = np.bincount(whole.observations.point[rows], minlength=whole.n_points)
     return np.asarray(np.bincount(rays.point, agree, whole.n_points) >= _AGREEING * views)
 

@@ -89,9 +89,9 @@ class Explained:
 class Trial:
     """Some tracks of a problem, to be tried with two sets of poses at once: each view stands in all arrays twice."""
 
-    def __init__(self, problem: Problem, tried: IntArray, n_out: int, backend: str = "auto") -> None:
+    def __init__(self, problem: Problem, tried: IntArray, n_out: int, kernels: str = "auto") -> None:
         """Take the views of the tracks ``tried`` out of a problem; the first ``n_out`` of them took no part."""
-        self._problem, self._backend = problem, backend
+        self._problem, self._kernels = problem, kernels
         self._n_cam, self._n_tried, self._n_out = len(problem.cameras.model), len(tried), n_out
         obs = problem.observations
         # Observations are sorted by point.
@@ -180,10 +180,10 @@ class Trial:
             nan,
             nan,
         )
-        found = triangulation.triangulate(seen, 2 * self._n_groups, self._backend)
+        found = triangulation.triangulate(seen, 2 * self._n_groups, self._kernels)
         state = State(rotation, translation, np.nan_to_num(found.points), np.empty((0, 3)))
         problem = Problem(state, np.zeros(len(rotation), bool), self._problem.cameras, self._obs)
-        norms = native_kernels.residual_norms(problem, state, self._backend)
+        norms = native_kernels.residual_norms(problem, state, self._kernels)
         return found.points.reshape(2, -1, 3), found.parallax_rad.reshape(2, -1), norms.reshape(2, -1)
 
 

@@ -115,7 +115,7 @@ class Recorder : public ceres::IterationCallback {
 using Arguments = std::map<std::string, std::string>;
 
 Arguments parse(int argc, char** argv) {
-  Arguments args{{"--config", "dense"}, {"--loss", "squared"},   {"--scale", "1"},
+  Arguments args{{"--config", "dense"},   {"--loss", "squared"},   {"--scale", "1"},
                  {"--iterations", "100"}, {"--tolerance", "1e-8"}, {"--threads", "1"}};
   for (int i = 1; i + 1 < argc; i += 2) args[argv[i]] = argv[i + 1];
   return args;
@@ -127,8 +127,7 @@ void build(ceres::Problem* problem, ceres::ParameterBlockOrdering* ordering, Cas
     double* point = c->points.data() + 3 * c->point[i];
     const double* uv = c->uv.data() + 2 * i;
     ceres::CostFunction* cost =
-        c->size == 9 ? static_cast<ceres::CostFunction*>(
-                           new ceres::AutoDiffCostFunction<Free, 2, 9, 3>(new Free{uv}))
+        c->size == 9 ? static_cast<ceres::CostFunction*>(new ceres::AutoDiffCostFunction<Free, 2, 9, 3>(new Free{uv}))
                      : new ceres::AutoDiffCostFunction<Calibrated, 2, 6, 3>(new Calibrated{uv, camera + 6});
     problem->AddResidualBlock(cost, loss, camera, point);
   }
@@ -164,7 +163,8 @@ void write(const Arguments& args, const Case& c, const Recorder& recorder, doubl
            const ceres::Solver::Summary& summary) {
   std::FILE* file = std::fopen(args.at("--trace").c_str(), "w");
   if (file == nullptr) throw std::runtime_error("the trace cannot be written");
-  std::fprintf(file, "{\"version\": \"%s\", \"reason\": \"%s\", \"total_s\": %.9f, \"start_mb\": %.3f, \"peak_mb\": %.3f",
+  std::fprintf(file,
+               "{\"version\": \"%s\", \"reason\": \"%s\", \"total_s\": %.9f, \"start_mb\": %.3f, \"peak_mb\": %.3f",
                CERES_VERSION_STRING, ceres::TerminationTypeToString(summary.termination_type), recorder.seconds(),
                start_mb, memory_mb("VmHWM"));
   std::fprintf(file, ", \"trace\": [");

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ba_node.core.geometry import so3_exp, so3_log
 from ba_node.io.bal import BalProblem
 from experiments.benchmarks.problem_file import Case, sorted_by_point
-from experiments.thesis.sphere import generate_sphere
+from experiments.thesis.sphere import generate_sphere, project
 from experiments.thesis.sphere_file import start_of
 from experiments.thesis.sphere_options import preset
 
@@ -101,7 +101,7 @@ def _case(
 ) -> Case:
     """Measure and disturb; fixed cameras start at their true pose."""
     camera, point = seen
-    uv = _project(cameras, points, camera, point)
+    uv = project(cameras, points, camera, point)
     uv += noise.pixel * rng.normal(size=uv.shape)
     wrong = rng.random(len(uv)) < noise.outliers
     uv[wrong] += rng.uniform(-20.0, 20.0, (int(wrong.sum()), 2))
@@ -121,15 +121,6 @@ def _case(
 def _cameras(rotation: FloatArray, centre: FloatArray, intrinsics: FloatArray) -> FloatArray:
     translation = -(rotation @ centre[:, :, None])[..., 0]
     return np.hstack([so3_log(rotation), translation, intrinsics])
-
-
-def _project(cameras: FloatArray, points: FloatArray, camera: IntArray, point: IntArray) -> FloatArray:
-    x = (so3_exp(cameras[:, :3])[camera] @ points[point][:, :, None])[..., 0] + cameras[camera, 3:6]
-    p = -x[:, :2] / x[:, 2:]
-    s = np.sum(p * p, axis=1)
-    f, k1, k2 = cameras[camera, 6:].T
-    uv: FloatArray = (f * (1.0 + s * (k1 + s * k2)))[:, None] * p
-    return uv
 
 
 def _looking(direction: FloatArray) -> FloatArray:

@@ -30,7 +30,7 @@ _WORDS = (
 
 
 @dataclass(frozen=True)
-class SessionError:
+class SessionResult:
     """The error of one session's trajectory, before and after.
 
     Attributes:
@@ -58,7 +58,7 @@ class SessionError:
         )
 
 
-def session_errors(out: Path, truth: Poses) -> list[SessionError]:
+def session_results(out: Path, truth: Poses) -> list[SessionResult]:
     """Return the errors of every session that a replay wrote, that of the newest first.
 
     Args:
@@ -71,7 +71,7 @@ def session_errors(out: Path, truth: Poses) -> list[SessionError]:
     return [_session(path.parent, truth) for path in sorted(out.rglob("trajectory.tum"), key=_place)]
 
 
-def said(report: Mapping[str, Any]) -> str:
+def messages_of(report: Mapping[str, Any]) -> str:
     """Return all words in report.json that are meant for a user, one text a line."""
     lines: list[str] = []
     for part in (*report.get("older_sessions", ()), report):
@@ -88,9 +88,9 @@ def _place(path: Path) -> tuple[int, str]:
     return len(path.parts), path.parent.name
 
 
-def _session(folder: Path, truth: Poses) -> SessionError:
+def _session(folder: Path, truth: Poses) -> SessionResult:
     before, after = (read_tum(folder / f"{name}.tum") for name in ("trajectory_input", "trajectory"))
-    return SessionError(
+    return SessionResult(
         folder,
         len(after),
         _translation_m(before, truth),

@@ -74,7 +74,7 @@ def _about(text: str, rows: Sequence[Row]) -> str:
 
 def _summary(rows: Sequence[Row]) -> str:
     wrong = [row for row in rows if row["fault"] != SOUND]
-    asked = [row for row in wrong if FAULTS[row["fault"]].told]
+    asked = [row for row in wrong if FAULTS[row["fault"]].named]
     sound = [row for row in rows if row["fault"] == SOUND]
     harmless = sum(row["verdict"] not in ("crash", "harm") for row in wrong)
     return (
@@ -90,7 +90,7 @@ def fault_table(rows: Sequence[Row]) -> str:
     for name in (SOUND, *FAULTS):
         for (rig, amount), cell in grouped(rows, name).items():
             named = f"{sum(row['told'] for row in cell)} of {len(cell)}"
-            asked = name == SOUND or FAULTS[name].told
+            asked = name == SOUND or FAULTS[name].named
             about = "none" if name == SOUND else FAULTS[name].about
             verdict = min((row["verdict"] for row in cell), key=_VERDICTS.index)
             shown = verdict if verdict not in ("crash", "harm") else f"**{verdict}**"

@@ -20,7 +20,7 @@ from ba_node.config import Config
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from experiments.robustness.faults import FAULTS, RIGS, SOUND, Recording, spoiled, without_outliers
-from experiments.robustness.harm import SessionError, said, session_errors
+from experiments.robustness.harm import SessionResult, messages_of, session_results
 
 Row = dict[str, Any]
 
@@ -42,7 +42,7 @@ _DRIVE = {
 # An observation farther from the truth than so many sigma is an outlier.
 _OUTLIER_SIGMA = 6.0
 _NOISE_PX = 0.5
-_NOTHING_SAID = r"\A\s*\Z"
+_NO_MESSAGE = r"\A\s*\Z"
 
 
 class NameChoiceError(ValueError):
@@ -154,7 +154,7 @@ def run(task: Task) -> Row:
 
 @dataclass(frozen=True)
 class _Outcome:
-    errors: list[SessionError]
+    errors: list[SessionResult]
     words: str
     refused: bool
     crashed: bool = False
@@ -172,21 +172,21 @@ def _replayed(recording: Recording) -> _Outcome:
             return _Outcome([], f"{type(error).__name__}: {error}", not crashed, crashed)
         except Exception as error:  # a table of faults has a row for this one too
             return _Outcome([], f"{type(error).__name__}: {error}", False, crashed=True)
-        errors = session_errors(out, recording.truth)
+        errors = session_results(out, recording.truth)
         shutil.rmtree(out)
-        return _Outcome(errors, said(report), False)
+        return _Outcome(errors, messages_of(report), False)
 
 
 def _fault(task: Task, recording: Recording) -> Row:
     fault, outcome = FAULTS.get(task.fault), _replayed(recording)
-    told = (_NOTHING_SAID,) if fault is None else fault.told
+    named = (_NO_MESSAGE,) if fault is None else fault.named
     share = sum(error.keyframes for error in outcome.errors) / len(recording.keyframes)
     enough = share >= (1.0 if fault is None else fault.least)
     return {
         **_figures(outcome.errors),
         "published_share": share,
         "verdict": _verdict(outcome, enough),
-        "told": all(re.search(pattern, outcome.words, re.IGNORECASE) for pattern in told),
+        "told": all(re.search(pattern, outcome.words, re.IGNORECASE) for pattern in named),
         "words": outcome.words[:300],
     }
 
@@ -202,7 +202,7 @@ def _verdict(outcome: _Outcome, enough: bool) -> str:
     return "better" if better else "kept"
 
 
-def _figures(errors: Sequence[SessionError]) -> Row:
+def _figures(errors: Sequence[SessionResult]) -> Row:
     """Return the errors of all sessions together; the rotation is that of the worst."""
     if not errors:
         return dict.fromkeys(("input_m", "published_m", "input_deg", "published_deg"))

@@ -10,9 +10,9 @@ from typing import Any
 
 from ba_node.io.bal import BalProblem, write_bal
 from experiments.thesis.sphere import SphereData, generate_sphere
-from experiments.thesis.sphere_options import PRESETS, SphereOptions, preset, sphere_declarations
+from experiments.thesis.sphere_options import PRESETS, SphereOptions, preset
 
-__all__ = ["PRESETS", "make", "sphere_declarations", "start_of", "truth_of", "truth_path", "write_sphere"]
+__all__ = ["PRESETS", "SphereOptions", "make", "start_of", "truth_of", "truth_path", "write_sphere"]
 
 
 def start_of(data: SphereData) -> BalProblem:

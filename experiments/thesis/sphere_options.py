@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from ba_node.config import Checked, ConfigError, Parameter, declared, option
+from ba_node.config import Checked, ConfigError, option
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,6 @@ class SphereOptions(Checked):
                 f"observations = {self.observations}: {self.points} points seen in two images each need"
                 f" {2 * self.points}; raise it, or 0 for all that is visible"
             )
-
-
-def sphere_declarations() -> tuple[Parameter, ...]:
-    """Return every option, in the order of the class."""
-    return declared(SphereOptions, live=False)
 
 
 def _size(images: int, points: int, observations: int, outlier_share: float = 0.02) -> SphereOptions:

@@ -123,7 +123,7 @@ def test_there_is_one_map_for_each_real_session(drawn: tuple[list[Measurement], 
         known, scene = len(backend.scene.keyframes), backend.scene
         backend.add(measurement)
         assert backend.scene is not scene or len(scene.keyframes) >= known
-        assert len(backend.scene.pending) + len(backend._sessions.state.ahead) <= 2 * 60
+        assert len(backend.scene.pending) + len(backend._sessions.state.waiting) <= 2 * 60
     backend.flush(final=True)
     assert backend.held == []
     found = [len(estimate.trajectory) for _, estimate in backend.finished] + [len(backend.scene.keyframes)]

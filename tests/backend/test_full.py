@@ -20,10 +20,11 @@ from ba_node.core import geometry, solver
 from ba_node.core.result import Iteration, Status
 from ba_node.evaluation.alignment import align
 from ba_node.measurements import CameraRig, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from ba_node.synthetic import SyntheticData, SyntheticOptions
 from ba_node.window import full
 from ba_node.window.merging import scaled
 from ba_node.window.problems import some_observations
+from tests.generated import generated
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,7 +40,7 @@ def recording(**options: Any) -> SyntheticData:
         "keyframes": 30, "landmarks": 2500, "tracks": 120, "length_m": 30.0, "ids": "random64",
         "drift_rotation_deg": 1.0,
     }  # fmt: skip
-    return generate(SyntheticOptions(**{**base, **options}))
+    return generated(SyntheticOptions(**{**base, **options}))
 
 
 def feed(backend: Backend, stream: Iterable[Measurement], flush: bool = True) -> None:
@@ -274,7 +275,7 @@ def test_a_solve_is_stopped_after_an_iteration() -> None:
 
     taken.solve(CONFIG.solver, "lma_cd", 30, on_iteration=watch)
     assert seen == [0, 1, 2]
-    assert taken.status is Status.MAX_ITERATIONS
+    assert taken.result.status is Status.MAX_ITERATIONS
     assert taken.result.method == "lma_cd"
 
 

@@ -15,13 +15,14 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.synthetic import SyntheticOptions
+from tests.generated import generated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-    from pathlib import Path
+
+    from tests.conftest import Case
 
 KINDS: dict[str, dict[str, Any]] = {
     "stereo": {},
@@ -40,7 +41,7 @@ Stream = list[Measurement]
 
 def recording(**options: Any) -> tuple[Stream, Poses]:
     base: dict[str, Any] = {"keyframes": 40, "landmarks": 3000, "tracks": 150, "length_m": 35.0}
-    data = generate(SyntheticOptions(**{**base, **options}))
+    data = generated(SyntheticOptions(**{**base, **options}))
     return [measurement for _, _, measurement in data.timeline()], data.truth
 
 
@@ -303,10 +304,9 @@ def test_a_held_solve_leaves_the_map_as_it_was() -> None:
     np.testing.assert_allclose(steps[0], given, atol=1e-9)
 
 
-def test_a_point_that_ran_away_goes_back(shared_data: Path) -> None:
+def test_a_point_that_ran_away_goes_back(case: Callable[[str], Case]) -> None:
     """A public model at its optimum: the largest residual of its 509 points is 4 px."""
-    with BagReader(shared_data.parent / "cases" / "optimal_map_runaway_point.mcap") as bag:
-        stream = [measurement for _, _, measurement in bag.measurements()]
+    stream = case("optimal_map_runaway_point").measurements
     backend = Backend(ALONE)
     cloud = replay(backend, stream)[-1].cloud
     given = {
@@ -321,10 +321,9 @@ def test_a_point_that_ran_away_goes_back(shared_data: Path) -> None:
     assert backend.map.rms_px("refined") <= 0.94
 
 
-def test_what_hardly_moves_is_left_as_it_came(shared_data: Path) -> None:
+def test_what_hardly_moves_is_left_as_it_came(case: Callable[[str], Case]) -> None:
     """One camera, five images 1 mm apart at 6 m: they tell no distance."""
-    with BagReader(shared_data.parent / "cases" / "mono_hardly_moves.mcap") as bag:
-        stream = [measurement for _, _, measurement in bag.measurements()]
+    stream = case("mono_hardly_moves").measurements
     backend = Backend(ALONE)
     last = replay(backend, stream)[-1]
     inputs = np.array([one.position for one in stream if isinstance(one, Keyframe)])
@@ -356,16 +355,11 @@ def test_a_solve_of_everything_is_judged_too(kind: str) -> None:
     "name",
     ["stereo_baseline_sign", "extrinsics_inverted", "depth_in_mm", "extrinsics_1_degree"],
 )
-def test_recordings_gone_wrong(name: str, shared_data: Path) -> None:
-    with BagReader(shared_data.parent / "cases" / f"{name}.mcap") as bag:
-        stream = [measurement for _, _, measurement in bag.measurements()]
-    rows = np.loadtxt(shared_data.parent / "cases" / f"{name}.truth.tum")
-    inputs = [one for one in stream if isinstance(one, Keyframe)]
-    stamps = np.array([one.stamp_ns for one in inputs], np.int64)
-    ids = np.array([one.keyframe_id for one in inputs], np.uint64)
-    truth = Poses(ids, stamps, rows[:, 1:4], rows[:, 4:])
+def test_recordings_gone_wrong(name: str, case: Callable[[str], Case]) -> None:
+    given = case(name)
+    stream = given.measurements
     backend = Backend(ALONE)
-    before, after = errors(stream, truth, replay(backend, stream)[-1])
+    before, after = errors(stream, given.truth, replay(backend, stream)[-1])
     assert after <= 1.1 * before, f"{before:.4f} -> {after:.4f} m"
     # The front-end's steps hold one camera that stands still: that is no cause to hold anything back.
     assert ("held" in backend.scene.log.warnings) == (name != "mono_stands_still")

@@ -15,7 +15,7 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.estimate import Poses
-from experiments.robustness.harm import SessionError, said, session_errors
+from experiments.robustness.harm import SessionResult, messages_of, session_results
 
 Replay = Callable[..., "Outcome"]
 
@@ -36,12 +36,12 @@ class Outcome:
     words: str
     report: dict[str, Any]
 
-    def errors(self, truth: Poses) -> list[SessionError]:
+    def errors(self, truth: Poses) -> list[SessionResult]:
         """Return the errors of every session."""
-        return session_errors(self.out, truth)
+        return session_results(self.out, truth)
 
     def tells(self, *patterns: str) -> None:
-        """Assert that each pattern is found in what a user is told."""
+        """Assert that each pattern is found in the messages to the user."""
         for pattern in patterns:
             assert re.search(pattern, self.words, re.IGNORECASE), f"{pattern!r} is not in:\n{self.words or 'nothing'}"
 
@@ -58,12 +58,12 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Replay:
         path = out / "report.json"
         report: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
         lines = [line for line in stderr.splitlines() if line.startswith("ba:")]
-        return Outcome(out, code, "\n".join([*lines, said(report) if report else ""]).strip(), report)
+        return Outcome(out, code, "\n".join([*lines, messages_of(report) if report else ""]).strip(), report)
 
     return replay
 
 
-def harmless(errors: list[SessionError], least: float, keyframes: int) -> None:
+def harmless(errors: list[SessionResult], least: float, keyframes: int) -> None:
     """Assert that no session became worse, and that enough keyframes were published."""
     published = sum(error.keyframes for error in errors)
     assert published >= least * keyframes, f"{published} of {keyframes} keyframes published"

@@ -52,7 +52,7 @@ def test_no_harm_and_the_cause_is_named(
     assert outcome.code in fault.codes, f"exit code {outcome.code}: {outcome.words}"
     if outcome.report:
         harmless(outcome.errors(recording.truth), fault.least, len(recording.keyframes))
-    outcome.tells(*fault.told)
+    outcome.tells(*fault.named)
 
 
 @pytest.mark.parametrize("name", ["camera_turned", "depth_in_mm", "extrinsics_inverted"])
@@ -61,4 +61,4 @@ def test_odometry_that_is_better_than_the_tracks_is_kept(name: str, tmp_path: Pa
     outcome = run(write(tmp_path, recording))
     assert outcome.code in FAULTS[name].codes
     harmless(outcome.errors(recording.truth), 1.0, 60)
-    outcome.tells(*FAULTS[name].told)
+    outcome.tells(*FAULTS[name].named)

@@ -16,7 +16,8 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.measurements import FeatureTracks
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from ba_node.synthetic import SyntheticData, SyntheticOptions
+from tests.generated import generated
 
 FloatArray = NDArray[np.float64]
 Wrong = Callable[[SyntheticData], SyntheticData]
@@ -32,7 +33,7 @@ def recording(seed: int = 3, wrong: str = "", mode: str = "stereo", **options: A
     if wrong == "not rectified":
         options["distortion"] = "plumb_bob"
     chosen = {"baseline_m": 0.12 if mode == "stereo" else 0.0, "length_m": length, **depth, **options}
-    data = generate(SyntheticOptions(seed=seed, **chosen))
+    data = generated(SyntheticOptions(seed=seed, **chosen))
     return WRONG[wrong](data) if wrong else data
 
 

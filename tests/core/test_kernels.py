@@ -168,10 +168,10 @@ def test_native_knows_once_where_inner_iterations_ended(make_problem: Make) -> N
     kernels = native_kernels.make(make_problem()[0], SolverOptions(kernels="native"))
     assert isinstance(kernels, native_kernels.NativeKernels)
     iterated = kernels.iterate_points(make_problem()[0].start, 2)[1]
-    assert kernels._kernel.linearise_polished()
-    assert not kernels._kernel.linearise_polished()
+    assert kernels._kernel.linearise_prepared()
+    assert not kernels._kernel.linearise_prepared()
     kernels.linearise(iterated)
-    assert not kernels._kernel.linearise_polished()
+    assert not kernels._kernel.linearise_prepared()
 
 
 @built

@@ -11,6 +11,7 @@ from ba_node.config import Config, DiagnosticsConfig
 from ba_node.estimate import SolveReport, Status
 from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.messages.diagnostics import Finding, Health, Level, diagnose, diagnostics_message
+from ba_node.messages.report import LatencyReport, Report
 
 GOOD = SolveReport(
     status=Status.CONVERGED,
@@ -19,7 +20,6 @@ GOOD = SolveReport(
     observations=900,
     outliers=100,
     keyframes=20,
-    latency_p95_s=0.02,
     rejected={"bad_pose": 2},
 )
 HEALTHY = Health(
@@ -27,17 +27,17 @@ HEALTHY = Health(
     publishers={"/car/keyframes": 1, "/car/feature_tracks": 1},
     silence_s=0.1,
     inbox_size=500,
-    report=GOOD,
+    report=Report(GOOD, latency=LatencyReport(latency_p95_s=0.02)),
     tf="map -> odom",
     memory_mb=200.0,
 )
 
 
 def findings(**changes: Any) -> dict[str, Finding]:
-    report = {name: changes.pop(name) for name in list(changes) if name in SolveReport.__dataclass_fields__}
-    health = dataclasses.replace(HEALTHY, **changes)
-    if report:
-        health = dataclasses.replace(health, report=dataclasses.replace(GOOD, **report))
+    solve = {name: changes.pop(name) for name in list(changes) if name in SolveReport.__dataclass_fields__}
+    latency = LatencyReport(latency_p95_s=changes.pop("latency_p95_s", 0.02))
+    report = Report(dataclasses.replace(GOOD, **solve), latency=latency)
+    health = dataclasses.replace(HEALTHY, **({"report": report} | changes))
     return {finding.subject: finding for finding in diagnose(health, Config())}
 
 
@@ -74,7 +74,7 @@ def test_all_is_well() -> None:
         ({"report": None}, "solver", Level.OK, "no solve yet"),
         ({"rms_px_after": 3.0}, "solver", Level.WARN, "rms 3.0 px"),
         ({"rms_px_after": 30.0}, "solver", Level.ERROR, "rms 30.0 px"),
-        ({"outliers": 900}, "solver", Level.WARN, "only 50 % of the observations"),
+        ({"outliers": 900}, "solver", Level.WARN, "only 50 % of the observations are inliers"),
         ({"outliers": 9000}, "solver", Level.ERROR, "only 9 % of the observations"),
         ({"latency_p95_s": 0.5}, "latency", Level.WARN, "95 % within 500 ms"),
         ({"latency_p95_s": 5.0}, "latency", Level.ERROR, "95 % within 5000 ms"),

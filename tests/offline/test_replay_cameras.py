@@ -22,7 +22,6 @@ from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
 
 F = ROSBAGS_FACTORY
-CASE = Path(__file__).resolve().parents[2].parent / "shared" / "cases" / "camera_info_roi.mcap"
 
 
 def record_with(path: Path, change: Callable[[Any], None], lone: bool = False, **options: Any) -> Path:
@@ -76,15 +75,6 @@ def test_region_and_binning_give_the_same_map(tmp_path: Path) -> None:
     assert plain["trajectory_error_m"]["refined"] < 0.5 * plain["trajectory_error_m"]["input"]
     assert part["notices"] == {**plain["notices"], "adjusted_camera": 2}
     assert part["attention"] == []
-
-
-@pytest.mark.skipif(not CASE.exists(), reason="the cases of ../shared are not here")
-def test_the_case_of_a_region(tmp_path: Path) -> None:
-    report = replay(CASE, tmp_path, Config())
-    assert report["rms_px"]["refined"] < 0.12
-    assert report["median_px"]["refined"] < 0.12
-    assert report["attention"] == []
-    assert report["notices"]["adjusted_camera"] == 2
 
 
 def wrong(**fields: Any) -> Callable[[Any], None]:

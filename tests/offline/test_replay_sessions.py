@@ -15,14 +15,12 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.config import Config
-from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
 
-CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
 S = 1_000_000_000
 HOUR = 3600 * S
 Timeline = list[tuple[str, int, Measurement]]
@@ -41,38 +39,6 @@ def restamped(rows: Iterable[tuple[str, int, Measurement]], begin: int, shift_ns
         else (topic, time_ns, m)
         for topic, time_ns, m in rows
     ]
-
-
-def case(name: str) -> Path:
-    path = CASES / f"{name}.mcap"
-    if not path.is_file():
-        pytest.skip("needs the recordings in ../shared/cases, which are not part of the repository")
-    return path
-
-
-def error_m(trajectory: Path, truth: Path) -> float:
-    return absolute_error(read_tum(trajectory), read_tum(truth)).translation.rmse
-
-
-def test_case_clock_set_back(tmp_path: Path) -> None:
-    bag = case("clock_set_back")
-    report = replay(bag, tmp_path, Config())
-    assert [entry["folder"] for entry in report["older_sessions"]] == ["session_0"]
-    for folder in (tmp_path, tmp_path / "session_0"):
-        assert len(read_tum(folder / "trajectory.tum")) == 20
-        assert error_m(folder / "trajectory.tum", bag.with_name("clock_set_back.truth.tum")) < 0.01, folder
-    assert report["rejected"] == report["older_sessions"][0]["rejected"] == {}
-    assert any("keyframe 20 is 3599.9 s older" in line for line in report["attention"])
-
-
-def test_case_one_stamp_zero(tmp_path: Path) -> None:
-    bag = case("one_stamp_zero")
-    report = replay(bag, tmp_path, Config())
-    assert report["older_sessions"] == []
-    assert report["keyframes"] == report["keyframes_refined"] == 39
-    assert report["rejected"] == {"bad_stamp": 1, "unknown_keyframe": 2}
-    assert any(line.startswith("keyframe 17 is") for line in report["attention"])
-    assert error_m(tmp_path / "trajectory.tum", bag.with_name("one_stamp_zero.truth.tum")) < 0.02
 
 
 def test_sessions_with_the_same_id_do_not_share_a_folder(tmp_path: Path) -> None:

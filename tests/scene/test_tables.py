@@ -2,23 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.scene.tables import Column, IdArray, IdIndex, Table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from ba_node.scene.tables import FloatArray, IdArray, IdIndex, Table, column
 
 ids_near_the_ends = st.integers(0, 3) | st.integers(2**63 - 2, 2**63 + 2) | st.integers(2**64 - 4, 2**64 - 1)
 
 
 class Pairs(Table):
-    COLUMNS: ClassVar[Mapping[str, Column]] = {"number": Column(np.uint64), "xy": Column(np.float64, (2,), np.nan)}
-    number: IdArray
+    number: IdArray = column(np.uint64)
+    xy: FloatArray = column(np.float64, (2,), np.nan)
 
 
 def test_rows_keep_their_values_through_growth_and_forgetting() -> None:
@@ -34,7 +29,7 @@ def test_rows_keep_their_values_through_growth_and_forgetting() -> None:
     assert renumbered[3] == 1
     assert renumbered[4] == -1
     table.append(1)
-    assert np.isnan(table._buffers["xy"][len(table) - 1]).all()
+    assert np.isnan(table.xy[-1]).all()
 
 
 @given(st.lists(ids_near_the_ends, unique=True), st.lists(ids_near_the_ends), st.integers(0, 8))

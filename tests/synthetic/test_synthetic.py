@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ba_node.config import ConfigError
+from ba_node.config import ConfigError, declared
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.synthetic import SyntheticData, SyntheticOptions, declarations, generate
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 FloatArray = NDArray[np.float64]
 
@@ -296,7 +296,7 @@ def test_options_out_of_range_are_refused_by_name(changes: dict[str, object], na
 
 
 def test_every_option_is_declared_with_its_default_in_range() -> None:
-    for parameter in declarations():
+    for parameter in declared(SyntheticOptions):
         assert parameter.check(parameter.default) == parameter.default
         assert parameter.doc.endswith(".")
     assert dataclasses.replace(SMALL, length_m=40).length_m == 40.0

@@ -34,12 +34,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ba_node.config import Config
-    from ba_node.estimate import Estimate, SolveReport
+    from ba_node.estimate import Estimate
     from ba_node.measurements import CameraRig
+    from ba_node.messages.report import Report
     from ba_node.messages.topics import Topic
     from ba_node.ros.rclpy_compat.deferred import Relay
     from ba_node.ros.worker.inbox import Inbox
-    from ba_node.ros.worker.worker import Account, Notice, Worker
+    from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 
 @dataclass
@@ -62,7 +63,7 @@ class Host:
         clock: what is wrong with simulated time, in words; empty if nothing is.
         at_cleanup: what is undone when the node is cleaned up, last made first.
         after_cleanup: what is undone a moment later: who was answered at cleanup must still hear it.
-        report: of the last solve, with its latency; None before the first.
+        report: the last one, with its latency; None before the first.
     """
 
     node: Any
@@ -78,16 +79,13 @@ class Host:
     place_cameras: Callable[[CameraRig], CameraRig | None] = lambda rig: rig
     tf: str = ""
     clock: str = ""
-    report: SolveReport | None = None
+    report: Report | None = None
     at_cleanup: ExitStack = field(default_factory=ExitStack)
     after_cleanup: ExitStack = field(default_factory=ExitStack)
 
 
 class Component:
     """A part of the node. Made when the node is configured; derived classes override what concerns them."""
-
-    def take_account(self, account: Account) -> None:
-        """Take a report on what was turned away, when no solve tells it."""
 
     def __init__(self, host: Host) -> None:
         """Make the entities. An exception refuses the configuration and destroys those made so far."""
@@ -102,8 +100,11 @@ class Component:
     def reconfigure(self, before: Config) -> None:
         """Follow a change of parameters: ``host.config`` is new already. The back-end is told by the node."""
 
+    def take_report(self, outcome: Outcome) -> None:
+        """Take what the worker reports, of every solve and on what was turned away; only while active."""
+
     def take(self, estimate: Estimate, newest: bool) -> None:
-        """Take an estimate as it leaves the worker, oldest first; only while active.
+        """Take an estimate as it leaves the worker, after the report on it, oldest first; only while active.
 
         Args:
             estimate: of every solve, failed and skipped ones too (``estimate.report.status.usable``).

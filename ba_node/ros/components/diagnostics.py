@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from collections import Counter, deque
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
 
@@ -18,9 +16,6 @@ from ba_node.messages.topics import DIAGNOSTICS, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
-
-if TYPE_CHECKING:
-    pass
 
 _PERIOD_S = 1.0
 # Rates are those of so many seconds.
@@ -67,7 +62,7 @@ class Diagnostics(Component):
             inbox_size=host.config.node.inbox_size,
             # Counts of a session begin anew with it: what has become less is nothing that was lost.
             recent={name: count for name, count in (self._all_lost() - lost_before).items() if name not in _NO_FAULT},
-            report=host.report and dataclasses.replace(host.report, rejected={**host.report.rejected, **host.counted}),
+            report=host.report and host.report.counting(host.counted),
             tf=host.tf,
             memory_mb=_resident_mb(),
             clock=host.clock,
@@ -79,8 +74,8 @@ class Diagnostics(Component):
         report = self.host.report
         lost = Counter(self.host.counted)
         if report is not None:
-            lost.update(report.rejected)
-            lost["coalesced"] = report.coalesced
+            lost = Counter(report.counting(self.host.counted).rejected)
+            lost["coalesced"] = report.queue.coalesced
         lost["dropped"] = self.host.inbox.dropped
         return lost
 

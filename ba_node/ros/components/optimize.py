@@ -164,7 +164,7 @@ class Optimize(Component):
 
         choices = (self.host.config.solver, request.method, request.max_iterations)
         taken.solve(*choices, clock=time.perf_counter, on_iteration=watch)
-        if out_of_time and taken.status is Status.MAX_ITERATIONS:
+        if out_of_time and taken.result.status is Status.MAX_ITERATIONS:
             return taken.with_result(reason=f"stopped after {request.time_budget_s:g} s")
         return taken
 
@@ -173,13 +173,13 @@ class Optimize(Component):
         with goal.owed.at_work():
             merged = None if goal.stop or goal.owed.given else backend.merge(taken)
             if merged is None:
-                lost = taken.status.usable
-                reason = (goal.stop or backend.refusal or _GONE) if lost else taken.reason
+                lost = taken.result.status.usable
+                reason = (goal.stop or backend.refusal or _GONE) if lost else taken.result.reason
                 held = lost and not goal.stop and backend.refusal
-                goal.end(Status.HELD if held else Status.SKIPPED if lost else taken.status, reason)
+                goal.end(Status.HELD if held else Status.SKIPPED if lost else taken.result.status, reason)
                 return None
             estimate, goal.result["followed_keyframes"] = merged
-            goal.end(taken.status, taken.reason)
+            goal.end(taken.result.status, taken.result.reason)
             return estimate
 
     def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:

@@ -4,14 +4,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from ba_node.estimate import SolveReport, Status
-from ba_node.messages.outputs import output_messages, report_message
+from ba_node.estimate import Status
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.report import LatencyReport, Report, report_message
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS
-from ba_node.ros.components.activity import Activity
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, log
@@ -20,13 +20,47 @@ from ba_node.ros.worker.latency import Sliding
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate
-    from ba_node.ros.worker.worker import Account
+    from ba_node.ros.worker.worker import Outcome
 
 _LOG_PERIOD_S = 5.0
 # Leave first; their age is in the report that follows.
 _POSES = {"refined_keyframes", "pose"}
-# Of a report, what is known on this thread alone.
-_TIMES = [f"{which}latency_{part}_s" for which in ("", "stamp_") for part in ("p50", "p95", "max")]
+
+_WORDS = {Status.HELD: "held", Status.FAILED: "failed", Status.SKIPPED: "skipped"}
+
+
+class Activity:
+    """Say in one line every few seconds how it goes: rate, residuals, latency, and what became of the solutions."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._since_s: float | None = None
+        self._counts: Counter[str] = Counter()
+
+    def line(self, report: Report, now_s: float, period_s: float) -> str:
+        """Take in the report of a solve; return the line if one is due, else an empty text.
+
+        Args:
+            report: with latencies.
+            now_s: by a clock that does not jump, s.
+            period_s: time between two lines; 0 for none.
+        """
+        if self._since_s is None:
+            self._since_s = now_s
+        self._counts[_WORDS.get(report.solve.status, "taken")] += 1
+        elapsed_s = now_s - self._since_s
+        if period_s <= 0.0 or elapsed_s < period_s:
+            return ""
+        count = sum(self._counts.values())
+        verdict = ", ".join(
+            f"{self._counts[word]} {word}" for word in ("taken", *_WORDS.values()) if self._counts[word]
+        )
+        self._since_s, self._counts = now_s, Counter()
+        return (
+            f"{count / elapsed_s:.1f} solves/s, {verdict}; rms {report.solve.rms_px_after:.2f} px,"
+            f" {100 * report.solve.inlier_share:.0f} % agree, latency {1e3 * report.latency.latency_p50_s:.0f} ms"
+            f" (95 %: {1e3 * report.latency.latency_p95_s:.0f} ms)"
+        )
 
 
 class Publishing(Component):
@@ -41,7 +75,7 @@ class Publishing(Component):
         super().__init__(host)
         self._factory = RclpyFactory()
         self._throttle, self._activity = Throttle(_LOG_PERIOD_S), Activity()
-        self._latency, self._stamp_latency = Sliding(), Sliding()
+        self._ages, self._latency = (Sliding(), Sliding()), LatencyReport()
         # The estimate that latched topics are to show, and those of them that do not show it yet.
         self._latest: Estimate | None = None
         self._behind: set[str] = set()
@@ -50,29 +84,26 @@ class Publishing(Component):
             matched = self._catch_up if topic in LATCHED_OUTPUTS else None
             self._outputs[topic] = self.publisher(TOPICS[topic], matched=matched)
 
+    def take_report(self, outcome: Outcome) -> None:
+        """Publish the poses of a solve, and the report, which says how old they were then."""
+        if outcome.estimate is not None:
+            self._publish(outcome.estimate, self._heard() & _POSES)
+            self._measure(outcome)
+        report = Report(outcome.report, outcome.queue, self._latency).counting(self.host.counted)
+        self.host.report = report
+        if "report" in self._heard():
+            frame_id = self.host.config.frames.map_frame if outcome.estimate is None else outcome.estimate.frame_id
+            message = report_message(self._factory, report, outcome.stamp_ns, frame_id)
+            self._outputs["report"].publish(message)
+        if outcome.estimate is not None:
+            self._log_report(report)
+
     def take(self, estimate: Estimate, newest: bool) -> None:
-        """Publish an estimate."""
-        wanted = self._heard()
+        """Publish the map."""
         if newest:
             self._latest = estimate
-            self._behind = set(LATCHED_OUTPUTS) - wanted
-        else:
-            wanted.difference_update(LATCHED_OUTPUTS)
-        self._publish(estimate, wanted & _POSES)
-        report = self.host.report = self._timed(estimate)
-        told = dataclasses.replace(report, rejected={**report.rejected, **self.host.counted})
-        self._publish(dataclasses.replace(estimate, report=told), wanted - _POSES)
-        self._log_report(report)
-
-    def take_account(self, account: Account) -> None:
-        """Publish a report without a solve: with the times of the last one."""
-        known = self.host.report
-        times = {} if known is None else {name: getattr(known, name) for name in _TIMES}
-        report = self.host.report = dataclasses.replace(account.report, **times)
-        if "report" in self._heard():
-            told = dataclasses.replace(report, rejected={**report.rejected, **self.host.counted})
-            frame = self.host.config.frames.map_frame
-            self._outputs["report"].publish(report_message(self._factory, told, account.stamp_ns, frame))
+            self._behind = set(LATCHED_OUTPUTS) - self._heard()
+            self._publish(estimate, self._heard().intersection(LATCHED_OUTPUTS))
 
     def _heard(self) -> set[str]:
         return {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
@@ -85,34 +116,23 @@ class Publishing(Component):
             self._publish(self._latest, wanted)
 
     def _publish(self, estimate: Estimate, wanted: set[str]) -> None:
+        if not wanted:
+            return
         for topic, _, message in output_messages(self._factory, estimate, self.host.config.output, wanted):
             self._outputs[topic].publish(message)
 
-    def _timed(self, estimate: Estimate) -> SolveReport:
-        """Return the report with what only this thread knows: how old the poses are that have just left."""
-        age_ns = self.host.node.get_clock().now().nanoseconds - estimate.stamp_ns
-        now_s = time.monotonic()
-        latency = self._latency.add(now_s - (estimate.arrived_s or now_s))
-        stamp_latency = self._stamp_latency.add(1e-9 * age_ns)
-        return dataclasses.replace(
-            estimate.report,
-            latency_p50_s=latency.p50,
-            latency_p95_s=latency.p95,
-            latency_max_s=latency.largest,
-            stamp_latency_p50_s=stamp_latency.p50,
-            stamp_latency_p95_s=stamp_latency.p95,
-            stamp_latency_max_s=stamp_latency.largest,
-        )
+    def _measure(self, outcome: Outcome) -> None:
+        """Note how old the poses are that have just left."""
+        arrival, stamp = self._ages
+        age_ns = self.host.node.get_clock().now().nanoseconds - outcome.stamp_ns
+        self._latency = LatencyReport(*arrival.add(time.monotonic() - outcome.arrived_s), *stamp.add(1e-9 * age_ns))
 
-    def _log_report(self, report: SolveReport) -> None:
+    def _log_report(self, report: Report) -> None:
         """Say how it goes, and why a solve gave nothing: that the first keyframes are not enough is no warning."""
-        if (
-            report.solve_count
-            and not report.status.usable
-            and self._throttle.passes(report.status.name, time.monotonic())
-        ):
-            text = f"keyframe {report.newest_keyframe_id} was not refined: {report.reason}"
-            log(self.host.node, Severity.INFO if report.status is Status.SKIPPED else Severity.WARNING, text)
-        line = self._activity.line(report, time.monotonic(), self.host.config.node.log_period_s)
+        solve, now_s = report.solve, time.monotonic()
+        if solve.solve_count and not solve.status.usable and self._throttle.passes(solve.status.name, now_s):
+            text = f"keyframe {solve.newest_keyframe_id} was not refined: {solve.reason}"
+            log(self.host.node, Severity.INFO if solve.status is Status.SKIPPED else Severity.WARNING, text)
+        line = self._activity.line(report, now_s, self.host.config.node.log_period_s)
         if line:
             log(self.host.node, Severity.INFO, line)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Key = tuple[int, int]
 
 
-class Ledger:
+class KeyframeAccounts:
     """What became of the keyframes. Each is in one of the first four counts, or still waits.
 
     Attributes:

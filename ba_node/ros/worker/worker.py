@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 from ba_node.estimate import Estimate, SolveReport, Status
 from ba_node.measurements import Keyframe
-from ba_node.ros.worker.keyframe_accounts import Ledger
+from ba_node.messages.report import QueueReport
+from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
 from ba_node.ros.worker.lag import Lag
 from ba_node.ros.worker.latency import Budget
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
 _MAX_OUTPUTS = 20
 # A report on what was turned away goes out without a solve, but not more often.
-_ACCOUNT_PERIOD_S = 1.0
+_REPORT_PERIOD_S = 1.0
 # Texts that begin alike say the same.
 _HEAD = 40
 # Falling behind for this long is warned about.
@@ -56,14 +57,25 @@ class Notice:
 
 
 @dataclass(frozen=True)
-class Account:
-    """The report of the last solve with what has been turned away since, when there is no new solve to tell it."""
+class Outcome:
+    """What a solve gave; or what has been turned away since the last one, when there is no solve to tell it.
+
+    Attributes:
+        report: of the solve, or of the last one.
+        queue: what has become of keyframes so far.
+        stamp_ns: of the newest keyframe, ns.
+        estimate: what the solve gave; None without one.
+        arrived_s: when its newest keyframe came in, by the worker's clock, s.
+    """
 
     report: SolveReport
+    queue: QueueReport
     stamp_ns: int
+    estimate: Estimate | None = None
+    arrived_s: float = 0.0
 
 
-Output = Estimate | Notice | Account
+Output = Outcome | Notice
 
 
 class Worker:
@@ -92,15 +104,15 @@ class Worker:
         self._clock = clock
         self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
         self._budget = Budget(clock)
-        self._ledger = Ledger()
+        self._keyframes = KeyframeAccounts()
         self._lag = Lag(_PATIENCE_S)
-        self._told: Counter[str] = Counter()
-        self._told_map = 0
+        self._logged: Counter[str] = Counter()
+        self._logged_map = 0
         self._warned: set[str] = set()
         # What the last report said of things turned away, when that was, and whether there is more to say.
-        self._accounted: object = None
-        self._account_s = -_ACCOUNT_PERIOD_S
-        self._owes = False
+        self._reported: object = None
+        self._reported_s = -_REPORT_PERIOD_S
+        self._has_news = False
         self._settled = True
         self._behind = False
         self._failures: Counter[str] = Counter()
@@ -109,7 +121,7 @@ class Worker:
     @property
     def refined(self) -> int:
         """Return how many keyframes took part in a usable solve so far."""
-        return self._ledger.refined
+        return self._keyframes.refined
 
     @property
     def alive(self) -> bool:
@@ -146,7 +158,7 @@ class Worker:
             return 0.0
         if not self._settled:
             return self._settle_time_s
-        return _ACCOUNT_PERIOD_S if self._owes else None
+        return _REPORT_PERIOD_S if self._has_news else None
 
     def step(self, arrivals: list[Arrival]) -> None:
         """Take in what arrived (nothing means silence, unless there is more to solve), and solve if there is need."""
@@ -158,8 +170,8 @@ class Worker:
         self._behind = False
         if self._backend.ready:
             self._guard(self._solve)
-        self._tell_rejections()
-        self._guard(self._account)
+        self._log_rejections()
+        self._guard(self._report_rejections)
 
     def _take(self, arrival: Arrival) -> None:
         if callable(arrival.content):
@@ -172,12 +184,12 @@ class Worker:
         backend.add(content)
         refused = list(backend.refused)
         if isinstance(content, Keyframe) and all(one is not content for one in refused):
-            self._ledger.take(content.session_id, content.keyframe_id, arrival.time_s)
+            self._keyframes.take(content.session_id, content.keyframe_id, arrival.time_s)
         for one in refused:
             if one is content:
-                self._ledger.rejected += 1
+                self._keyframes.rejected += 1
             else:
-                self._ledger.refuse(one.session_id, one.keyframe_id)
+                self._keyframes.refuse(one.session_id, one.keyframe_id)
 
     def _solve(self) -> None:
         start_s = self._clock()
@@ -198,64 +210,63 @@ class Worker:
     def _arrival_s(self, now_s: float) -> float:
         """Return when the keyframe came in that the next solve is for; now if it was solved before."""
         newest = self._backend.due
-        arrived_s = None if newest is None else self._ledger.arrival_s(*newest)
+        arrived_s = None if newest is None else self._keyframes.arrival_s(*newest)
         return now_s if arrived_s is None else arrived_s
 
     def _goes_on(self, _: Iteration) -> bool:
         return self._budget.allows_more() and not self._inbox.closed
 
-    def _finished(self, estimate: Estimate, start_s: float, arrived_s: float) -> Estimate:
-        """Add to the report what only the worker knows."""
-        report, ledger = estimate.report, self._ledger
+    def _finished(self, estimate: Estimate, start_s: float, arrived_s: float) -> Outcome:
+        """Add what only the worker knows."""
+        report = estimate.report
         refined = set(estimate.refined.keyframe_id.tolist()) if report.status.usable else set()
         held = {(one.session_id, one.keyframe_id) for one in self._backend.held}
-        ledger.settle(self._backend.map, refined, held)
-        budget_ms = self._backend.config.node.latency_budget_ms
-        spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
-        report = dataclasses.replace(
-            report,
-            reason=spent if self._budget.spent and report.status is Status.MAX_ITERATIONS else report.reason,
-            queue_wait_s=start_s - arrived_s,
-        )
-        return dataclasses.replace(estimate, report=self._counted(report), arrived_s=arrived_s)
+        self._keyframes.settle(self._backend.map, refined, held)
+        if self._budget.spent and report.status is Status.MAX_ITERATIONS:
+            budget_ms = self._backend.config.node.latency_budget_ms
+            spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
+            report = dataclasses.replace(report, reason=spent)
+        return Outcome(report, self._queue(start_s - arrived_s), estimate.stamp_ns, estimate, arrived_s)
 
-    def _counted(self, report: SolveReport) -> SolveReport:
-        """Return a report with the accounts of the worker as they are now."""
-        ledger, keyframes = self._ledger, self._inbox.keyframes
-        self._accounted, self._owes = self._turned_away(), False
-        return dataclasses.replace(
-            report,
-            rejected={**report.rejected, **self._failures},
-            warnings=(*report.warnings, *self._lag.warnings),
+    def _queue(self, wait_s: float = 0.0) -> QueueReport:
+        """Return what has become of keyframes so far; with it all is reported that was turned away."""
+        keyframes, inbox = self._keyframes, self._inbox.keyframes
+        self._reported, self._has_news = self._turned_away(), False
+        return QueueReport(
+            queue_wait_s=wait_s,
             dropped=self._inbox.dropped,
-            coalesced=ledger.coalesced,
-            received=keyframes.received,
-            solved=ledger.solved,
-            dropped_keyframes=keyframes.dropped + ledger.forgotten,
-            rejected_keyframes=ledger.rejected,
-            waiting=keyframes.waiting + ledger.waiting,
+            coalesced=keyframes.coalesced,
+            received=inbox.received,
+            solved=keyframes.solved,
+            dropped_keyframes=inbox.dropped + keyframes.forgotten,
+            rejected_keyframes=keyframes.rejected,
+            waiting=inbox.waiting + keyframes.waiting,
+            rejected=dict(self._failures),
+            warnings=self._lag.warnings,
         )
 
     def _turned_away(self) -> object:
         """Return what a report says of things turned away."""
         return self._backend.map_index, Counter(self._backend.rejected), tuple(self._backend.warnings)
 
-    def _account(self) -> None:
+    def _report_rejections(self) -> None:
         """Report what was turned away since the last report, if no solve did."""
         now_s = self._clock()
-        self._owes = self._turned_away() != self._accounted and bool(self._backend.rejected or self._backend.warnings)
-        if self._owes and now_s - self._account_s >= _ACCOUNT_PERIOD_S:
-            self._account_s = now_s
-            self._put(Account(self._counted(self._backend.report), self._backend.stamp_ns))
+        self._has_news = self._turned_away() != self._reported and bool(
+            self._backend.rejected or self._backend.warnings
+        )
+        if self._has_news and now_s - self._reported_s >= _REPORT_PERIOD_S:
+            self._reported_s = now_s
+            self._put(Outcome(self._backend.report, self._queue(), self._backend.stamp_ns))
 
-    def _tell_rejections(self) -> None:
+    def _log_rejections(self) -> None:
         rejected, told = Counter(self._backend.rejected), []
-        if self._backend.map_index != self._told_map:
-            self._told_map, self._told, self._warned = self._backend.map_index, Counter(), set()
-        for reason in sorted(rejected - self._told):
+        if self._backend.map_index != self._logged_map:
+            self._logged_map, self._logged, self._warned = self._backend.map_index, Counter(), set()
+        for reason in sorted(rejected - self._logged):
             notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
             told.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
-        self._told = rejected
+        self._logged = rejected
         # What is a rejection too has been told with its count.
         heads = tuple(notice.text[:_HEAD] for notice in told)
         warnings = self._backend.warnings

@@ -53,8 +53,8 @@ class Fault:
         motion: what it does to the world and the path.
         amounts: how much of it, the usual first.
         rigs: the rigs that can have it, the usual first.
-        told: patterns (re, any case), each of which a user must find in what is said; none where the result is to be as
-            good as ever.
+        named: patterns (re, any case), each of which must be found in the messages to the user; none where the result
+            is to be as good as ever.
         codes: exit codes of a replay that are right: 3 where there is something to look at, 2 where it may be refused.
         least: share of the keyframe messages that have to be published.
         changes: options of the recording that it needs.
@@ -65,7 +65,7 @@ class Fault:
     motion: Motion | None = None
     amounts: tuple[float, ...] = (1.0,)
     rigs: tuple[str, ...] = (STEREO, MONO)
-    told: tuple[str, ...] = ()
+    named: tuple[str, ...] = ()
     codes: tuple[int, ...] = (0, 3)
     least: float = 1.0
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -78,23 +78,23 @@ _LOOK, _REFUSED = (3,), (2, 3)
 FAULTS: dict[str, Fault] = {
     # What is said about cameras, frames and units.
     "baseline_reversed": Fault(
-        "second camera on the wrong side", setup.baseline_reversed, rigs=_TWO, told=("baseline|swapped",), codes=_LOOK
+        "second camera on the wrong side", setup.baseline_reversed, rigs=_TWO, named=("baseline|swapped",), codes=_LOOK
     ),
     "cameras_swapped": Fault(
-        "cameras swapped", setup.cameras_swapped, rigs=_TWO, told=("swapped|baseline",), codes=_LOOK
+        "cameras swapped", setup.cameras_swapped, rigs=_TWO, named=("swapped|baseline",), codes=_LOOK
     ),
     "extrinsics_inverted": Fault(
         "extrinsics inverted",
         setup.extrinsics_inverted,
         rigs=_ALL,
-        told=("invert|camera.from.body|axes|body_from_camera",),
+        named=("invert|camera.from.body|axes|body_from_camera",),
         codes=_LOOK,
     ),
     "axes_confused": Fault(
         "body axes given as optical",
         setup.axes_confused,
         rigs=_ALL,
-        told=("axes|optical|body_from_camera",),
+        named=("axes|optical|body_from_camera",),
         codes=_LOOK,
     ),
     "camera_turned": Fault(
@@ -102,7 +102,7 @@ FAULTS: dict[str, Fault] = {
         setup.camera_turned,
         amounts=(1.0, 0.5, 3.0, 10.0),
         rigs=_TWO,
-        told=(r"camera \S+ .*(degree|\bdeg\b|turned|does not fit)",),
+        named=(r"camera \S+ .*(degree|\bdeg\b|turned|does not fit)",),
         codes=_LOOK,
     ),
     "depth_in_mm": Fault(
@@ -110,18 +110,18 @@ FAULTS: dict[str, Fault] = {
         setup.depth_in_mm,
         amounts=(1000.0, 0.001, 100.0),
         rigs=(RGBD,),
-        told=("depth",),
+        named=("depth",),
         codes=_LOOK,
     ),
     "poses_inverted": Fault(
-        "poses inverted", setup.poses_inverted, rigs=_ALL, told=("pose.*invert|invert.*pose",), codes=_LOOK
+        "poses inverted", setup.poses_inverted, rigs=_ALL, named=("pose.*invert|invert.*pose",), codes=_LOOK
     ),
     "focal_off": Fault(
         "focal length, times",
         setup.focal_off,
         amounts=(1.2, 0.8, 1.5),
         rigs=_ALL,
-        told=("focal",),
+        named=("focal",),
         codes=_LOOK,
     ),
     "roi_ignored": Fault(
@@ -129,7 +129,7 @@ FAULTS: dict[str, Fault] = {
         setup.roi_ignored,
         amounts=(120.0, 60.0),
         rigs=_ALL,
-        told=(r"region|\broi\b|principal",),
+        named=(r"region|\broi\b|principal",),
         codes=_LOOK,
     ),
     "roi_given": Fault("region of interest said, px", setup.roi_given, amounts=(120.0, 60.0), codes=(0,)),
@@ -137,46 +137,46 @@ FAULTS: dict[str, Fault] = {
         "binning not said",
         setup.binning_ignored,
         amounts=(2.0, 4.0),
-        told=("binning|focal|intrinsics",),
+        named=("binning|focal|intrinsics",),
         codes=_LOOK,
     ),
     "binning_given": Fault("binning said", setup.binning_given, amounts=(2.0,), codes=(0,)),
     "rectified_with_distortion": Fault(
-        "rectified, distortion given", setup.rectified_with_distortion, told=("rectif|distortion",), codes=_LOOK
+        "rectified, distortion given", setup.rectified_with_distortion, named=("rectif|distortion",), codes=_LOOK
     ),
     # Stamps, sessions, frames.
     "clock_set_back": Fault(
         "clock set back, s",
         stamps.clock_set_back,
         amounts=(3600.0, 60.0),
-        told=("stamp|clock|session",),
+        named=("stamp|clock|session",),
         least=0.95,
     ),
-    "one_stamp_zero": Fault("one stamp is zero", stamps.one_stamp_zero, told=("stamp",), codes=_LOOK, least=0.97),
+    "one_stamp_zero": Fault("one stamp is zero", stamps.one_stamp_zero, named=("stamp",), codes=_LOOK, least=0.97),
     "one_stamp_future": Fault(
         "one stamp ahead, s",
         stamps.one_stamp_future,
         amounts=(4e8, 86400.0),
-        told=("stamp",),
+        named=("stamp",),
         codes=_LOOK,
         least=0.97,
     ),
     "stamps_in_another_unit": Fault("stamps, divided by", stamps.stamps_in_another_unit, amounts=(1e3, 1e6)),
     "begins_anew": Fault(
-        "recording begins anew", stamps.begins_anew, told=("session|stamp|again|duplicate",), least=0.5
+        "recording begins anew", stamps.begins_anew, named=("session|stamp|again|duplicate",), least=0.5
     ),
     "session_lowered": Fault(
-        "session id lowered by", stamps.session_lowered, amounts=(10.0, 1.0), told=("session",), least=0.95
+        "session id lowered by", stamps.session_lowered, amounts=(10.0, 1.0), named=("session",), least=0.95
     ),
     "useless_messages": Fault("useless messages of a higher session", stamps.useless_messages, amounts=(3.0,)),
     "duplicates": Fault(
         "keyframes again, stamps off by, s", stamps.duplicates, amounts=(-3600.0, 0.05, 3600.0), least=0.85
     ),
-    "frame_slash": Fault("frame /odom", stamps.frame_slash, told=("frame",), codes=_REFUSED, least=0.0),
-    "frame_empty": Fault("frame without a name", stamps.frame_empty, told=("frame",), codes=_REFUSED, least=0.0),
-    "frame_changes": Fault("frame renamed midway", stamps.frame_changes, told=("frame",), codes=_LOOK, least=0.5),
+    "frame_slash": Fault("frame /odom", stamps.frame_slash, named=("frame",), codes=_REFUSED, least=0.0),
+    "frame_empty": Fault("frame without a name", stamps.frame_empty, named=("frame",), codes=_REFUSED, least=0.0),
+    "frame_changes": Fault("frame renamed midway", stamps.frame_changes, named=("frame",), codes=_LOOK, least=0.5),
     # The front-end errs.
-    "ids_reused": Fault("ids reused as places", tracks.ids_reused, told=(r"reuse|\bids?\b",), codes=_LOOK),
+    "ids_reused": Fault("ids reused as places", tracks.ids_reused, named=(r"reuse|\bids?\b",), codes=_LOOK),
     "wrong_ids": Fault("keyframes with wrong ids", tracks.wrong_ids, amounts=(5.0, 1.0, 2.0)),
     "outliers_uniform": Fault("outliers anywhere, share", tracks.outliers_uniform, amounts=(0.3, 0.5, 0.1), rigs=_ALL),
     "outliers_jumping": Fault("tracks jump, share", tracks.outliers_jumping, amounts=(0.3, 0.5, 0.1), rigs=_ALL),

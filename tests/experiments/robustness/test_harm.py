@@ -12,7 +12,7 @@ import pytest
 
 from ba_node.estimate import Poses
 from ba_node.io.trajectory import write_tum
-from experiments.robustness.harm import SessionError, said, session_errors
+from experiments.robustness.harm import SessionResult, messages_of, session_results
 from tests.conftest import make_poses
 
 
@@ -30,7 +30,7 @@ def test_each_session_is_compared_with_the_truth(tmp_path: Path) -> None:
         folder.mkdir(exist_ok=True)
         write_tum(folder / "trajectory_input.tum", shifted(truth[rows], 0.1))
         write_tum(folder / "trajectory.tum", shifted(truth[rows], published))
-    good, bad = session_errors(tmp_path, truth)
+    good, bad = session_results(tmp_path, truth)
     assert (good.folder, bad.folder, good.keyframes) == (tmp_path, tmp_path / "session_3", 20)
     assert good.published_m < 1e-9 and good.harmless
     assert good.input_m == pytest.approx(0.05, rel=0.1) and bad.published_m == pytest.approx(0.1, rel=0.1)
@@ -42,7 +42,7 @@ def test_a_body_that_stands_still_is_compared_without_alignment(tmp_path: Path) 
     truth = dataclasses.replace(truth, position=np.zeros((10, 3)))
     write_tum(tmp_path / "trajectory_input.tum", truth)
     write_tum(tmp_path / "trajectory.tum", dataclasses.replace(truth, position=np.full((10, 3), 0.1)))
-    (error,) = session_errors(tmp_path, truth)
+    (error,) = session_results(tmp_path, truth)
     assert error.input_m == 0.0 and error.published_m == pytest.approx(0.1 * np.sqrt(3.0))
 
 
@@ -56,10 +56,10 @@ def test_a_body_that_stands_still_is_compared_without_alignment(tmp_path: Path) 
     ],
 )
 def test_bound(input_m: float, published_m: float, input_deg: float, published_deg: float, harmless: bool) -> None:
-    assert SessionError(Path(), 1, input_m, published_m, input_deg, published_deg).harmless is harmless
+    assert SessionResult(Path(), 1, input_m, published_m, input_deg, published_deg).harmless is harmless
 
 
 def test_words_are_those_for_a_user() -> None:
     older = {"warnings": {"held": "step of 60 m"}, "rejected": {}}
     report = {"attention": ["one"], "rejected": {"bad_pose": 2}, "older_sessions": [older], "median_px": {"input": 3}}
-    assert said(report).splitlines() == ["held: step of 60 m", "one", "bad_pose: 2"]
+    assert messages_of(report).splitlines() == ["held: step of 60 m", "one", "bad_pose: 2"]

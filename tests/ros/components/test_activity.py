@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from ba_node.estimate import SolveReport, Status
-from ba_node.ros.components.activity import Activity
+from ba_node.messages.report import LatencyReport, Report
+from ba_node.ros.components.publishing import Activity
 
-REPORT = SolveReport(
-    status=Status.CONVERGED, rms_px_after=0.434, inlier_share=0.97, latency_p50_s=0.021, latency_p95_s=0.04
+REPORT = Report(
+    SolveReport(status=Status.CONVERGED, rms_px_after=0.434, inlier_share=0.97),
+    latency=LatencyReport(latency_p50_s=0.021, latency_p95_s=0.04),
 )
 
 
@@ -20,7 +22,7 @@ def test_one_line_a_period() -> None:
 def test_what_was_not_taken_is_counted() -> None:
     activity = Activity()
     for k, status in enumerate((Status.SKIPPED, Status.CONVERGED, Status.HELD, Status.HELD, Status.FAILED)):
-        line = activity.line(SolveReport(status=status), float(k), 4.0)
+        line = activity.line(Report(SolveReport(status=status)), float(k), 4.0)
     assert line.startswith("1.2 solves/s, 1 taken, 2 held, 1 failed, 1 skipped; ")
 
 

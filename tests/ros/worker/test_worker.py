@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,9 @@ import pytest
 from ba_node.config import Config
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import Keyframe, Measurement
+from ba_node.messages.report import Report
 from ba_node.ros.worker.inbox import Inbox
-from ba_node.ros.worker.worker import Account, Notice, Output, Worker
+from ba_node.ros.worker.worker import Notice, Outcome, Output, Worker
 
 
 class FakeMap:
@@ -138,8 +140,14 @@ class Rig:
         return self.worker.outputs()
 
 
-def reports(outputs: list[Output]) -> list[SolveReport]:
-    return [output.report for output in outputs if isinstance(output, Estimate)]
+def reports(outputs: list[Output], *, of_solves: bool = True) -> list[Any]:
+    """Return what was reported of solves, or of what was turned away, the fields of all parts in one."""
+    found = [one for one in outputs if isinstance(one, Outcome) and (one.estimate is not None) == of_solves]
+    wholes = [Report(one.report, one.queue) for one in found]
+    own = [{"rejected": whole.rejected, "warnings": whole.warnings} for whole in wholes]
+    return [
+        SimpleNamespace(**vars(one.solve) | vars(one.queue) | extra) for one, extra in zip(wholes, own, strict=True)
+    ]
 
 
 def test_solves_once_for_everything_that_waits() -> None:
@@ -234,7 +242,7 @@ def test_keyframes_that_come_during_a_solve_are_solved_together() -> None:
         for number in range(1, 7):
             rig.keyframe(number)
         go_on.set()
-        found: list[SolveReport] = []
+        found: list[Any] = []
         while len(found) < 2:
             found += reports(rig.wait_for_output())
         assert [report.newest_keyframe_id for report in found] == [0, 6]
@@ -251,7 +259,7 @@ def test_goes_on_while_there_is_more_to_solve() -> None:
     try:
         for number in range(8):
             rig.keyframe(number)
-        found: list[SolveReport] = []
+        found: list[Any] = []
         while not found or found[-1].newest_keyframe_id != 7:
             found += reports(rig.wait_for_output())
         assert rig.backend.flushed == 0, "it did not wait for silence"
@@ -371,15 +379,15 @@ def test_what_is_turned_away_is_reported_without_a_solve() -> None:
     rig.step()
     rig.now_s = 10.0
     rig.keyframe(1)
-    accounts = [output for output in rig.step() if isinstance(output, Account)]
-    assert [(one.report.rejected_keyframes, one.report.received) for one in accounts] == [(1, 2)]
+    accounts = reports(rig.step(), of_solves=False)
+    assert [(one.rejected_keyframes, one.received) for one in accounts] == [(1, 2)]
     # Not more often than once a second, and never twice the same.
     rig.now_s = 10.5
     rig.keyframe(1)
-    assert [output for output in rig.step() if isinstance(output, Account)] == []
+    assert reports(rig.step(), of_solves=False) == []
     assert rig.worker._patience_s() is not None
     rig.now_s = 11.0
-    assert [one.report.rejected_keyframes for one in rig.step() if isinstance(one, Account)] == [2]
+    assert [one.rejected_keyframes for one in reports(rig.step(), of_solves=False)] == [2]
     rig.now_s = 20.0
     assert rig.step() == []
     assert rig.worker._patience_s() is None, "all is said"

@@ -11,7 +11,7 @@
 
 #include "adjustment/triangulate.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // As in core/consensus.py.
 constexpr std::int64_t kMaxPairs = 45, kMaxSingles = 8;
@@ -122,4 +122,4 @@ class Consensus {
   bool best_far_ = false;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

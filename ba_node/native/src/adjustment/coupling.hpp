@@ -8,12 +8,12 @@
 #include <cstdint>
 #include <vector>
 
-#include "linalg/blocks.hpp"
 #include "adjustment/equations.hpp"
 #include "adjustment/layout.hpp"
 #include "adjustment/rows.hpp"
+#include "linalg/blocks.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 template <int D>
 class Coupling {
@@ -62,7 +62,7 @@ class Coupling {
         ninth = t[2] * u + t[5] * v;
       }
       if (l_.has_depth) {
-        read_lanes(slot, equations_.lines - 1, t);
+        read_lanes(slot, equations_.registers - 1, t);
         const V8 w = t[0] * p[0] + t[1] * p[1] + t[2] * p[2];
         for (int i = 0; i < 3; ++i) h[i] += t[i] * w;
       }
@@ -103,7 +103,7 @@ class Coupling {
       v += t[3] * q[0] + t[4] * q[1] + t[5] * q[2];
       for (int i = 0; i < 3; ++i) z[i] += t[i] * u + t[3 + i] * v;
       if (l_.has_depth) {
-        read_lanes(slot, equations_.lines - 1, t);
+        read_lanes(slot, equations_.registers - 1, t);
         const V8 w = t[0] * q[0] + t[1] * q[1] + t[2] * q[2];
         for (int i = 0; i < 3; ++i) z[i] += t[i] * w;
       }
@@ -128,7 +128,7 @@ class Coupling {
   template <bool kGeneral>
   [[gnu::always_inline]] void couple(std::int64_t slot, V8 (&c)[6], V8* f) const {
     V8 t[8];
-    const auto read = [&](int line) { read_lanes(slot, line, t); };
+    const auto read = [&](int reg) { read_lanes(slot, reg, t); };
     const auto add = [&c](const V8* a) {
       c[0] += a[0] * a[0];
       c[1] += a[1] * a[0];
@@ -157,7 +157,7 @@ class Coupling {
     }
     if constexpr (kGeneral) {
       if (l_.has_depth) {
-        read(equations_.lines - 1);
+        read(equations_.registers - 1);
         add(t);
       }
     }
@@ -204,11 +204,11 @@ class Coupling {
     }
   }
 
-  // Line `line` of the records of a slot, each number by lane.
-  [[gnu::always_inline]] void read_lanes(std::int64_t slot, int line, V8 (&t)[8]) const {
-    const V8* record = &equations_.record[kLanes * slot * equations_.lines + line];
+  // Register `reg` of the records of a slot, each number by lane.
+  [[gnu::always_inline]] void read_lanes(std::int64_t slot, int reg, V8 (&t)[8]) const {
+    const V8* record = &equations_.record[kLanes * slot * equations_.registers + reg];
 #pragma GCC unroll 8
-    for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.lines];
+    for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.registers];
     transpose(t);
   }
 
@@ -220,10 +220,11 @@ class Coupling {
   // Which free keyframe each image is of.
   void find_columns() {
     image_column_.assign(l_.images.size(), -1);
-    const std::int64_t none = kLanes * l_.n_slots(), lists = static_cast<std::int64_t>(l_.keyframe_seen.size()) - 1;
+    const std::int64_t none = kLanes * l_.n_slots(), lists = static_cast<std::int64_t>(l_.list_begin.size()) - 1;
     for (std::int64_t list = 0; list < lists; ++list)
-      for (std::int64_t i = l_.keyframe_seen[list]; i < l_.keyframe_seen[list + 1]; ++i)
-        if (l_.seen[i] < none) image_column_[l_.slot_image[l_.seen[i]]] = static_cast<std::int32_t>(list % l_.n_free);
+      for (std::int64_t i = l_.list_begin[list]; i < l_.list_begin[list + 1]; ++i)
+        if (l_.listed[i] < none)
+          image_column_[l_.slot_image[l_.listed[i]]] = static_cast<std::int32_t>(list % l_.n_free);
   }
 
   const Layout& l_;
@@ -233,4 +234,4 @@ class Coupling {
   Buffer<Column<D>> step_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

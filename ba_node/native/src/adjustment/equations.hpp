@@ -10,12 +10,12 @@
 #include <utility>
 #include <vector>
 
-#include "linalg/blocks.hpp"
 #include "adjustment/layout.hpp"
-#include "parallel/pool.hpp"
 #include "adjustment/rows.hpp"
+#include "linalg/blocks.hpp"
+#include "parallel/pool.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // C (packed), g and cost of a batch of points.
 struct PointSums {
@@ -25,11 +25,11 @@ struct PointSums {
 };
 
 template <int kRows>
-[[gnu::always_inline]] inline void add_point_rows(const Seen& seen, PointSums& out) {
+[[gnu::always_inline]] inline void add_point_rows(const Evaluation& obs, PointSums& out) {
 #pragma GCC unroll 3
   for (int row = 0; row < kRows; ++row) {
-    const V8 *d = seen.d_point[row], w = seen.weight[row == 2];
-    const V8 a = w * d[0], b = w * d[1], c = w * d[2], r = seen.residual[row];
+    const V8 *d = obs.d_point[row], w = obs.weight[row == 2];
+    const V8 a = w * d[0], b = w * d[1], c = w * d[2], r = obs.residual[row];
     out.c[0] += a * d[0];
     out.c[1] += b * d[0];
     out.c[2] += b * d[1];
@@ -40,7 +40,7 @@ template <int kRows>
     out.g[1] += b * r;
     out.g[2] += c * r;
   }
-  out.cost += seen.cost;
+  out.cost += obs.cost;
 }
 
 // The derivative by a pose, from that by the point at x.
@@ -63,34 +63,33 @@ struct AtPoints {
 template <int D>
 class Equations : public AtPoints {
  public:
-  explicit Equations(const Layout& layout)
-      : lines(lines_with(layout.has_depth)), l_(layout) {
+  explicit Equations(const Layout& layout) : registers(registers_with(layout.has_depth)), l_(layout) {
     const std::int64_t bytes = resize(*this);
-    if (bytes <= kMostAhead) resize(ahead_);
+    if (bytes <= kMaxPreparedBytes) resize(prepared_);
     b.resize(l_.n_free);
     gradient_c.resize(l_.n_free);
-    part_.resize(l_.n_chunks());
-    const std::int64_t lists = l_.n_seen_parts() > 1 ? l_.n_seen_parts() * l_.n_free : 0;
-    part_b_.resize(lists);
-    part_gradient_.resize(lists);
+    partial_.resize(l_.n_chunks());
+    const std::int64_t lists = l_.n_lists() > 1 ? l_.n_lists() * l_.n_free : 0;
+    partial_b_.resize(lists);
+    partial_gradient_.resize(lists);
   }
 
   double gradient_norm = 0;
   Buffer<Block<D>> b;
   Buffer<Column<D>> gradient_c;
-  // Rows of the Jacobian an observation, each `lines` registers.
-  const int lines;
+  // Rows of the Jacobian an observation, each `registers` registers.
+  const int registers;
 
   double linearise(Rows& rows, const StateView& s, Pool& pool) {
     rows.load_images(s);
-    rows.with_kind([&](auto lens, auto depth) {
+    rows.with_kind<D>([&](auto lens, auto depth) {
       pool.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-        part_[chunk] = linearise_chunk<decltype(lens)::value, decltype(depth)::value>(rows, s, chunk);
+        partial_[chunk] = linearise_chunk<decltype(lens)::value, decltype(depth)::value>(rows, s, chunk);
       });
     });
     sum_keyframes(pool);
     double total = 0;
-    for (double part : part_) total += part;
+    for (double partial : partial_) total += partial;
     return total;
   }
 
@@ -104,53 +103,53 @@ class Equations : public AtPoints {
     find_gradient_norm();
   }
 
-  // Polishing ends with what a linearisation at its end begins with; that is kept if it is small.
-  bool looks_ahead() const { return ahead_.record.size() == this->record.size(); }
-  // Registers a record, and those that hold() needs for a slot.
-  static constexpr int lines_with(bool depth) { return (D == 9 ? 2 : 1) + (depth ? 1 : 0); }
-  static constexpr int held_with(bool depth) { return kLanes * lines_with(depth) + 2; }
+  // Inner iterations end with what a linearisation there begins with; that is kept if it is small.
+  bool can_prepare() const { return prepared_.record.size() == this->record.size(); }
+  // Registers a record, and those that stage() needs for a slot.
+  static constexpr int registers_with(bool depth) { return (D == 9 ? 2 : 1) + (depth ? 1 : 0); }
+  static constexpr int staged_with(bool depth) { return kLanes * registers_with(depth) + 2; }
 
   // Rows of a slot, by lane, into `to`; weights last.
   template <bool kDepth>
-  [[gnu::always_inline]] static void hold(const Seen& seen, V8* to) {
-    constexpr int kLines = lines_with(kDepth);
-    for (int i = 0; i < 6; ++i) to[i] = seen.d_point[i / 3][i % 3];
-    to[6] = seen.residual[0];
-    to[7] = seen.residual[1];
-    to[kLanes * kLines] = seen.weight[0];
+  [[gnu::always_inline]] static void stage(const Evaluation& obs, V8* to) {
+    constexpr int kRegisters = registers_with(kDepth);
+    for (int i = 0; i < 6; ++i) to[i] = obs.d_point[i / 3][i % 3];
+    to[6] = obs.residual[0];
+    to[7] = obs.residual[1];
+    to[kLanes * kRegisters] = obs.weight[0];
     if constexpr (D == 9)
-      for (int i = 0; i < 6; ++i) to[kLanes + i] = seen.d_intrinsics[i / 3][i % 3];
+      for (int i = 0; i < 6; ++i) to[kLanes + i] = obs.d_intrinsics[i / 3][i % 3];
     if constexpr (kDepth) {
-      V8* last = to + kLanes * (kLines - 1);
-      for (int i = 0; i < 3; ++i) last[i] = seen.d_point[2][i];
-      last[3] = seen.residual[2];
-      to[kLanes * kLines + 1] = seen.weight[1];
+      V8* last = to + kLanes * (kRegisters - 1);
+      for (int i = 0; i < 3; ++i) last[i] = obs.d_point[2][i];
+      last[3] = obs.residual[2];
+      to[kLanes * kRegisters + 1] = obs.weight[1];
     }
   }
 
-  // The rows of a batch as held, and what else follows from them at x, for a linearisation to come.
+  // The rows of a batch as staged, and what else follows from them at x, for a linearisation to come.
   template <bool kDepth>
-  void put_ahead(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, const V8* rows) {
-    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot, rows += held_with(kDepth))
-      write<kDepth>(rows, slot, ahead_);
-    put(batch, x, sums, ahead_);
+  void prepare(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, const V8* rows) {
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot, rows += staged_with(kDepth))
+      write<kDepth>(rows, slot, prepared_);
+    put(batch, x, sums, prepared_);
   }
 
-  // Linearise where the last polishing ended.
-  void go_ahead(Pool& pool) {
-    std::swap(static_cast<AtPoints&>(*this), ahead_);
+  // Linearise where the last inner iterations ended.
+  void take_prepared(Pool& pool) {
+    std::swap(static_cast<AtPoints&>(*this), prepared_);
     sum_keyframes(pool);
   }
 
  private:
   // Bytes of records up to which a second set stays in the caches with the first; beyond, it costs what it saves.
-  static constexpr std::int64_t kMostAhead = 4 << 20;
-  // Pieces of the keyframes of a part.
-  static constexpr std::int64_t kRanges = 4;
+  static constexpr std::int64_t kMaxPreparedBytes = 4 << 20;
+  // Tasks that the keyframes of a list are summed in.
+  static constexpr std::int64_t kTasksOfList = 4;
 
   std::int64_t resize(AtPoints& at) const {
-    at.record.resize((kLanes * l_.n_slots() + 1) * lines);
-    clear(&at.record[kLanes * l_.n_slots() * lines], lines);
+    at.record.resize((kLanes * l_.n_slots() + 1) * registers);
+    clear(&at.record[kLanes * l_.n_slots() * registers], registers);
     at.point.resize(3 * l_.n_batches);
     at.c.resize(6 * l_.n_batches);
     at.gradient_p.resize(3 * l_.n_batches);
@@ -158,7 +157,7 @@ class Equations : public AtPoints {
   }
 
   void sum_keyframes(Pool& pool) {
-    const std::int64_t parts = l_.n_seen_parts(), n = l_.n_free;
+    const std::int64_t partials = l_.n_lists(), n = l_.n_free;
     const auto sum_list = [this](std::int64_t list, Block<D>& block, Column<D>& gradient) {
       if (l_.has_depth) {
         sum_keyframe<true>(list, block, gradient);
@@ -166,21 +165,22 @@ class Equations : public AtPoints {
         sum_keyframe<false>(list, block, gradient);
       }
     };
-    if (parts == 1) {
+    if (partials == 1) {
       pool.each(n, [&](std::int64_t k, int) { sum_list(k, b[k], gradient_c[k]); });
     } else {
-      // Each thread what it has seen itself.
-      pool.each(parts * kRanges, [&](std::int64_t piece, int) {
-        const std::int64_t part = piece / kRanges, range = piece % kRanges;
-        for (std::int64_t i = part * n + n * range / kRanges; i < part * n + n * (range + 1) / kRanges; ++i)
-          sum_list(i, part_b_[i], part_gradient_[i]);
+      // Each thread what it has obs itself.
+      pool.each(partials * kTasksOfList, [&](std::int64_t task, int) {
+        const std::int64_t partial = task / kTasksOfList, range = task % kTasksOfList;
+        for (std::int64_t i = partial * n + n * range / kTasksOfList; i < partial * n + n * (range + 1) / kTasksOfList;
+             ++i)
+          sum_list(i, partial_b_[i], partial_gradient_[i]);
       });
       for (std::int64_t k = 0; k < n; ++k) {
-        b[k] = part_b_[k];
-        gradient_c[k] = part_gradient_[k];
-        for (std::int64_t i = k + n; i < parts * n; i += n) {
-          add(b[k], part_b_[i]);
-          add(gradient_c[k], part_gradient_[i]);
+        b[k] = partial_b_[k];
+        gradient_c[k] = partial_gradient_[k];
+        for (std::int64_t i = k + n; i < partials * n; i += n) {
+          add(b[k], partial_b_[i]);
+          add(gradient_c[k], partial_gradient_[i]);
         }
       }
     }
@@ -204,13 +204,13 @@ class Equations : public AtPoints {
       PointSums sums{};
       for (std::int64_t slot = l_.slot_begin[i]; slot < l_.slot_begin[i + 1]; ++slot) {
         Images images;
-        Seen seen;
-        V8 held[held_with(kDepth)];
+        Evaluation obs;
+        V8 staged[staged_with(kDepth)];
         rows.gather<kLens>(slot, images);
-        rows.see<kLens, kDepth, true>(slot, images, x, seen);
-        add_point_rows<kDepth ? 3 : 2>(seen, sums);
-        hold<kDepth>(seen, held);
-        write<kDepth>(held, slot, *this);
+        rows.evaluate<kLens, kDepth, true>(slot, images, x, obs);
+        add_point_rows<kDepth ? 3 : 2>(obs, sums);
+        stage<kDepth>(obs, staged);
+        write<kDepth>(staged, slot, *this);
       }
       put(i, x, sums, *this);
       total += sums.cost;
@@ -224,23 +224,23 @@ class Equations : public AtPoints {
     for (int j = 0; j < 3; ++j) to.gradient_p[3 * batch + j] = sums.g[j];
   }
 
-  // Records of a slot, of its rows as held: weighted, by observation.
+  // Records of a slot, of its rows as staged: weighted, by observation.
   template <bool kDepth>
-  [[gnu::always_inline]] static void write(const V8* held, std::int64_t slot, AtPoints& to) {
-    constexpr int kLines = lines_with(kDepth);
-    V8* record = &to.record[kLanes * slot * kLines];
-    const auto put_line = [&](int line, int count, const V8& weight) {
+  [[gnu::always_inline]] static void write(const V8* staged, std::int64_t slot, AtPoints& to) {
+    constexpr int kRegisters = registers_with(kDepth);
+    V8* record = &to.record[kLanes * slot * kRegisters];
+    const auto put_register = [&](int reg, int count, const V8& weight) {
       V8 r[8];
 #pragma GCC unroll 8
-      for (int i = 0; i < 8; ++i) r[i] = i < count ? weight * held[kLanes * line + i] : V8{};
+      for (int i = 0; i < 8; ++i) r[i] = i < count ? weight * staged[kLanes * reg + i] : V8{};
       transpose(r);
 #pragma GCC unroll 8
-      for (int l = 0; l < kLanes; ++l) record[l * kLines + line] = r[l];
+      for (int l = 0; l < kLanes; ++l) record[l * kRegisters + reg] = r[l];
     };
-    const V8 weight = root(held[kLanes * kLines]);
-    put_line(0, 8, weight);
-    if constexpr (D == 9) put_line(1, 6, weight);
-    if constexpr (kDepth) put_line(kLines - 1, 4, root(held[kLanes * kLines + 1]));
+    const V8 weight = root(staged[kLanes * kRegisters]);
+    put_register(0, 8, weight);
+    if constexpr (D == 9) put_register(1, 6, weight);
+    if constexpr (kDepth) put_register(kRegisters - 1, 4, root(staged[kLanes * kRegisters + 1]));
   }
 
   // B and g of the observations of a list.
@@ -248,7 +248,7 @@ class Equations : public AtPoints {
   void sum_keyframe(std::int64_t list, Block<D>& block, Column<D>& gradient) {
     constexpr int kRows = kDepth ? 3 : 2;
     V8 h[D * (D + 1) / 2] = {}, g[D] = {};
-    for (std::int64_t first = l_.keyframe_seen[list]; first < l_.keyframe_seen[list + 1]; first += kLanes) {
+    for (std::int64_t first = l_.list_begin[list]; first < l_.list_begin[list + 1]; first += kLanes) {
       V8 j[3][D], r[3];
       load_rows<kDepth>(first, j, r);
       int t = 0;
@@ -279,13 +279,13 @@ class Equations : public AtPoints {
   template <bool kDepth>
   [[gnu::always_inline]] void load_rows(std::int64_t first, V8 (&j)[3][D], V8 (&r)[3]) const {
     V8 x[3], t[8];
-    const auto read = [&](int line) {
+    const auto read = [&](int reg) {
 #pragma GCC unroll 8
-      for (int l = 0; l < kLanes; ++l) t[l] = record[l_.seen[first + l] * static_cast<std::int64_t>(lines) + line];
+      for (int l = 0; l < kLanes; ++l) t[l] = record[l_.listed[first + l] * static_cast<std::int64_t>(registers) + reg];
       transpose(t);
     };
     const double* points = reinterpret_cast<const double*>(point.data());
-    const std::int32_t* of_lane = &l_.seen_point[first];
+    const std::int32_t* of_lane = &l_.listed_point[first];
     for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[of_lane[l] + kLanes * i]; });
     read(0);
     r[0] = t[6];
@@ -301,7 +301,7 @@ class Equations : public AtPoints {
       }
     }
     if constexpr (kDepth) {
-      read(lines - 1);
+      read(registers - 1);
       pose_row(x, t, j[2]);
       r[2] = t[3];
     }
@@ -317,10 +317,10 @@ class Equations : public AtPoints {
     x.a[i] = value;
   }
   const Layout& l_;
-  std::vector<double> part_;
-  Buffer<Block<D>> part_b_;  // by part, if there are several
-  Buffer<Column<D>> part_gradient_;
-  AtPoints ahead_;
+  std::vector<double> partial_;
+  Buffer<Block<D>> partial_b_;  // by list, if a keyframe has several
+  Buffer<Column<D>> partial_gradient_;
+  AtPoints prepared_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

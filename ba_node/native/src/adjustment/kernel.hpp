@@ -1,121 +1,98 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// The Schur complement of the points, S = B - E C^-1 E' with damped B and C, and back-substitution.
-// The equations stand in core/schur.py, which is this file's oracle. With C = L L' they need Z = E L^-T alone.
+// Everything about one problem: its normal equations at a state, the system reduced to its keyframes, and what a step
+// does.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
 #include <cstdint>
 #include <limits>
-#include <memory>
 #include <utility>
 #include <vector>
 
-#include "linalg/blocks.hpp"
-#include "linalg/cholesky.hpp"
-#include "adjustment/coupling.hpp"
 #include "adjustment/equations.hpp"
+#include "adjustment/inner_iterations.hpp"
 #include "adjustment/layout.hpp"
-#include "linalg/pcg.hpp"
-#include "adjustment/polish.hpp"
-#include "parallel/pool.hpp"
+#include "adjustment/reduced_system.hpp"
 #include "adjustment/retract.hpp"
 #include "adjustment/rows.hpp"
-#include "linalg/sparse_cholesky.hpp"
-#include "adjustment/sparse_schur.hpp"
+#include "linalg/blocks.hpp"
+#include "parallel/pool.hpp"
+#include "targets/target.hpp"
 
-namespace ba {
-
-// What a step did: by what the model said the objective would fall, and the objective before and after the polishing.
-struct Moved {
-  double predicted = 0;
-  double damping = 0;  // 1/2 p' D p
-  Polished objective{std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::quiet_NaN()};
-};
+namespace ba::BA_TARGET {
 
 template <int D>
-class Kernel {
+class KernelOf final : public Kernel {
  public:
-  // factors: pairs of free keyframes that have a block of B between them.
-  Kernel(const ProblemView& problem, const Rules& rules, const StateView& start, CoupledPairs factors, int threads)
-      : l_(problem, D == 9),
-        factors_(std::move(factors)),
-        rows_(l_, rules, start),
-        pool_(threads),
+  explicit KernelOf(KernelArguments arguments)
+      : l_(arguments.problem, D == 9),
+        rows_(l_, arguments.cost, arguments.start),
+        pool_(arguments.threads),
         equations_(l_),
-        coupling_(l_, equations_) {
-    pairs_.assign(factors_.size(), Block<D>{});
-    rhs_.resize(l_.n_free);
-    sums_.resize(l_.n_chunks() * l_.n_free);
-    scaled_gradient_.resize(3 * l_.n_batches);
-    damping_p_.resize(3 * l_.n_batches);
-    damping_c_.resize(l_.n_free * D);
-    part_.resize(l_.n_chunks());
+        reduced_(l_, rows_, equations_, std::move(arguments.factors), pool_) {
+    partial_.resize(l_.n_chunks());
     const std::int64_t most = l_.n_batches ? l_.slot_begin[1] : 0;
-    for (int i = 0; i < pool_.threads(); ++i) images_.emplace_back(most);
-    for (int i = 0; i < pool_.threads(); ++i) held_.emplace_back(equations_.looks_ahead() ? most * equations_.held_with(l_.has_depth) : 0);
+    const std::int64_t staged = equations_.can_prepare() ? most * equations_.staged_with(l_.has_depth) : 0;
+    for (int i = 0; i < pool_.threads(); ++i) {
+      images_.emplace_back(most);
+      staged_.emplace_back(staged);
+    }
   }
-  // The parts refer to one another.
-  Kernel(const Kernel&) = delete;
-  Kernel& operator=(const Kernel&) = delete;
+  // The members refer to one another.
+  KernelOf(const KernelOf&) = delete;
+  KernelOf& operator=(const KernelOf&) = delete;
 
-  std::int64_t n_free() const { return l_.n_free; }
-  std::int64_t n_edges() const { return l_.n_edges(); }
-  std::int64_t n_pairs() const { return l_.n_pairs(); }
-  std::int64_t n_points() const { return l_.n_points; }
-  std::int64_t n_chunks() const { return l_.n_chunks(); }
-  double gradient_norm() const { return equations_.gradient_norm; }
+  int size() const override { return D; }
+  std::int64_t n_free() const override { return l_.n_free; }
+  std::int64_t n_edges() const override { return l_.n_edges(); }
+  std::int64_t n_pairs() const override { return l_.n_pairs(); }
+  std::int64_t n_points() const override { return l_.n_points; }
+  std::int64_t n_chunks() const override { return l_.n_chunks(); }
+  double gradient_norm() const override { return equations_.gradient_norm; }
 
-  double objective(const StateView& s) {
+  double objective(const StateView& s) override {
     rows_.load_images(s);
-    rows_.with_kind([&](auto lens, auto depth) {
+    rows_.with_kind<D>([&](auto lens, auto depth) {
       pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-        part_[chunk].after = rows_.template objective<decltype(lens)::value, decltype(depth)::value>(chunk, s);
+        partial_[chunk].after = rows_.template objective<decltype(lens)::value, decltype(depth)::value>(chunk, s);
       });
     });
-    return total().after;
+    return total_of(partial_).after;
   }
 
-  // Improve each point alone, keyframes held. points: out.
-  Polished polish_points(const StateView& s, double* points, int steps) {
+  Objectives inner_iterations(const StateView& s, double* points, int steps) override {
     rows_.load_images(s);
-    is_ahead_ = equations_.looks_ahead();
-    rows_.with_kind([&](auto lens, auto depth) {
+    is_prepared_ = equations_.can_prepare();
+    rows_.with_kind<D>([&](auto lens, auto depth) {
       pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int thread) {
         constexpr Lens kLens = decltype(lens)::value;
         constexpr bool kDepth = decltype(depth)::value;
-        part_[chunk] = is_ahead_ ? polish_chunk<kLens, kDepth, true>(chunk, thread, s, points, steps)
-                                 : polish_chunk<kLens, kDepth, false>(chunk, thread, s, points, steps);
+        partial_[chunk] = iterate_chunk<kLens, kDepth>(chunk, thread, s, points, steps);
       });
     });
-    return total();
+    return total_of(partial_);
   }
 
-  double linearise(const StateView& s) {
-    is_ahead_ = false;
+  double linearise(const StateView& s) override {
+    is_prepared_ = false;
     return equations_.linearise(rows_, s, pool_);
   }
 
-  // Linearise where the last polishing ended; false if too little is known of it.
-  bool linearise_polished() {
-    if (!is_ahead_) return false;
-    is_ahead_ = false;
-    equations_.go_ahead(pool_);
+  bool linearise_prepared() override {
+    if (!is_prepared_) return false;
+    is_prepared_ = false;
+    equations_.take_prepared(pool_);
     return true;
   }
 
-  // Add what factors have at the state of the last linearisation: to B (n_free x 36), to the gradient (n_free x 6), and the
-  // blocks of the coupled pairs (n_pairs x 36).
-  void add_factors(const double* diagonal, const double* gradient, const double* pairs) {
+  void add_factors(const double* diagonal, const double* gradient, const double* pairs) override {
     equations_.add_factors(diagonal, gradient);
-    for (std::size_t k = 0; k < factors_.size(); ++k)
-      for (int i = 0; i < 36; ++i) set_entry(pairs_[k], i / 6, i % 6, pairs[36 * k + i]);
+    reduced_.set_pairs(pairs);
   }
 
   // diag(B) (n_free x D) and diag(C) (n_points x 3).
-  void diagonals(double* d_c, double* d_p) const {
+  void diagonals(double* d_c, double* d_p) const override {
     for (std::int64_t k = 0; k < l_.n_free; ++k)
       for (int i = 0; i < D; ++i) d_c[k * D + i] = entry(equations_.b[k], i, i);
     for (std::int64_t i = 0; i < l_.n_batches; ++i) {
@@ -125,172 +102,32 @@ class Kernel {
     }
   }
 
-  // Add damping to the diagonals and factor C; everything below is of this damped system.
-  void factor(const double* damping_c, const double* damping_p) {
-    std::copy_n(damping_c, l_.n_free * D, damping_c_.data());
-    factor_points([&](std::int64_t i, V8(&damping)[3]) { rows_.load_points(i, damping_p, damping); });
+  void factor(const double* damping_c, const double* damping_p) override { reduced_.factor(damping_c, damping_p); }
+  void damp(bool diagonal, double mu) override { reduced_.damp(diagonal, mu); }
+  void rhs(double* out) const override { reduced_.rhs(out); }
+  void dense(double* out) override { reduced_.dense(out); }
+  bool solve(double* x) override { return reduced_.solve(x); }
+  const Fill& analyse(const FillLimits& limits) override { return reduced_.analyse(limits); }
+  bool solve_sparse(double* x) override { return reduced_.solve_sparse(x); }
+  const Rows32& assemble() override { return reduced_.assemble().pattern(); }
+  void write_blocks(double* out) override {
+    const auto n = static_cast<std::int64_t>(reduced_.assembled().pattern().index.size());
+    for (std::int64_t k = 0; k < n; ++k) write_block(reduced_.assembled().blocks()[k], out + k * D * D, D);
+  }
+  PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) override {
+    return reduced_.pcg(scale, kind, limits, formed, x);
+  }
+  void product(const double* x, double* out) override { reduced_.product(x, out); }
+  void diagonal_blocks(double* out) override { reduced_.diagonal_blocks(out); }
+  double back_substitute(const double* step_c, double* step_p) override {
+    return reduced_.back_substitute(step_c, nullptr, step_p);
   }
 
-  // The same with mu times the diagonal itself, or the identity.
-  void damp(bool diagonal, double mu) {
-    for (std::int64_t k = 0; k < l_.n_free; ++k)
-      for (int i = 0; i < D; ++i)
-        damping_c_[k * D + i] = mu * (diagonal ? std::max(entry(equations_.b[k], i, i), kMinDiagonal) : 1.0);
-    factor_points([&](std::int64_t i, V8(&damping)[3]) {
-      const V8* c = &equations_.c[6 * i];
-      const V8 d[3] = {c[0], c[2], c[5]};
-      for (int j = 0; j < 3; ++j) damping[j] = mu * (diagonal ? maximum(d[j], splat(kMinDiagonal)) : splat(1.0));
-    });
-  }
-
-  void rhs(double* out) const {
-    for (std::int64_t k = 0; k < l_.n_free; ++k)
-      for (int i = 0; i < D; ++i) out[k * D + i] = at(rhs_[k], i);
-  }
-
-  // S, symmetric, (n x n), n = n_free D.
-  void dense(double* out) {
-    const std::int64_t n = l_.n_free * D;
-    std::fill_n(out, n * n, 0.0);
-    each_block([&](std::int64_t i, std::int64_t j, const Block<D>& block) {
-      for (int r = 0; r < D; ++r)
-        for (int c = 0; c < D; ++c) out[(i * D + r) * n + j * D + c] = out[(j * D + c) * n + i * D + r] = entry(block, r, c);
-    });
-  }
-
-  // Solve S x = rhs by dense Cholesky; false if S is not positive definite.
-  bool solve(double* x) {
-    const std::int64_t n = l_.n_free * D;
-    cholesky_.resize(n);
-    const SparseSchur<D>& s = assemble();
-    pool_.each(l_.n_free, [&](std::int64_t i, int) {
-      for (std::int64_t k = s.pattern().start[i]; k < s.pattern().start[i + 1]; ++k) {
-        const std::int64_t j = s.pattern().index[k];
-        for (int r = 0; r < D; ++r)
-          for (int c = (j == i ? r : 0); c < D; ++c) cholesky_.at(j * D + c, i * D + r) = entry(s.blocks()[k], r, c);
-      }
-    });
-    if (!cholesky_.factor(pool_)) return false;
-    rhs(x);
-    cholesky_.solve(x);
-    return all_finite(x, n);
-  }
-
-  // The size of the sparse factor, found once if it meets the limits.
-  const Fill& analyse(const FillLimits& limits) {
-    if (!factor_ || !factor_->fill().complete) factor_ = std::make_unique<SparseCholesky<D>>(schur().pattern(), limits);
-    return factor_->fill();
-  }
-
-  // S by blocks.
-  const SparseSchur<D>& assemble() {
-    schur().assemble(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); }, pairs_);
-    return schur();
-  }
-
-  // Solve S x = rhs by sparse Cholesky, after analyse; false if S is not positive definite.
-  bool solve_sparse(double* x) {
-    if (!factor_->factor(assemble().blocks())) return false;
-    rhs(x);
-    factor_->solve(x);
-    return true;
-  }
-
-  // Solve S x = rhs by conjugate gradients; scale: 1/D (n_free x D). formed: products with S by blocks, summed first;
-  // otherwise without it.
-  PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) {
-    if (formed) assemble();
-    const bool whole = kind == Preconditioner::kSchurBlock || kind == Preconditioner::kOwnBlock;
-    inverse_.set(blocks_of(kind), l_.n_free, scale, whole);
-    pcg_.resize(l_.n_free * D);
-    rhs_as_given_.resize(l_.n_free * D);
-    rhs(rhs_as_given_.data());
-    const auto multiply = [&](const double* in, double* out) {
-      if (formed) {
-        schur().multiply(in, out);
-      } else {
-        product(in, out);
-      }
-    };
-    const auto precondition = [this](const Buffer<double>& r, Buffer<double>& z) { inverse_.apply(r, z); };
-    return pcg_.solve(multiply, precondition, rhs_as_given_.data(), scale, limits, x);
-  }
-
-  // S x without forming S.
-  void product(const double* x, double* out) {
-    coupling_.load_step(x);
-    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-      Column<D>* y = &sums_[chunk * l_.n_free];
-      clear(y, l_.n_free);
-      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 v[3], p[3];
-        coupling_.project_step(i, v);
-        upper_times(coupling_.inverse_l(i), v, p);
-        coupling_.add_coupling(i, p, y);
-      }
-    });
-    each_sum([&](std::int64_t k, const Column<D>& sum) {
-      const Column<D> y = multiply(equations_.b[k], coupling_.step(k));
-      for (int i = 0; i < D; ++i) out[k * D + i] = at(y, i) - at(sum, i) + damping_c_[k * D + i] * x[k * D + i];
-    });
-    for (std::size_t k = 0; k < factors_.size(); ++k) {
-      const std::int64_t i = factors_.row[k], j = factors_.column[k];
-      add_multiplied<1>(pairs_[k], x + j * D, out + i * D);
-      add_multiplied_transposed<1>(pairs_[k], x + i * D, out + j * D);
-    }
-  }
-
-  void diagonal_blocks(double* out) {
-    const Block<D>* blocks = find_diagonal();
-    for (std::int64_t k = 0; k < l_.n_free; ++k) write_block(blocks[k], out + k * D * D, D);
-  }
-
-  // Step of the points for a step of the free keyframes (n_free x D), added to `base` unless that is null; returns the
-  // reduction of the undamped model.
-  //
-  // With y = L^-1 gp, v = Z' step_c and w = -(y + v) the points' step is p = L^-T w, and as C + D = L L' the model's
-  // curvature is step_c' B step_c + 2 w'v + |w|^2 - p' D p: E is not needed.
-  double back_substitute(const double* step_c, const double* base, double* out) {
-    coupling_.load_step(step_c);
-    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-      V8 slope{}, curvature{}, damping{};
-      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 v[3], w[3], p[3], x[3] = {};
-        coupling_.project_step(i, v);
-        const V8 *y = &scaled_gradient_[3 * i], *g = &equations_.gradient_p[3 * i], *d = &damping_p_[3 * i];
-        for (int c = 0; c < 3; ++c) w[c] = -(y[c] + v[c]);
-        upper_times(coupling_.inverse_l(i), w, p);
-        for (int c = 0; c < 3; ++c) {
-          slope += g[c] * p[c];
-          curvature += w[c] * (2 * v[c] + w[c]) - d[c] * p[c] * p[c];
-          damping += d[c] * p[c] * p[c];
-        }
-        if (base != nullptr) rows_.load_points(i, base, x);
-        for (int c = 0; c < 3; ++c) x[c] += p[c];
-        rows_.store_points(i, x, out);
-      }
-      part_[chunk] = {0.5 * sum(damping), -sum(slope) - 0.5 * sum(curvature)};
-    });
-    double reduction = total().after;
-    damping_cost_ = total().before;
-    for (std::int64_t i = 0; i < l_.n_free * D; ++i) damping_cost_ += 0.5 * damping_c_[i] * step_c[i] * step_c[i];
-    for (std::int64_t k = 0; k < l_.n_free; ++k)
-      reduction -= dot(equations_.gradient_c[k], coupling_.step(k)) + 0.5 * dot(multiply(equations_.b[k], coupling_.step(k)), coupling_.step(k));
-    for (std::size_t k = 0; k < factors_.size(); ++k) {
-      double moved[D] = {};
-      add_multiplied<1>(pairs_[k], step_c + factors_.column[k] * D, moved);
-      for (int i = 0; i < D; ++i) reduction -= step_c[factors_.row[k] * D + i] * moved[i];
-    }
-    return reduction;
-  }
-
-  // Take a step of the free keyframes (n_free x D) and those of the points that go with it from `from` to `to`, and
-  // polish the points after it. Objectives are not numbers where the state after the step is not finite.
-  Moved move(const StateView& from, const double* step_c, int steps, const StateSpan& to) {
-    Moved out;
-    is_ahead_ = false;
-    out.predicted = back_substitute(step_c, from.points, to.points);
-    out.damping = damping_cost_;
+  StepResult step(const StateView& from, const double* step_c, int steps, const StateSpan& to) override {
+    StepResult out;
+    is_prepared_ = false;
+    out.predicted = reduced_.back_substitute(step_c, from.points, to.points);
+    out.damping = reduced_.damping_cost();
     retract_keyframes(l_, from, step_c, D, to);
     const bool finite = all_finite(to.points, 3 * l_.n_points) && all_finite(to.rotation, 9 * l_.n_keyframes) &&
                         all_finite(to.translation, 3 * l_.n_keyframes) &&
@@ -298,7 +135,7 @@ class Kernel {
     if (!finite) return out;
     const StateView s{to.rotation, to.translation, to.points, to.intrinsics};
     if (steps > 0) {
-      out.objective = polish_points(s, to.points, steps);
+      out.objective = inner_iterations(s, to.points, steps);
     } else {
       out.objective.before = out.objective.after = objective(s);
     }
@@ -306,142 +143,39 @@ class Kernel {
   }
 
  private:
-  // kAhead: keep what a linearisation where it ends would begin with.
-  template <Lens kLens, bool kDepth, bool kAhead>
-  Polished polish_chunk(std::int64_t chunk, int thread, const StateView& s, double* points, int steps) {
+  // With is_ahead_ keeps what a linearisation where it ends would begin with.
+  template <Lens kLens, bool kDepth>
+  Objectives iterate_chunk(std::int64_t chunk, int thread, const StateView& s, double* points, int steps) {
     V8 before{}, after{};
     for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
       const std::int64_t slot_begin = l_.slot_begin[i];
-      V8 x[3], first, best;
+      V8 x[3], first{}, best{};
       PointSums sums;
-      V8* held = held_[thread].data();
-      const auto keep = [&](std::int64_t slot, const Seen& seen) {
-        if (kAhead) Equations<D>::template hold<kDepth>(seen, held + (slot - slot_begin) * Equations<D>::held_with(kDepth));
+      V8* staged = staged_[thread].data();
+      const auto keep = [&](std::int64_t slot, const Evaluation& obs) {
+        if (is_prepared_)
+          Equations<D>::template stage<kDepth>(obs, staged + (slot - slot_begin) * Equations<D>::staged_with(kDepth));
       };
       rows_.load_points(i, s.points, x);
-      polish_batch<kLens, kDepth>(rows_, slot_begin, l_.slot_begin[i + 1], steps, images_[thread].data(), keep, x, sums, first,
-                                  best);
+      iterate_batch<kLens, kDepth>(rows_, slot_begin, l_.slot_begin[i + 1], steps, images_[thread].data(), keep, x,
+                                   sums, first, best);
       rows_.store_points(i, x, points);
-      if (kAhead) equations_.template put_ahead<kDepth>(i, x, sums, held);
+      if (is_prepared_) equations_.template prepare<kDepth>(i, x, sums, staged);
       before += first;
       after += select(best < std::numeric_limits<double>::infinity(), best, V8{});
     }
     return {0.5 * sum(before), 0.5 * sum(after)};
   }
 
-  // damping(batch, out): of the points of a batch.
-  template <class Damping>
-  void factor_points(Damping damping) {
-    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-      Column<D>* sums = &sums_[chunk * l_.n_free];
-      clear(sums, l_.n_free);
-      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 d[3];
-        damping(i, d);
-        factor_batch(i, d, sums);
-      }
-    });
-    // -gc + Z L^-1 gp.
-    each_sum([&](std::int64_t k, const Column<D>& sum) {
-      rhs_[k].a = sum.a - equations_.gradient_c[k].a;
-      if constexpr (D == 9) rhs_[k].b = sum.b - equations_.gradient_c[k].b;
-    });
-  }
-
-  // L^-1 and y = L^-1 gp of a batch; adds Z y to `sums`.
-  void factor_batch(std::int64_t batch, const V8 (&damping)[3], Column<D>* sums) {
-    Packed& li = coupling_.inverse_l(batch);
-    V8 g[3], y[3], p[3];
-    for (int i = 0; i < 3; ++i) {
-      g[i] = equations_.gradient_p[3 * batch + i];
-      damping_p_[3 * batch + i] = damping[i];
-    }
-    inverse_cholesky(*reinterpret_cast<const Packed*>(&equations_.c[6 * batch]), damping, li);
-    lower_times(li, g, y);
-    for (int i = 0; i < 3; ++i) scaled_gradient_[3 * batch + i] = y[i];
-    upper_times(li, y, p);
-    coupling_.add_coupling(batch, p, sums);
-  }
-
-  // Call take(i, j, block) for the blocks S_ij with j >= i that are not zero.
-  template <class Take>
-  void each_block(Take take) {
-    const SparseSchur<D>& s = assemble();
-    for (std::int64_t i = 0; i < l_.n_free; ++i)
-      for (std::int64_t k = s.pattern().start[i]; k < s.pattern().start[i + 1]; ++k)
-        take(i, s.pattern().index[k], s.blocks()[k]);
-  }
-
-  // What M is made of, null for none.
-  const Block<D>* blocks_of(Preconditioner kind) {
-    if (kind == Preconditioner::kNone) return nullptr;
-    if (kind == Preconditioner::kSchurBlock || kind == Preconditioner::kSchurDiagonal) return find_diagonal();
-    own_.assign(l_.n_free, Block<D>{});
-    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, own_[k]);
-    return own_.data();
-  }
-
-  const Block<D>* find_diagonal() {
-    return schur().diagonal(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); });
-  }
-
-  SparseSchur<D>& schur() {
-    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, factors_, pool_.threads());
-    return *schur_;
-  }
-
-  // B and the damping of keyframe k, onto its diagonal block.
-  void add_diagonal(std::int64_t k, Block<D>& block) const {
-    add(block, equations_.b[k]);
-    for (int c = 0; c < D; ++c) set_entry(block, c, c, entry(block, c, c) + damping_c_[k * D + c]);
-  }
-
-  // Call put(k, sum) for each free keyframe with the sum of what the chunks have for it in sums_.
-  template <class Put>
-  void each_sum(Put put) {
-    pool_.each(kSumPieces, [&](std::int64_t piece, int) {
-      for (std::int64_t k = l_.n_free * piece / kSumPieces; k < l_.n_free * (piece + 1) / kSumPieces; ++k) {
-        Column<D> sum = sums_[k];
-        for (std::int64_t chunk = 1; chunk < l_.n_chunks(); ++chunk) add(sum, sums_[chunk * l_.n_free + k]);
-        put(k, sum);
-      }
-    });
-  }
-
-  Polished total() const {
-    Polished out;
-    for (const Polished& part : part_) {
-      out.before += part.before;
-      out.after += part.after;
-    }
-    return out;
-  }
-
-  static constexpr std::int64_t kSumPieces = 8;
-
-  double damping_cost_ = 0;
-
   Layout l_;
-  CoupledPairs factors_;
-  Buffer<Block<D>> pairs_;
   Rows rows_;
   Pool pool_;
   Equations<D> equations_;
-  Coupling<D> coupling_;
-  DenseCholesky cholesky_;
-  Pcg pcg_;
-  DiagonalInverse<D> inverse_;
-  Buffer<Block<D>> own_;
-  Buffer<double> rhs_as_given_;
-  Buffer<Column<D>> rhs_, sums_;  // sums_: of each chunk
-  Buffer<V8> scaled_gradient_, damping_p_;
-  std::vector<double> damping_c_;
-  std::vector<Polished> part_;
-  bool is_ahead_ = false;
+  ReducedSystem<D> reduced_;
+  std::vector<Objectives> partial_;
+  bool is_prepared_ = false;
   std::vector<Buffer<Images>> images_;  // of each thread
-  std::vector<Buffer<V8>> held_;        // the same: rows of a batch
-  std::unique_ptr<SparseSchur<D>> schur_;
-  std::unique_ptr<SparseCholesky<D>> factor_;
+  std::vector<Buffer<V8>> staged_;      // the same: rows of a batch
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -1,68 +1,51 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A problem sorted for the kernels: points in batches of eight, observations in slots, edges, images. Made once, then
-// only read.
+// A problem sorted for the kernels. Made once, then only read.
 //
-// A lane is a point. Points are numbered anew by their number of observations, most first, so that the eight of a batch
-// have about as many; slot j of a batch holds observation j of each. Lanes that have fewer are padded. So sums over the
-// observations of a point need no gathering, and neither do the points.
+// The words of these files:
+//
+// - lane:    one of the eight numbers that are worked on at once. Lane l of a batch is its point l.
+// - batch:   eight points. Points are numbered anew by their number of observations, most first, so that those of a
+//            batch have about as many.
+// - slot:    slot j of a batch holds observation j of each of its points; lanes that have fewer are padded. So sums
+// over
+//            the observations of a point need no gathering, and neither do the points.
+// - edge:    a point and a free keyframe that observes it, in however many images.
+// - record:  what is kept of an observation where the problem is linearised: its rows of the Jacobian, by registers.
+// - section: a quarter of the batches of a problem that is not small. Sections take about as long as one another.
+// - chunk:   neighbouring batches of a section that one thread works on, the unit of every loop over points.
+// - strip:   neighbouring batches whose blocks Z stay in the nearer caches while S is summed.
 #pragma once
 
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
-#include <numeric>
 
+#include "adjustment/types.hpp"
 #include "parallel/memory.hpp"
-#include "adjustment/project.hpp"
-#include "simd/simd.hpp"
+#include "simd/target.hpp"
 
 namespace ba {
 
-// Arrays of the caller; see core/problem.py for shapes. They outlive nothing: copied where kept.
-struct ProblemView {
-  std::int64_t n_keyframes, n_points, n_obs, n_cameras;
-  const std::int64_t *keyframe, *camera, *point;
-  const double *uv, *sigma, *depth, *depth_sigma;  // depth null if there is none
-  const double *camera_rotation, *camera_translation, *params;
-  const std::uint8_t* model;
-  const bool* fixed;
-};
-
-struct StateView {
-  const double *rotation, *translation, *points, *intrinsics;  // intrinsics null if the cameras' own are used
-};
+// What a whole problem needs; a lane with less distortion has zeros in the rest.
+enum class Lens : std::uint8_t { kPinhole, kRadial, kRational, kMixed };
 
 class Layout {
  public:
-  Layout(const ProblemView& p, bool own_intrinsics) : own_intrinsics(own_intrinsics) {
-    n_keyframes = p.n_keyframes;
-    n_points = p.n_points;
-    n_obs = p.n_obs;
-    n_cameras = p.n_cameras;
-    has_depth = p.depth != nullptr;
-    copy_cameras(p);
-    number_keyframes(p);
-    const Buffer<std::int64_t> order = sorted(p), first = number_points(p);
-    number_images(p);
-    fill_slots(p, order, first);
-    find_edges(p, order, first);
-    index_by_keyframe();
-    cut_chunks();
-  }
+  Layout(const ProblemView& p, bool own_intrinsics);
 
   // Whether every keyframe has its own f, k1, k2.
   bool own_intrinsics;
   bool has_depth = false;
-  // Whether a keyframe sees a point in more than one image.
+  // Whether a keyframe observes a point in more than one image.
   bool has_rigs = false;
   Lens lens = Lens::kPinhole;
   std::int64_t n_keyframes = 0, n_points = 0, n_obs = 0, n_cameras = 0, n_free = 0, n_batches = 0;
   // The caller's number of each point of ours; the last is repeated to fill the last batch.
   Buffer<std::int32_t> point;
   // Slots of batch b: slot_begin[b] to slot_begin[b + 1]. By slot and lane: image, edge that ends here (or -1), whether
-  // the edge is that of the slot before (if that happens or depth is measured), what was measured. inverse_sigma is 0 where there is nothing.
+  // the edge is that of the slot before (if that happens or depth is measured), what was measured. inverse_sigma is 0
+  // where there is nothing.
   Buffer<std::int64_t> slot_begin;
   Buffer<std::int32_t> slot_image, slot_edge;
   Buffer<double> same_edge, u, v, inverse_sigma, depth, inverse_depth_sigma;
@@ -71,18 +54,18 @@ class Layout {
   // The same by keyframe: edges_of_keyframe[keyframe_edge[k]] to [keyframe_edge[k + 1]].
   Buffer<std::int64_t> keyframe_edge;
   Buffer<std::int32_t> edges_of_keyframe;
-  // Observations (8 slot + lane) by free keyframe, those of keyframe k in quarter q (or all, if there are few) from
-  // keyframe_seen[q n_free + k] on, filled up to whole registers by one after the last; and where the x of their points
+  // Observations (8 slot + lane) by free keyframe, those of keyframe k in section q (or all, if there are few) from
+  // list_begin[q n_free + k] on, filled up to whole registers by one after the last; and where the x of their points
   // stand in registers by batch (three each).
-  Buffer<std::int64_t> keyframe_seen;
-  Buffer<std::int32_t> seen, seen_point;
+  Buffer<std::int64_t> list_begin;
+  Buffer<std::int32_t> listed, listed_point;
   // The caller's number of each free keyframe.
   Buffer<std::int64_t> free_keyframe;
   // Images: distinct keyframe * n_cameras + camera.
   Buffer<std::int64_t> images;
-  // Parts of the batches that can be worked on at the same time; the problem alone decides them. Quarters take about as
-  // long as one another in all that is done (a small problem has one part alone), chunks are about equal parts of them.
-  Buffer<std::int64_t> quarters, chunks;
+  // First batch of each section and of each chunk, and the number of batches. The problem alone decides them, never the
+  // number of threads. A small problem has one section.
+  Buffer<std::int64_t> sections, chunks;
   Buffer<double> camera_rotation, camera_translation, params;
   Buffer<std::uint8_t> model;
 
@@ -95,252 +78,34 @@ class Layout {
     return total;
   }
   std::int64_t n_chunks() const { return static_cast<std::int64_t>(chunks.size()) - 1; }
-  std::int64_t n_quarters() const { return static_cast<std::int64_t>(quarters.size()) - 1; }
-  // In how many parts the observations of each keyframe are listed.
-  std::int64_t n_seen_parts() const { return n_obs >= kSeenTogether * n_free ? n_quarters() : 1; }
+  std::int64_t n_sections() const { return static_cast<std::int64_t>(sections.size()) - 1; }
+  // How many lists the observations of each keyframe are in.
+  std::int64_t n_lists() const { return n_obs >= kMinListedApart * n_free ? n_sections() : 1; }
   // Lanes of a batch that are points, not padding.
   int lanes(std::int64_t batch) const {
     return static_cast<int>(std::min<std::int64_t>(kLanes, n_points - kLanes * batch));
   }
 
  private:
-  // Up to this many (keyframe, camera) pairs images are numbered by a table, beyond it by searching.
-  static constexpr std::int64_t kTableLimit = std::int64_t{1} << 20;
-  static constexpr std::int64_t kQuarters = 4, kMaxChunks = 32, kMinChunkSlots = 32;
-  // Batches are dealt to quarters in so many runs of neighbours at most, which meet the same keyframes.
-  static constexpr std::int64_t kMaxRuns = 256;
-  // Observations a keyframe up to which its list is not cut: each piece of it is filled up to a whole register.
-  static constexpr std::int64_t kSeenTogether = 128;
+  // Observations a keyframe up to which it has one list: each is filled up to a whole register.
+  static constexpr std::int64_t kMinListedApart = 128;
 
   Buffer<std::int32_t> column_;  // of each keyframe among the free ones, -1 if fixed
   Buffer<std::int32_t> table_;   // image of each (keyframe, camera), if there are few
 
-  void copy_cameras(const ProblemView& p) {
-    camera_rotation.assign(p.camera_rotation, p.camera_rotation + 9 * n_cameras);
-    camera_translation.assign(p.camera_translation, p.camera_translation + 3 * n_cameras);
-    params.assign(p.params, p.params + kParams * n_cameras);
-    model.assign(p.model, p.model + n_cameras);
-    lens = own_intrinsics ? Lens::kRadial : Lens::kPinhole;
-    for (std::int64_t c = 0; c < n_cameras; ++c) {
-      const double* k = &params[kParams * c];
-      Lens need = Lens::kPinhole;
-      for (int i = 4; i < kParams; ++i)
-        if (k[i] != 0.0) need = std::max(need, i < 6 ? Lens::kRadial : Lens::kRational);
-      if (model[c] != 0) need = Lens::kMixed;
-      lens = std::max(lens, need);
-    }
-  }
-
-  void number_keyframes(const ProblemView& p) {
-    column_.assign(n_keyframes, -1);
-    for (std::int64_t k = 0; k < n_keyframes; ++k) {
-      if (p.fixed[k]) continue;
-      column_[k] = static_cast<std::int32_t>(n_free++);
-      free_keyframe.push_back(k);
-    }
-  }
-
-  // Order of the observations by (point, keyframe); empty if that is theirs already, as in the back-end's windows.
-  Buffer<std::int64_t> sorted(const ProblemView& p) const {
-    const auto before = [&p](std::int64_t a, std::int64_t b) {
-      return p.point[a] != p.point[b] ? p.point[a] < p.point[b] : p.keyframe[a] < p.keyframe[b];
-    };
-    std::int64_t i = 1;
-    while (i < n_obs && !before(i, i - 1)) ++i;
-    if (i >= n_obs) return {};
-    Buffer<std::int64_t> order(n_obs);
-    std::iota(order.begin(), order.end(), std::int64_t{0});
-    std::stable_sort(order.begin(), order.end(), before);
-    return order;
-  }
-
-  // Points by the first keyframe that sees them: neighbours in memory then meet the same keyframes.
-  Buffer<std::int32_t> points_by_keyframe(const ProblemView& p) const {
-    Buffer<std::int32_t> lowest(n_points, static_cast<std::int32_t>(n_keyframes));
-    for (std::int64_t o = 0; o < n_obs; ++o)
-      lowest[p.point[o]] = std::min(lowest[p.point[o]], static_cast<std::int32_t>(p.keyframe[o]));
-    Buffer<std::int64_t> place(n_keyframes + 2, 0);
-    for (std::int32_t k : lowest) ++place[k + 1];
-    std::partial_sum(place.begin(), place.end(), place.begin());
-    Buffer<std::int32_t> out(n_points);
-    for (std::int64_t i = 0; i < n_points; ++i) out[place[lowest[i]]++] = static_cast<std::int32_t>(i);
-    return out;
-  }
-
-  // Number points and give batches their slots; returns where each of our points' observations begin, and how many.
-  Buffer<std::int64_t> number_points(const ProblemView& p) {
-    Buffer<std::int64_t> begin(n_points + 1, 0);
-    for (std::int64_t o = 0; o < n_obs; ++o) ++begin[p.point[o] + 1];
-    const std::int64_t most = *std::max_element(begin.begin(), begin.end());
-    n_batches = (n_points + kLanes - 1) / kLanes;
-    point.resize(kLanes * n_batches);
-    const Buffer<std::int32_t> by_keyframe = points_by_keyframe(p);
-    Buffer<std::int64_t> place(most + 2, 0);  // of the points with so many observations, most first
-    for (std::int64_t i = 0; i < n_points; ++i) ++place[most - begin[i + 1] + 1];
-    std::partial_sum(place.begin(), place.end(), place.begin());
-    for (std::int32_t i : by_keyframe) point[place[most - begin[i + 1]]++] = i;
-    deal_batches();
-    for (std::int64_t i = n_points; i < kLanes * n_batches; ++i) point[i] = point[n_points - 1];
-    slot_begin.assign(n_batches + 1, 0);
-    for (std::int64_t b = 0; b < n_batches; ++b) slot_begin[b + 1] = slot_begin[b] + begin[point[kLanes * b] + 1];
-    std::partial_sum(begin.begin(), begin.end(), begin.begin());
-    Buffer<std::int64_t> first(2 * point.size(), 0);
-    for (std::int64_t i = 0; i < n_points; ++i) {
-      first[2 * i] = begin[point[i]];
-      first[2 * i + 1] = begin[point[i] + 1] - begin[point[i]];
-    }
-    return first;
-  }
-
-  // Cut the batches into quarters that have as many points of many observations as one another. The last batch, which may
-  // be incomplete, stays the last.
-  void deal_batches() {
-    quarters.push_back(0);
-    const std::int64_t whole = n_points / kLanes, run = std::max<std::int64_t>(1, whole / kMaxRuns);
-    if (n_obs >= kQuarters * kMinChunkSlots * kLanes) {
-      Buffer<std::int32_t> dealt;
-      dealt.reserve(point.size());
-      for (std::int64_t quarter = 0; quarter < kQuarters; ++quarter) {
-        for (std::int64_t first = quarter * run; first < whole; first += kQuarters * run)
-          dealt.insert(dealt.end(), point.begin() + kLanes * first, point.begin() + kLanes * std::min(whole, first + run));
-        if (quarter + 1 < kQuarters) quarters.push_back(static_cast<std::int64_t>(dealt.size()) / kLanes);
-      }
-      std::copy(dealt.begin(), dealt.end(), point.begin());
-    }
-    quarters.push_back(n_batches);
-  }
-
-  std::int64_t image_key(const ProblemView& p, std::int64_t o) const { return p.keyframe[o] * n_cameras + p.camera[o]; }
-
-  void number_images(const ProblemView& p) {
-    const std::int64_t pairs = n_keyframes * n_cameras;
-    if (pairs > kTableLimit) {
-      images.resize(n_obs);
-      for (std::int64_t o = 0; o < n_obs; ++o) images[o] = image_key(p, o);
-      std::sort(images.begin(), images.end());
-      images.erase(std::unique(images.begin(), images.end()), images.end());
-      return;
-    }
-    table_.assign(pairs, -1);
-    for (std::int64_t o = 0; o < n_obs; ++o) table_[image_key(p, o)] = 0;
-    for (std::int64_t i = 0; i < pairs; ++i) {
-      if (table_[i] < 0) continue;
-      table_[i] = static_cast<std::int32_t>(images.size());
-      images.push_back(i);
-    }
-  }
-
-  std::int32_t image_of(std::int64_t key) const {
-    if (!table_.empty()) return table_[key];
-    return static_cast<std::int32_t>(std::lower_bound(images.begin(), images.end(), key) - images.begin());
-  }
-
-  void fill_slots(const ProblemView& p, const Buffer<std::int64_t>& order, const Buffer<std::int64_t>& first) {
-    const std::int64_t size = kLanes * n_slots();
-    slot_image.assign(size, 0);
-    u.assign(size, 0.0);
-    v.assign(size, 0.0);
-    inverse_sigma.assign(size, 0.0);
-    depth.assign(has_depth ? size : 0, 0.0);
-    inverse_depth_sigma.assign(depth.size(), 0.0);
-    for (std::int64_t i = 0; i < n_points; ++i) {
-      for (std::int64_t j = 0; j < first[2 * i + 1]; ++j) {
-        const std::int64_t o = order.empty() ? first[2 * i] + j : order[first[2 * i] + j];
-        const std::int64_t at = kLanes * (slot_begin[i / kLanes] + j) + i % kLanes;
-        slot_image[at] = image_of(image_key(p, o));
-        u[at] = p.uv[2 * o];
-        v[at] = p.uv[2 * o + 1];
-        inverse_sigma[at] = 1.0 / p.sigma[o];
-        if (has_depth && !std::isnan(p.depth[o])) {
-          depth[at] = p.depth[o];
-          inverse_depth_sigma[at] = 1.0 / p.depth_sigma[o];
-        }
-      }
-    }
-  }
-
-  void find_edges(const ProblemView& p, const Buffer<std::int64_t>& order, const Buffer<std::int64_t>& first) {
-    slot_edge.assign(slot_image.size(), -1);
-    if (has_depth) same_edge.assign(slot_image.size(), 0.0);
-    point_edge.assign(point.size() + 1, 0);
-    edge_column.reserve(n_obs);
-    for (std::int64_t i = 0; i < n_points; ++i) {
-      std::int32_t last = -1;
-      for (std::int64_t j = 0; j < first[2 * i + 1]; ++j) {
-        const std::int64_t o = order.empty() ? first[2 * i] + j : order[first[2 * i] + j];
-        const std::int64_t at = kLanes * (slot_begin[i / kLanes] + j) + i % kLanes;
-        const std::int32_t column = column_[p.keyframe[o]];
-        if (column < 0) continue;
-        if (column == last) {
-          has_rigs = true;
-          same_edge.resize(slot_image.size(), 0.0);
-          same_edge[at] = 1.0;
-          slot_edge[at - kLanes] = -1;
-        } else {
-          edge_column.push_back(column);
-        }
-        slot_edge[at] = static_cast<std::int32_t>(edge_column.size()) - 1;
-        last = column;
-      }
-      point_edge[i + 1] = static_cast<std::int32_t>(edge_column.size());
-    }
-    for (std::size_t i = n_points; i < point.size(); ++i) point_edge[i + 1] = point_edge[i];
-  }
-
-  void index_by_keyframe() {
-    keyframe_edge.assign(n_free + 1, 0);
-    for (std::int32_t k : edge_column) ++keyframe_edge[k + 1];
-    std::partial_sum(keyframe_edge.begin(), keyframe_edge.end(), keyframe_edge.begin());
-    edges_of_keyframe.resize(edge_column.size());
-    edge_end.resize(edge_column.size());
-    Buffer<std::int64_t> next(keyframe_edge.begin(), keyframe_edge.end() - 1);
-    for (std::int64_t p = 0; p < n_points; ++p) {
-      for (std::int32_t e = point_edge[p]; e < point_edge[p + 1]; ++e) {
-        edges_of_keyframe[next[edge_column[e]]++] = e;
-        edge_end[e] = point_edge[p + 1];
-      }
-    }
-    list_seen();
-  }
-
-  void list_seen() {
-    const std::int64_t parts = n_seen_parts(), lists = parts * n_free;
-    // take(list, observation, where its point is)
-    const auto each = [this, parts](auto take) {
-      for (std::int64_t part = 0; part < parts; ++part)
-        for (std::int64_t b = quarters[part]; b < (parts > 1 ? quarters[part + 1] : n_batches); ++b)
-          for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at) {
-            if (inverse_sigma[at] == 0.0) continue;
-            const std::int64_t k = column_[images[slot_image[at]] / n_cameras];
-            if (k >= 0) take(part * n_free + k, at, 3 * kLanes * b + at % kLanes);
-          }
-    };
-    keyframe_seen.assign(lists + 1, 0);
-    each([this](std::int64_t list, std::int64_t, std::int64_t) { ++keyframe_seen[list + 1]; });
-    for (std::int64_t i = 0; i < lists; ++i)
-      keyframe_seen[i + 1] = keyframe_seen[i] + (keyframe_seen[i + 1] + kLanes - 1) / kLanes * kLanes;
-    seen.assign(keyframe_seen[lists], static_cast<std::int32_t>(kLanes * n_slots()));
-    seen_point.assign(seen.size(), 0);
-    Buffer<std::int64_t> next(keyframe_seen.begin(), keyframe_seen.end());
-    each([this, &next](std::int64_t list, std::int64_t at, std::int64_t x) {
-      seen[next[list]] = static_cast<std::int32_t>(at);
-      seen_point[next[list]++] = static_cast<std::int32_t>(x);
-    });
-  }
-
-  void cut_chunks() {
-    const std::int64_t most = kMaxChunks / n_quarters(), least = n_quarters() * kMinChunkSlots;
-    const std::int64_t count = n_quarters() == 1 ? 1 : std::clamp<std::int64_t>(n_slots() / least, 1, most);
-    chunks.push_back(0);
-    for (std::int64_t quarter = 0; quarter < n_quarters(); ++quarter) {
-      const std::int64_t first = slot_begin[quarters[quarter]], slots = slot_begin[quarters[quarter + 1]] - first;
-      for (std::int64_t i = 1; i <= count; ++i) {
-        const auto end = std::lower_bound(slot_begin.begin(), slot_begin.end(), first + slots * i / count);
-        chunks.push_back(std::max<std::int64_t>(chunks.back(), end - slot_begin.begin()));
-      }
-      chunks.back() = quarters[quarter + 1];
-    }
-  }
+  void copy_cameras(const ProblemView& p);
+  void number_keyframes(const ProblemView& p);
+  Buffer<std::int64_t> sorted(const ProblemView& p) const;
+  Buffer<std::int32_t> points_by_keyframe(const ProblemView& p) const;
+  Buffer<std::int64_t> number_points(const ProblemView& p);
+  void deal_batches();
+  void number_images(const ProblemView& p);
+  std::int32_t image_of(std::int64_t key) const;
+  void fill_slots(const ProblemView& p, const Buffer<std::int64_t>& order, const Buffer<std::int64_t>& first);
+  void find_edges(const ProblemView& p, const Buffer<std::int64_t>& order, const Buffer<std::int64_t>& first);
+  void index_by_keyframe();
+  void list_observations();
+  void cut_chunks();
 };
 
 }  // namespace ba

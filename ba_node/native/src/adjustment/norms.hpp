@@ -13,7 +13,7 @@
 #include "adjustment/project.hpp"
 #include "adjustment/rows.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // x in the camera frame of one observation, m: Rc (R x + t) + tc.
 inline void in_camera(const ProblemView& p, const StateView& s, std::int64_t o, double* out) {
@@ -22,8 +22,7 @@ inline void in_camera(const ProblemView& p, const StateView& s, std::int64_t o, 
   const double* x = s.points + 3 * p.point[o];
   double body[3];
   for (int i = 0; i < 3; ++i) body[i] = r[3 * i] * x[0] + r[3 * i + 1] * x[1] + r[3 * i + 2] * x[2] + t[i];
-  for (int i = 0; i < 3; ++i)
-    out[i] = q[3 * i] * body[0] + q[3 * i + 1] * body[1] + q[3 * i + 2] * body[2] + move[i];
+  for (int i = 0; i < 3; ++i) out[i] = q[3 * i] * body[0] + q[3 * i + 1] * body[1] + q[3 * i + 2] * body[2] + move[i];
 }
 
 template <Lens kLens>
@@ -61,4 +60,4 @@ inline void residual_norms(const ProblemView& p, const StateView& s, double* out
     residual_norms_as<Lens::kRational>(p, s, out);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -7,16 +7,13 @@
 #include <cmath>
 #include <cstdint>
 
+#include "adjustment/layout.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
-constexpr int kParams = 12;
 // As in core/cameras.py: nearest depth, m; cosine of the largest angle to the axis of an equidistant camera.
 constexpr double kMinDepth = 1e-6, kLeastCosine = -0.8660254037844387;
-
-// What a whole problem needs; a lane with less distortion has zeros in the rest.
-enum class Lens : std::uint8_t { kPinhole, kRadial, kRational, kMixed };
 
 // Parameters of the cameras of eight observations, as far as the lens needs them.
 struct Cameras {
@@ -99,7 +96,8 @@ inline void project_fisheye(const V8 (&x)[3], const Cameras& c, Projected& out) 
   }
 }
 
-// Which lanes no camera of their model can see, cameras.behind of core/cameras.py; with keep, as far as a number is left.
+// Which lanes no camera of their model can see, cameras.behind of core/cameras.py; with keep, as far as a number is
+// left.
 template <Lens kLens>
 [[gnu::always_inline]] inline Mask behind(const V8 (&x)[3], const Cameras& c, bool keep) {
   const Mask plane = keep ? magnitude(x[2]) < kMinDepth * 1e-6 : x[2] <= kMinDepth;
@@ -121,7 +119,7 @@ template <Lens kLens, bool kDerivatives>
   const V8 iz = 1.0 / x[2];
   const V8 a = x[0] * iz, b = x[1] * iz;
   const V8 fx = c.param[0], fy = c.param[1];
-  V8 da = a, db = b;                                     // distorted ray
+  V8 da = a, db = b;                                    // distorted ray
   V8 jaa = splat(1.0), jab{}, jba{}, jbb = splat(1.0);  // its derivative by (a, b)
   Bend n{};
   if constexpr (kLens != Lens::kPinhole) {
@@ -162,4 +160,4 @@ template <Lens kLens, bool kDerivatives>
   if constexpr (kLens == Lens::kMixed) project_fisheye<kDerivatives>(x, c, out);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

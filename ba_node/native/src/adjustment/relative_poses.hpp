@@ -9,41 +9,25 @@
 #include <cstdint>
 #include <vector>
 
-#include "adjustment/layout.hpp"
+#include "simd/target.hpp"
+#include "targets/target.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
-enum class FactorLoss : std::uint8_t { kSquared, kHuber, kCauchy };
-
-// Arrays of the caller: n x 2 keyframes, n x 9 rotation and n x 3 translation of j in i, n x 36 W; copied.
-struct RelativePosesView {
-  std::int64_t n;
-  const std::int64_t* keyframes;
-  const double *rotation, *translation, *root_information;
-  FactorLoss loss;
-  double loss_scale;
-};
-
-// Sums that the factors are added to: n_free x 6, n_free x 36, n_pairs x 36.
-struct FactorSums {
-  double *gradient, *diagonal, *pairs;
-};
-
-class RelativePoses {
+class RelativePoses final : public RelativePoseFactors {
  public:
-  // column: of each keyframe among the free ones, -1 if fixed; pair: n, of each factor, -1 if one end is fixed.
-  RelativePoses(const RelativePosesView& p, const std::int64_t* column, std::int64_t n_keyframes, const std::int64_t* pair)
+  // The arrays are copied.
+  explicit RelativePoses(const RelativePosesView& p)
       : keyframes_(p.keyframes, p.keyframes + 2 * p.n),
-        column_(column, column + n_keyframes),
-        pair_(pair, pair + p.n),
+        column_(p.column, p.column + p.n_keyframes),
+        pair_(p.pair, p.pair + p.n),
         rotation_(p.rotation, p.rotation + 9 * p.n),
         translation_(p.translation, p.translation + 3 * p.n),
         root_(p.root_information, p.root_information + 36 * p.n),
         loss_(p.loss),
         scale_(p.loss_scale) {}
 
-  // 1/2 sum Psi.
-  double value(const StateView& s) const {
+  double value(const StateView& s) const override {
     double total = 0;
     for (std::size_t f = 0; f < pair_.size(); ++f) {
       double e[6], r[6], weight;
@@ -54,8 +38,7 @@ class RelativePoses {
     return 0.5 * total;
   }
 
-  // The same; adds what belongs to the gradient and to the blocks.
-  double linearise(const StateView& s, const FactorSums& out) const {
+  double linearise(const StateView& s, const FactorSums& out) const override {
     double total = 0;
     for (std::size_t f = 0; f < pair_.size(); ++f) {
       double e[6], r[6], a[36], weight;
@@ -125,8 +108,8 @@ class RelativePoses {
     double squared = 0;
     for (int i = 0; i < 6; ++i) squared += r[i] * r[i];
     weight = 1.0;
-    if (loss_ == FactorLoss::kSquared) return squared;
-    if (loss_ == FactorLoss::kHuber) {
+    if (loss_ == Loss::kSquared) return squared;
+    if (loss_ == Loss::kHuber) {
       const double norm = std::sqrt(squared), near = std::min(norm, scale_);
       weight = scale_ / std::max(norm, scale_);
       return near * (2.0 * norm - near);
@@ -189,9 +172,10 @@ class RelativePoses {
       const double half = 0.5 * std::sqrt(angle2);
       factor = (1.0 - half * std::cos(half) / std::sin(half)) / angle2;
     }
-    const double full[9] = {1.0 - factor * (y * y + z * z), factor * x * y - 0.5 * z,       factor * x * z + 0.5 * y,
-                            factor * x * y + 0.5 * z,       1.0 - factor * (x * x + z * z), factor * y * z - 0.5 * x,
-                            factor * x * z - 0.5 * y,       factor * y * z + 0.5 * x,       1.0 - factor * (x * x + y * y)};
+    const double full[9] = {
+        1.0 - factor * (y * y + z * z), factor * x * y - 0.5 * z,       factor * x * z + 0.5 * y,
+        factor * x * y + 0.5 * z,       1.0 - factor * (x * x + z * z), factor * y * z - 0.5 * x,
+        factor * x * z - 0.5 * y,       factor * y * z + 0.5 * x,       1.0 - factor * (x * x + y * y)};
     std::copy_n(full, 9, out);
   }
 
@@ -199,8 +183,8 @@ class RelativePoses {
 
   std::vector<std::int64_t> keyframes_, column_, pair_;
   std::vector<double> rotation_, translation_, root_;
-  FactorLoss loss_;
+  Loss loss_;
   double scale_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -10,12 +10,7 @@
 
 #include "adjustment/layout.hpp"
 
-namespace ba {
-
-// Where a state is written: as StateView.
-struct StateSpan {
-  double *rotation, *translation, *points, *intrinsics;
-};
+namespace ba::BA_TARGET {
 
 // The rotation of a rotation vector, by Rodrigues' formula, row by row.
 inline void so3_exp(const double* phi, double* out) {
@@ -32,7 +27,8 @@ inline void so3_exp(const double* phi, double* out) {
 }
 
 // All poses, and intrinsics where they are free, after a step (n_free x size) of the free ones.
-inline void retract_keyframes(const Layout& l, const StateView& from, const double* step, int size, const StateSpan& to) {
+inline void retract_keyframes(const Layout& l, const StateView& from, const double* step, int size,
+                              const StateSpan& to) {
   std::copy_n(from.rotation, 9 * l.n_keyframes, to.rotation);
   std::copy_n(from.translation, 3 * l.n_keyframes, to.translation);
   if (l.own_intrinsics) std::copy_n(from.intrinsics, 3 * l.n_keyframes, to.intrinsics);
@@ -56,4 +52,4 @@ inline bool all_finite(const double* first, std::int64_t count) {
   return std::all_of(first, first + count, [](double x) { return std::isfinite(x); });
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

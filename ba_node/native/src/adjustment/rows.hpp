@@ -15,18 +15,12 @@
 #include "adjustment/project.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
-
-enum class Loss : std::uint8_t { kSquared, kHuber, kCauchy };
-enum class Cheirality : std::uint8_t { kKeep, kConstant, kDrop };
-
-struct Rules {
-  Loss loss = Loss::kSquared;
-  double scale = 1.0;
-  Cheirality cheirality = Cheirality::kKeep;
-};
+namespace ba::BA_TARGET {
 
 constexpr double kBehindNorm = 100.0;
+
+// Diagonal entries below this are not damped by less.
+constexpr double kMinDiagonal = 1e-6;
 
 // The images of eight observations.
 struct Images {
@@ -36,7 +30,7 @@ struct Images {
 };
 
 // Eight observations. Derivatives and residuals are whitened; rows u, v and depth.
-struct Seen {
+struct Evaluation {
   V8 residual[3];
   V8 d_point[3][3];
   V8 d_intrinsics[2][3];
@@ -82,20 +76,28 @@ inline void upper_times(const Packed& li, const V8 (&x)[3], V8 (&out)[3]) {
 
 class Rows {
  public:
-  Rows(Layout& layout, const Rules& rules, const StateView& start)
-      : l_(layout), rules_(rules), stride_(layout.lens == Lens::kPinhole ? 16 : layout.lens == Lens::kMixed ? 32 : 24) {
+  Rows(Layout& layout, const CostModel& cost_model, const StateView& start)
+      : l_(layout),
+        cost_(cost_model),
+        stride_(layout.lens == Lens::kPinhole ? 16
+                : layout.lens == Lens::kMixed ? 32
+                                              : 24) {
     image_.assign(stride_ * std::max<std::size_t>(l_.images.size(), 1), 0.0);
-    if (rules_.cheirality == Cheirality::kDrop) drop_behind(layout, start);
+    if (cost_.cheirality == Cheirality::kDrop) drop_behind(layout, start);
   }
 
-  // Call f<lens, depth>() for the lens that the problem needs and whether it measures depth.
-  template <class F>
-  auto with_kind(F f) const {
-    switch (l_.lens) {
-      case Lens::kPinhole: return with_depth<Lens::kPinhole>(f);
-      case Lens::kRadial: return with_depth<Lens::kRadial>(f);
-      case Lens::kRational: return with_depth<Lens::kRational>(f);
-      default: return with_depth<Lens::kMixed>(f);
+  // Call f(lens, depth) with the lens that the problem needs and whether it measures depth, both as types. Where
+  // keyframes have intrinsics of their own (D = 9) the lens is radial at least.
+  template <int D, class F>
+  void with_kind(F f) const {
+    if (l_.lens == Lens::kMixed) {
+      with_depth<Lens::kMixed>(f);
+    } else if (l_.lens == Lens::kRational) {
+      with_depth<Lens::kRational>(f);
+    } else if (D == 9 || l_.lens == Lens::kRadial) {
+      with_depth<Lens::kRadial>(f);
+    } else if constexpr (D == 6) {
+      with_depth<Lens::kPinhole>(f);
     }
   }
 
@@ -147,13 +149,14 @@ class Rows {
 
   // Everything about the observations of a slot; without derivatives residual and cost alone.
   template <Lens kLens, bool kDepth, bool kDerivatives>
-  [[gnu::always_inline]] void see(std::int64_t slot, const Images& im, const V8 (&x)[3], Seen& out) const {
+  [[gnu::always_inline]] void evaluate(std::int64_t slot, const Images& im, const V8 (&x)[3], Evaluation& out) const {
     const std::int64_t at = kLanes * slot;
     V8 y[3];
     for (int i = 0; i < 3; ++i)
-      y[i] = im.rotation[3 * i] * x[0] + im.rotation[3 * i + 1] * x[1] + im.rotation[3 * i + 2] * x[2] + im.translation[i];
+      y[i] =
+          im.rotation[3 * i] * x[0] + im.rotation[3 * i + 1] * x[1] + im.rotation[3 * i + 2] * x[2] + im.translation[i];
     const V8 whiten = load(&l_.inverse_sigma[at]);
-    const bool keep = rules_.cheirality == Cheirality::kKeep;
+    const bool keep = cost_.cheirality == Cheirality::kKeep;
     const Mask hidden = behind<kLens>(y, im.cameras, keep), none = whiten == 0.0, off = hidden | none;
     y[0] = select(off, V8{}, y[0]);
     y[1] = select(off, V8{}, y[1]);
@@ -188,7 +191,8 @@ class Rows {
   // The points of a batch, from the caller's array.
   void load_points(std::int64_t batch, const double* points, V8 (&x)[3]) const {
     const std::int32_t* of_lane = &l_.point[kLanes * batch];
-    for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[3 * static_cast<std::int64_t>(of_lane[l]) + i]; });
+    for (int i = 0; i < 3; ++i)
+      x[i] = each([=](int l) { return points[3 * static_cast<std::int64_t>(of_lane[l]) + i]; });
   }
   void store_points(std::int64_t batch, const V8 (&x)[3], double* points) const {
     for (int l = 0; l < l_.lanes(batch); ++l) {
@@ -206,10 +210,10 @@ class Rows {
       load_points(b, s.points, x);
       for (std::int64_t slot = l_.slot_begin[b]; slot < l_.slot_begin[b + 1]; ++slot) {
         Images im;
-        Seen seen;
+        Evaluation obs;
         gather<kLens>(slot, im);
-        see<kLens, kDepth, false>(slot, im, x, seen);
-        total += seen.cost;
+        evaluate<kLens, kDepth, false>(slot, im, x, obs);
+        total += obs.cost;
       }
     }
     return 0.5 * sum(total);
@@ -217,9 +221,12 @@ class Rows {
 
  private:
   template <Lens kLens, class F>
-  auto with_depth(F f) const {
-    return l_.has_depth ? f(std::integral_constant<Lens, kLens>(), std::true_type())
-                        : f(std::integral_constant<Lens, kLens>(), std::false_type());
+  void with_depth(F f) const {
+    if (l_.has_depth) {
+      f(std::integral_constant<Lens, kLens>(), std::true_type());
+    } else {
+      f(std::integral_constant<Lens, kLens>(), std::false_type());
+    }
   }
 
   [[gnu::always_inline]] void columns(const std::int32_t* image, int offset, V8 (&r)[8]) const {
@@ -229,19 +236,19 @@ class Rows {
   }
 
   double cost_of(double norm) const {
-    if (rules_.loss == Loss::kCauchy)
-      return rules_.scale * rules_.scale * std::log1p(norm * norm / (rules_.scale * rules_.scale));
-    if (rules_.loss == Loss::kSquared || norm <= rules_.scale) return norm * norm;
-    return rules_.scale * (2 * norm - rules_.scale);
+    if (cost_.loss == Loss::kCauchy)
+      return cost_.scale * cost_.scale * std::log1p(norm * norm / (cost_.scale * cost_.scale));
+    if (cost_.loss == Loss::kSquared || norm <= cost_.scale) return norm * norm;
+    return cost_.scale * (2 * norm - cost_.scale);
   }
 
   // Psi and the IRLS weight of residuals of a squared norm.
   [[gnu::always_inline]] void robust(V8 norm2, V8& cost, V8& weight) const {
     cost = norm2;
     weight = splat(1.0);
-    if (rules_.loss == Loss::kSquared) return;
-    const double c = rules_.scale;
-    if (rules_.loss == Loss::kCauchy) {
+    if (cost_.loss == Loss::kSquared) return;
+    const double c = cost_.scale;
+    if (cost_.loss == Loss::kCauchy) {
       const V8 ratio = norm2 * (1.0 / (c * c));
       cost = (c * c) * log1p(ratio);
       weight = 1.0 / (1.0 + ratio);
@@ -265,7 +272,8 @@ class Rows {
         const double* r = &image_[stride_ * l_.slot_image[at]];
         const int l = static_cast<int>(at % kLanes);
         double y[3];
-        for (int i = 0; i < 3; ++i) y[i] = r[3 * i] * x[0][l] + r[3 * i + 1] * x[1][l] + r[3 * i + 2] * x[2][l] + r[9 + i];
+        for (int i = 0; i < 3; ++i)
+          y[i] = r[3 * i] * x[0][l] + r[3 * i + 1] * x[1][l] + r[3 * i + 2] * x[2][l] + r[9 + i];
         const bool fisheye = l_.lens == Lens::kMixed && r[12 + kParams] != 0.0;
         if (is_behind(y, fisheye)) layout.inverse_sigma[at] = 0.0;
       }
@@ -273,9 +281,9 @@ class Rows {
   }
 
   const Layout& l_;
-  Rules rules_;
+  CostModel cost_;
   std::int64_t stride_;  // doubles an image: rotation, translation, parameters
   Buffer<double> image_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

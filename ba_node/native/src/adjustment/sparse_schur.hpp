@@ -9,41 +9,34 @@
 #include <limits>
 #include <vector>
 
-#include "linalg/block_fill.hpp"
-#include "linalg/blocks.hpp"
 #include "adjustment/coupling.hpp"
 #include "adjustment/layout.hpp"
+#include "linalg/block_fill.hpp"
+#include "linalg/blocks.hpp"
 #include "parallel/pool.hpp"
 
-namespace ba {
-
-// Pairs (i, j > i) of free keyframes, sorted, that factors couple.
-struct CoupledPairs {
-  std::vector<std::int32_t> row, column;
-
-  std::size_t size() const { return row.size(); }
-};
+namespace ba::BA_TARGET {
 
 // Pairs (i, j >= i) of free keyframes that share a point or a factor, the diagonal first in each row.
 inline Rows32 coupled(const Layout& l, const CoupledPairs& factors) {
   Rows32 upper;
-  std::vector<std::int32_t> seen_by(l.n_free, -1);
+  std::vector<std::int32_t> met_by(l.n_free, -1);
   std::size_t next = 0;
   for (std::int64_t i = 0; i < l.n_free; ++i) {
     const auto row = static_cast<std::int32_t>(i);
     upper.index.push_back(row);
-    seen_by[i] = row;
+    met_by[i] = row;
     for (std::int64_t k = l.keyframe_edge[i]; k < l.keyframe_edge[i + 1]; ++k) {
       const std::int64_t e = l.edges_of_keyframe[k];
       for (std::int64_t f = e; f < l.edge_end[e]; ++f) {
         const std::int32_t j = l.edge_column[f];
-        if (seen_by[j] == row) continue;
-        seen_by[j] = row;
+        if (met_by[j] == row) continue;
+        met_by[j] = row;
         upper.index.push_back(j);
       }
     }
     for (; next < factors.size() && factors.row[next] == row; ++next)
-      if (seen_by[factors.column[next]] != row) upper.index.push_back(factors.column[next]);
+      if (met_by[factors.column[next]] != row) upper.index.push_back(factors.column[next]);
     upper.close_row();
     std::sort(upper.index.begin() + upper.start[i] + 1, upper.index.end());
   }
@@ -57,12 +50,13 @@ class SparseSchur {
     cut_points();
     order_edges();
     scratch_.resize(most_edges_ * threads);
-    blocks_.resize(n_blocks() * groups());
-    diagonal_.resize(l_.n_free * groups());
+    blocks_.resize(n_blocks() * n_partials());
+    diagonal_.resize(l_.n_free * n_partials());
     index_rows();
     for (std::size_t k = 0; k < factors.size(); ++k) {
       const std::int32_t* index = pattern_.index.data();
-      const std::int32_t *first = index + pattern_.start[factors.row[k]], *stop = index + pattern_.start[factors.row[k] + 1];
+      const std::int32_t *first = index + pattern_.start[factors.row[k]],
+                         *stop = index + pattern_.start[factors.row[k] + 1];
       place_of_pair_.push_back(std::lower_bound(first, stop, factors.column[k]) - index);
     }
   }
@@ -83,17 +77,17 @@ class SparseSchur {
     }
   }
 
-  // S = B + damping - Z Z'. add_diagonal(k, block): add B and damping of keyframe k. pairs: blocks of B of the pairs that
-  // factors couple.
+  // S = B + damping - Z Z'. add_diagonal(k, block): add B and damping of keyframe k. pairs: blocks of B of the pairs
+  // that factors couple.
   template <class Add>
   void assemble(Pool& pool, const Coupling<D>& coupling, Add add_diagonal, const Buffer<Block<D>>& pairs) {
-    pool.each(groups(), [&](std::int64_t group, int thread) {
-      Block<D>* blocks = &blocks_[group * n_blocks()];
+    pool.each(n_partials(), [&](std::int64_t partial, int thread) {
+      Block<D>* blocks = &blocks_[partial * n_blocks()];
       clear(blocks, n_blocks());
-      each_stretch(group, coupling, thread, [&](std::int32_t e, const Edge<D>* z) { sum_edge(e, z, blocks); });
+      each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) { sum_edge(e, z, blocks); });
     });
-    pool.each(groups() > 1 ? kPieces : 0, [&](std::int64_t piece, int) {
-      add_groups(blocks_.data(), n_blocks(), n_blocks() * piece / kPieces, n_blocks() * (piece + 1) / kPieces);
+    pool.each(n_partials() > 1 ? kSumTasks : 0, [&](std::int64_t task, int) {
+      add_partials(blocks_.data(), n_blocks(), n_blocks() * task / kSumTasks, n_blocks() * (task + 1) / kSumTasks);
     });
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
     for (std::size_t k = 0; k < place_of_pair_.size(); ++k) add(blocks_[place_of_pair_[k]], pairs[k]);
@@ -102,58 +96,59 @@ class SparseSchur {
   // The diagonal blocks alone, n_free.
   template <class Add>
   const Block<D>* diagonal(Pool& pool, const Coupling<D>& coupling, Add add_diagonal) {
-    pool.each(groups(), [&](std::int64_t group, int thread) {
-      Block<D>* blocks = &diagonal_[group * l_.n_free];
+    pool.each(n_partials(), [&](std::int64_t partial, int thread) {
+      Block<D>* blocks = &diagonal_[partial * l_.n_free];
       clear(blocks, l_.n_free);
-      each_stretch(group, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
+      each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
         subtract_product(blocks[l_.edge_column[e]], Left<D>(z[e]), z[e]);
       });
     });
-    add_groups(diagonal_.data(), l_.n_free, 0, l_.n_free);
+    add_partials(diagonal_.data(), l_.n_free, 0, l_.n_free);
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, diagonal_[k]);
     return diagonal_.data();
   }
 
  private:
-  // Groups of points (quarters, halves or all) are summed apart, each by one thread, and then added in turn: the problem
-  // alone decides how many.
-  static constexpr std::int64_t kPieces = 16;
-  // A group more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
-  static constexpr std::int64_t kWorkOfBlock = 200, kGroupBytes = 20 << 20, kGroupBytesOfObservation = 32;
+  // Partial sums, of one section, two or all, are each made by one thread and then added in turn: the problem alone
+  // decides how many.
+  static constexpr std::int64_t kSumTasks = 16;
+  // One more is worth it from so much work for each block, in half pairs, and up to so much memory for all.
+  static constexpr std::int64_t kWorkOfBlock = 200, kPartialBytes = 20 << 20, kPartialBytesOfObservation = 32;
   // Z of as many points as stay in the nearer caches.
-  static constexpr std::int64_t kStretchBytes = 256 << 10;
+  static constexpr std::int64_t kStripBytes = 256 << 10;
 
   // Columns of a row for each of its blocks up to which it has a table; what stands for none.
   static constexpr std::int64_t kMaxSpan = 32, kSearched = std::numeric_limits<std::int64_t>::min();
 
   std::int64_t n_blocks() const { return static_cast<std::int64_t>(pattern_.index.size()); }
-  std::int64_t groups() const { return static_cast<std::int64_t>(cut_.size()) - 1; }
+  std::int64_t n_partials() const { return static_cast<std::int64_t>(cut_.size()) - 1; }
 
-  // Where groups begin, as batches. Z of an edge takes as long as a pair and a half.
+  // Where the points of each partial sum begin, as batches. Z of an edge takes as long as a pair and a half.
   void cut_points() {
     const std::int64_t twice = 3 * l_.n_edges() + 2 * l_.n_pairs();
     const std::int64_t n = std::max<std::int64_t>(n_blocks(), 1);
-    const std::int64_t most_bytes = std::max(kGroupBytes, kGroupBytesOfObservation * l_.n_obs);
+    const std::int64_t most_bytes = std::max(kPartialBytes, kPartialBytesOfObservation * l_.n_obs);
     const std::int64_t fit = most_bytes / (n * static_cast<std::int64_t>(sizeof(Block<D>)));
-    const std::int64_t most = std::min({1 + twice / (kWorkOfBlock * n), fit, l_.n_quarters()});
+    const std::int64_t most = std::min({1 + twice / (kWorkOfBlock * n), fit, l_.n_sections()});
     const std::int64_t count = most >= 4 ? 4 : most >= 2 ? 2 : 1;
-    for (std::int64_t i = 0; i <= count; ++i) cut_.push_back(l_.quarters[i * l_.n_quarters() / count]);
+    for (std::int64_t i = 0; i <= count; ++i) cut_.push_back(l_.sections[i * l_.n_sections() / count]);
   }
 
-  // Cut groups into stretches, and put the edges of each in the order of their rows: a row stays in the nearest cache
-  // while all edges of the stretch add to it.
+  // Cut the batches into strips, and put the edges of each in the order of their rows: a row stays in the nearest cache
+  // while all edges of the strip add to it.
   void order_edges() {
-    const std::int64_t fit = kStretchBytes / static_cast<std::int64_t>(sizeof(Edge<D>));
-    for (std::int64_t group = 0; group < groups(); ++group) {
-      group_stretch_.push_back(static_cast<std::int64_t>(stretch_.size()));
-      for (std::int64_t i = cut_[group]; i < cut_[group + 1]; ++i)
-        if (i == cut_[group] || first_edge(i + 1) - first_edge(stretch_.back()) > fit) stretch_.push_back(i);
+    const std::int64_t fit = kStripBytes / static_cast<std::int64_t>(sizeof(Edge<D>));
+    for (std::int64_t partial = 0; partial < n_partials(); ++partial) {
+      partial_strip_.push_back(static_cast<std::int64_t>(strip_.size()));
+      for (std::int64_t i = cut_[partial]; i < cut_[partial + 1]; ++i)
+        if (i == cut_[partial] || first_edge(i + 1) - first_edge(strip_.back()) > fit) strip_.push_back(i);
     }
-    group_stretch_.push_back(static_cast<std::int64_t>(stretch_.size()));
-    stretch_.push_back(l_.n_batches);
+    partial_strip_.push_back(static_cast<std::int64_t>(strip_.size()));
+    strip_.push_back(l_.n_batches);
     std::vector<std::int32_t> begin;
-    for (std::int64_t batch : stretch_) begin.push_back(static_cast<std::int32_t>(first_edge(batch)));
-    for (std::size_t i = 1; i < begin.size(); ++i) most_edges_ = std::max<std::int64_t>(most_edges_, begin[i] - begin[i - 1]);
+    for (std::int64_t batch : strip_) begin.push_back(static_cast<std::int32_t>(first_edge(batch)));
+    for (std::size_t i = 1; i < begin.size(); ++i)
+      most_edges_ = std::max<std::int64_t>(most_edges_, begin[i] - begin[i - 1]);
     order_.resize(l_.n_edges());
     std::vector<std::int32_t> next = begin;
     for (std::int32_t e : l_.edges_of_keyframe)
@@ -162,23 +157,23 @@ class SparseSchur {
 
   std::int64_t first_edge(std::int64_t batch) const { return l_.point_edge[kLanes * batch]; }
 
-  // Call sum(e, z) for the edges e of a group; z[e]: their Z.
+  // Call sum(e, z) for the edges e of a partial sum; z[e]: their Z.
   template <class Sum>
-  void each_stretch(std::int64_t group, const Coupling<D>& coupling, int thread, Sum sum) {
-    for (std::int64_t part = group_stretch_[group]; part < group_stretch_[group + 1]; ++part) {
-      const std::int64_t begin = first_edge(stretch_[part]), end = first_edge(stretch_[part + 1]);
+  void each_strip(std::int64_t partial, const Coupling<D>& coupling, int thread, Sum sum) {
+    for (std::int64_t strip = partial_strip_[partial]; strip < partial_strip_[partial + 1]; ++strip) {
+      const std::int64_t begin = first_edge(strip_[strip]), end = first_edge(strip_[strip + 1]);
       Edge<D>* z = &scratch_[thread * most_edges_] - begin;
-      for (std::int64_t i = stretch_[part]; i < stretch_[part + 1]; ++i) coupling.edges_of(i, z);
+      for (std::int64_t i = strip_[strip]; i < strip_[strip + 1]; ++i) coupling.edges_of(i, z);
       for (std::int64_t at = begin; at < end; ++at) sum(order_[at], z);
     }
   }
 
-  // Onto the blocks [begin, end) of the first group those of the others; n: blocks of a group.
-  void add_groups(Block<D>* blocks, std::int64_t n, std::int64_t begin, std::int64_t end) const {
+  // Onto the blocks [begin, end) of the first partial sum those of the others; n: blocks of each.
+  void add_partials(Block<D>* blocks, std::int64_t n, std::int64_t begin, std::int64_t end) const {
     const std::int64_t count = static_cast<std::int64_t>(sizeof(Block<D>) / sizeof(double));
     double* to = reinterpret_cast<double*>(blocks);
-    for (std::int64_t group = 1; group < groups(); ++group) {
-      const double* from = to + group * n * count;
+    for (std::int64_t partial = 1; partial < n_partials(); ++partial) {
+      const double* from = to + partial * n * count;
       for (std::int64_t i = begin * count; i < end * count; ++i) to[i] += from[i];
     }
   }
@@ -209,21 +204,22 @@ class SparseSchur {
       }
       place_of_.push_back(static_cast<std::int64_t>(place_.size()) - i);
       place_.resize(place_.size() + span);
-      for (std::int64_t k = begin; k < end; ++k) place_[place_of_[i] + pattern_.index[k]] = static_cast<std::int32_t>(k - begin);
+      for (std::int64_t k = begin; k < end; ++k)
+        place_[place_of_[i] + pattern_.index[k]] = static_cast<std::int32_t>(k - begin);
     }
   }
 
   const Layout& l_;
   Rows32 pattern_;
   std::vector<std::int64_t> cut_;
-  Buffer<Block<D>> blocks_, diagonal_;  // of each group; the sums are in the first
-  std::vector<std::int64_t> stretch_, group_stretch_;  // first batch of each stretch; first stretch of each group
-  Buffer<std::int32_t> order_;                          // edges, stretch by stretch and there by rows
-  std::int64_t most_edges_ = 0;                         // of a stretch
-  Buffer<Edge<D>> scratch_;                             // of each thread
-  Buffer<std::int32_t> place_;          // for columns between those of the row, nothing
+  Buffer<Block<D>> blocks_, diagonal_;               // of each partial sum; the sums are in the first
+  std::vector<std::int64_t> strip_, partial_strip_;  // first batch of each strip; first strip of each partial sum
+  Buffer<std::int32_t> order_;                       // edges, strip by strip and there by rows
+  std::int64_t most_edges_ = 0;                      // of a strip
+  Buffer<Edge<D>> scratch_;                          // of each thread
+  Buffer<std::int32_t> place_;                       // for columns between those of the row, nothing
   std::vector<std::int64_t> place_of_pair_;
   std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j], or kSearched
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

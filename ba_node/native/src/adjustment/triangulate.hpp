@@ -12,22 +12,14 @@
 #include <utility>
 #include <vector>
 
-namespace ba {
+#include "adjustment/types.hpp"
+#include "simd/target.hpp"
+
+namespace ba::BA_TARGET {
 
 // As in core/triangulation.py.
 constexpr int kPlainRounds = 3, kRobustRounds = 5;
 constexpr double kRayHuber = 1.5;
-
-// Views as rays: n_rays rows, in any order.
-struct RaysView {
-  std::int64_t n_rays;
-  const std::int64_t* point;
-  const double* centre;      // (n_rays, 3) m
-  const double* direction;   // (n_rays, 3) unit vectors
-  const double* px_per_rad;  // focal length over sigma
-  const double* distance;    // m, NaN where none was measured
-  const double* distance_sigma;
-};
 
 // x of the symmetric A x = b, by elimination with pivots as LAPACK does it.
 inline void solve3(double a[3][3], double b[3], double* x) {
@@ -72,8 +64,7 @@ class Triangulator {
       measured[p] = measured_;
       midpoint(points + 3 * p);
       parallax[p] = largest_angle();
-      if (views_.size() < 2 && !measured_)
-        std::fill_n(points + 3 * p, 3, std::numeric_limits<double>::quiet_NaN());
+      if (views_.size() < 2 && !measured_) std::fill_n(points + 3 * p, 3, std::numeric_limits<double>::quiet_NaN());
     }
   }
 
@@ -188,4 +179,4 @@ class Triangulator {
   bool measured_ = false;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -10,7 +10,7 @@
 #include "parallel/memory.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 // A column of d = 6 or 9 numbers: a register, and for 9 one more number.
 template <int D>
@@ -132,8 +132,7 @@ BA_INLINE void subtract_product(Block<6>& s, const Left<6>& x, const Edge<6>& y)
 
 BA_INLINE void subtract_product(Block<9>& s, const Left<9>& x, const Edge<9>& y) {
 #pragma GCC unroll 8
-  for (int c = 0; c < 8; ++c)
-    s.col[c] = s.col[c] - x.a[0] * y.a[0][c] - x.a[1] * y.a[1][c] - x.a[2] * y.a[2][c];
+  for (int c = 0; c < 8; ++c) s.col[c] = s.col[c] - x.a[0] * y.a[0][c] - x.a[1] * y.a[1][c] - x.a[2] * y.a[2][c];
   s.col[8] = s.col[8] - x.a[0] * y.b[0] - x.a[1] * y.b[1] - x.a[2] * y.b[2];
   s.row = s.row - y.a[0] * x.b[0] - y.a[1] * x.b[1] - y.a[2] * x.b[2];
   s.corner -= x.b[0] * y.b[0] + x.b[1] * y.b[1] + x.b[2] * y.b[2];
@@ -241,4 +240,4 @@ inline void write_block(const Block<D>& s, double* out, std::int64_t stride) {
     for (int r = 0; r < D; ++r) out[r * stride + c] = entry(s, r, c);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

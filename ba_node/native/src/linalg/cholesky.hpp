@@ -18,7 +18,7 @@
 #include "parallel/pool.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 class DenseCholesky {
  public:
@@ -51,9 +51,9 @@ class DenseCholesky {
         update<1>(j, j, first, j);
         if (!factor_tile(j)) return false;
       }
-      const auto each_group = [&](auto take) { each_rows(pool, end, take); };
-      each_group([&](std::int64_t i, auto count) { finish<decltype(count)::value>(i, first, end); });
-      each_group([&](std::int64_t i, auto count) {
+      const auto each_rows_below = [&](auto take) { each_rows(pool, end, take); };
+      each_rows_below([&](std::int64_t i, auto count) { finish<decltype(count)::value>(i, first, end); });
+      each_rows_below([&](std::int64_t i, auto count) {
         constexpr int kCount = decltype(count)::value;
         for (std::int64_t j = end; j <= i; ++j) update<kCount>(i, j, first, end);
         for (std::int64_t j = i + 1; j < i + kCount; ++j)
@@ -97,21 +97,21 @@ class DenseCholesky {
  private:
   // Panels whose columns are eliminated together; panels of rows that are worked on together, and columns of them that
   // are in registers at once: as many as fit.
-  static constexpr std::int64_t kBlock = 4, kGroup = sizeof(Register) == sizeof(V8) ? 3 : 1;
+  static constexpr std::int64_t kBlock = 4, kPanelsAtOnce = sizeof(Register) == sizeof(V8) ? 3 : 1;
   static constexpr int kColumns = sizeof(Register) == sizeof(V8) ? 8 : 4;
 
   V8* panel(std::int64_t r) { return tiles_.data() + kLanes * r * (r + 1) / 2; }
 
-  // Call take(i, count) for groups of panels from `first` on. They are dealt to the threads one by one from the last, the
-  // longest, so that each has its own in every block, and as much to do as the others.
+  // Call take(i, count) for up to kPanelsAtOnce panels from `first` on. They are dealt to the threads one by one from
+  // the last, the longest, so that each has its own in every block, and as much to do as the others.
   template <class Take>
   void each_rows(Pool& pool, std::int64_t first, Take take) {
-    const std::int64_t groups = (panels_ - first + kGroup - 1) / kGroup;
-    pool.each(groups, [&](std::int64_t piece, int) {
+    const std::int64_t tasks = (panels_ - first + kPanelsAtOnce - 1) / kPanelsAtOnce;
+    pool.each(tasks, [&](std::int64_t task, int) {
       int of = 0;
-      while (pool.share(groups, of + 1) <= piece) ++of;
-      const std::int64_t dealt = (piece - pool.share(groups, of)) * pool.threads() + of;
-      const std::int64_t end = panels_ - kGroup * dealt, i = std::max(first, end - kGroup);
+      while (pool.begin_of_queue(tasks, of + 1) <= task) ++of;
+      const std::int64_t dealt = (task - pool.begin_of_queue(tasks, of)) * pool.threads() + of;
+      const std::int64_t end = panels_ - kPanelsAtOnce * dealt, i = std::max(first, end - kPanelsAtOnce);
       with_count(end - i, [&](auto count) { take(i, count); });
     });
   }
@@ -119,7 +119,7 @@ class DenseCholesky {
   template <class F>
   static void with_count(std::int64_t count, F f) {
     if (count == 1) f(std::integral_constant<int, 1>());
-    if constexpr (kGroup > 1) {
+    if constexpr (kPanelsAtOnce > 1) {
       if (count == 2) f(std::integral_constant<int, 2>());
       if (count == 3) f(std::integral_constant<int, 3>());
     }
@@ -186,4 +186,4 @@ class DenseCholesky {
   Buffer<double> inverse_, y_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

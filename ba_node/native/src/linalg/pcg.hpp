@@ -9,24 +9,11 @@
 #include <cmath>
 #include <cstdint>
 
+#include "adjustment/types.hpp"
 #include "linalg/blocks.hpp"
 #include "parallel/memory.hpp"
 
-namespace ba {
-
-// M: none, or the diagonal blocks or the diagonal of S or of damped B.
-enum class Preconditioner : std::uint8_t { kNone, kSchurBlock, kSchurDiagonal, kOwnBlock, kOwnDiagonal };
-
-struct PcgLimits {
-  double t_eps;
-  std::int64_t max_iterations;
-  double radius, q_eps;
-};
-
-struct PcgEnd {
-  bool found = false, on_boundary = false;
-  std::int64_t iterations = 0;
-};
+namespace ba::BA_TARGET {
 
 // M^-1 of diagonal blocks, or of the diagonal, scaled.
 template <int D>
@@ -109,8 +96,8 @@ class Pcg {
 
   // Solve S x = rhs. product(in, out): S in; precondition(r, z): z = M^-1 r; scale: 1/D; x: out.
   template <class Product, class Precondition>
-  PcgEnd solve(Product product, Precondition precondition, const double* rhs, const double* scale, const PcgLimits& limits,
-               double* x) {
+  PcgEnd solve(Product product, Precondition precondition, const double* rhs, const double* scale,
+               const PcgLimits& limits, double* x) {
     const std::size_t n = x_.size();
     for (std::size_t i = 0; i < n; ++i) {
       x_[i] = 0.0;
@@ -186,4 +173,4 @@ class Pcg {
   Buffer<double> x_, r_, z_, d_, ad_, t_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -17,7 +17,7 @@
 #include "linalg/blocks.hpp"
 #include "simd/simd.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
 template <int D>
 class SparseCholesky {
@@ -114,8 +114,8 @@ class SparseCholesky {
           std::int32_t target = -1;
           if (row != column) {
             const auto begin = fill_.below.index.begin();
-            const auto found = std::lower_bound(begin + fill_.below.start[column],
-                                                begin + fill_.below.start[column + 1], row);
+            const auto found =
+                std::lower_bound(begin + fill_.below.start[column], begin + fill_.below.start[column + 1], row);
             target = static_cast<std::int32_t>(found - begin);
           }
           // S_ij lies in row i: L wants its row `row`, which is i only if i comes later.
@@ -192,8 +192,10 @@ class SparseCholesky {
   // x_j <- L_jj^-1 x_j or L_jj^-T x_j; also in out.
   void apply_inverse(std::int64_t j, bool transposed, double* out) {
     for (int i = 0; i < D; ++i) out[i] = 0.0;
-    if (transposed) add_multiplied_transposed<-1>(inverse_[j], &x_[j * D], out);
-    else add_multiplied<-1>(inverse_[j], &x_[j * D], out);
+    if (transposed)
+      add_multiplied_transposed<-1>(inverse_[j], &x_[j * D], out);
+    else
+      add_multiplied<-1>(inverse_[j], &x_[j * D], out);
     for (int i = 0; i < D; ++i) x_[j * D + i] = out[i];
   }
 
@@ -206,4 +208,4 @@ class SparseCholesky {
   Buffer<double> x_;
 };
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

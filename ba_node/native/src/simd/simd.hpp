@@ -11,9 +11,9 @@
 #include <cmath>
 #include <cstring>
 
-namespace ba {
+#include "simd/target.hpp"
 
-constexpr int kLanes = 8;
+namespace ba::BA_TARGET {
 
 using Native2 = double __attribute__((vector_size(16)));
 using Native4 = double __attribute__((vector_size(32)));
@@ -55,7 +55,7 @@ struct TwiceMask {
 // pieces of 16 bytes, and a register that is then read from them waits until they have left the store buffer.
 template <class H, class M>
 struct Twice {
-  using Lines = TwiceMask<M>;
+  using Compared = TwiceMask<M>;
   H lo, hi;
 
   Twice() = default;
@@ -74,16 +74,16 @@ struct Twice {
   BA_INLINE friend Twice operator op(const Twice& a, const Twice& b) { return {a.lo op b.lo, a.hi op b.hi}; } \
   BA_INLINE friend Twice operator op(double a, const Twice& b) { return {a op b.lo, a op b.hi}; }             \
   BA_INLINE friend Twice operator op(const Twice& a, double b) { return {a.lo op b, a.hi op b}; }             \
-  BA_INLINE Twice& operator op##=(const Twice& b) { return *this = *this op b; }                              \
-  BA_INLINE Twice& operator op##=(double b) { return *this = *this op b; }
+  BA_INLINE Twice& operator op## = (const Twice& b) { return *this = *this op b; }                            \
+  BA_INLINE Twice& operator op## = (double b) { return *this = *this op b; }
   BA_ARITHMETIC(+)
   BA_ARITHMETIC(-)
   BA_ARITHMETIC(*)
   BA_ARITHMETIC(/)
 #undef BA_ARITHMETIC
-#define BA_COMPARISON(op)                                                                                     \
-  BA_INLINE friend Lines operator op(const Twice& a, const Twice& b) { return {a.lo op b.lo, a.hi op b.hi}; } \
-  BA_INLINE friend Lines operator op(const Twice& a, double b) { return {a.lo op b, a.hi op b}; }
+#define BA_COMPARISON(op)                                                                                        \
+  BA_INLINE friend Compared operator op(const Twice& a, const Twice& b) { return {a.lo op b.lo, a.hi op b.hi}; } \
+  BA_INLINE friend Compared operator op(const Twice& a, double b) { return {a.lo op b, a.hi op b}; }
   BA_COMPARISON(<)
   BA_COMPARISON(<=)
   BA_COMPARISON(>)
@@ -130,17 +130,23 @@ struct Each;
 template <>
 struct Each<Native2> {
   template <class F>
-  BA_INLINE static Native2 of(F f) { return Native2{f(0), f(1)}; }
+  BA_INLINE static Native2 of(F f) {
+    return Native2{f(0), f(1)};
+  }
 };
 template <>
 struct Each<Native4> {
   template <class F>
-  BA_INLINE static Native4 of(F f) { return Native4{f(0), f(1), f(2), f(3)}; }
+  BA_INLINE static Native4 of(F f) {
+    return Native4{f(0), f(1), f(2), f(3)};
+  }
 };
 template <>
 struct Each<Native8> {
   template <class F>
-  BA_INLINE static Native8 of(F f) { return Native8{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)}; }
+  BA_INLINE static Native8 of(F f) {
+    return Native8{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)};
+  }
 };
 template <class H, class M>
 struct Each<Twice<H, M>> {
@@ -151,7 +157,9 @@ struct Each<Twice<H, M>> {
   }
 };
 template <class F>
-BA_INLINE V8 each(F f) { return Each<V8>::of(f); }
+BA_INLINE V8 each(F f) {
+  return Each<V8>::of(f);
+}
 
 // The same number in all lanes.
 template <class V>
@@ -282,25 +290,25 @@ BA_INLINE void transpose(Native8 (&r)[8]) {
   }
 }
 
-// By quarters: those off the diagonal change places.
+// By four blocks: those off the diagonal change places.
 template <class H, class M, int N>
 BA_INLINE void transpose(Twice<H, M> (&r)[N]) {
   constexpr int kHalf = N / 2;
-  H quarter[2][2][kHalf];
+  H section[2][2][kHalf];
 #pragma GCC unroll 2
   for (int i = 0; i < 2; ++i) {
 #pragma GCC unroll 4
     for (int j = 0; j < kHalf; ++j) {
-      quarter[i][0][j] = r[i * kHalf + j].lo;
-      quarter[i][1][j] = r[i * kHalf + j].hi;
+      section[i][0][j] = r[i * kHalf + j].lo;
+      section[i][1][j] = r[i * kHalf + j].hi;
     }
-    transpose(quarter[i][0]);
-    transpose(quarter[i][1]);
+    transpose(section[i][0]);
+    transpose(section[i][1]);
   }
 #pragma GCC unroll 2
   for (int i = 0; i < 2; ++i)
 #pragma GCC unroll 4
-    for (int j = 0; j < kHalf; ++j) r[i * kHalf + j] = {quarter[0][i][j], quarter[1][i][j]};
+    for (int j = 0; j < kHalf; ++j) r[i * kHalf + j] = {section[0][i][j], section[1][i][j]};
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

@@ -1,7 +1,7 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// The polishing of points, eight at once; core/polish.py says what it does and is this file's oracle.
+// Inner iterations: points alone, eight at once; core/inner_iterations.py says what they do and is this file's oracle.
 #pragma once
 
 #include <cstdint>
@@ -10,36 +10,31 @@
 #include "adjustment/equations.hpp"
 #include "adjustment/rows.hpp"
 
-namespace ba {
+namespace ba::BA_TARGET {
 
-constexpr double kFirstDamping = 1e-4, kMinDiagonal = 1e-6, kMinGain = 1e-4, kMinPromise = 1e-8;
+constexpr double kFirstDamping = 1e-4, kMinGain = 1e-4, kMinPromise = 1e-8;
 
-// Objectives at the start and at the end.
-struct Polished {
-  double before = 0, after = 0;
-};
-
-// Improve the points of a batch, keyframes held. images: room for those of all its slots, filled here. keep(slot, seen):
+// Improve the points of a batch, keyframes held. images: room for those of all its slots, filled here. keep(slot, obs):
 // called for all slots, the last time at the x that is returned; sums: of the same.
 template <Lens kLens, bool kDepth, class Keep>
-inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, Keep keep,
-                         V8 (&x)[3], PointSums& sums, V8& before, V8& best_cost) {
+inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end, int steps, Images* images, Keep keep,
+                          V8 (&x)[3], PointSums& sums, V8& before, V8& best_cost) {
   V8 best[3] = {x[0], x[1], x[2]};
   Mask active = ~Mask{}, worse{};
   double mu = kFirstDamping;
   best_cost = splat(std::numeric_limits<double>::infinity());
-  const auto see = [&](bool again) {
+  const auto evaluate = [&](bool again) {
     sums = PointSums{};
     for (std::int64_t slot = first; slot < end; ++slot) {
-      Seen seen;
+      Evaluation obs;
       if (!again) rows.gather<kLens>(slot, images[slot - first]);
-      rows.see<kLens, kDepth, true>(slot, images[slot - first], x, seen);
-      add_point_rows<kDepth ? 3 : 2>(seen, sums);
-      keep(slot, seen);
+      rows.evaluate<kLens, kDepth, true>(slot, images[slot - first], x, obs);
+      add_point_rows<kDepth ? 3 : 2>(obs, sums);
+      keep(slot, obs);
     }
   };
   for (int step = 0; step <= steps; ++step) {
-    see(step > 0);
+    evaluate(step > 0);
     if (step == 0) before = sums.cost;
     const Mask better = active & (sums.cost < best_cost);  // not if worse, or not a number
     const Mask arrived = best_cost - sums.cost < kMinGain * sums.cost;
@@ -62,7 +57,7 @@ inline void polish_batch(const Rows& rows, std::int64_t first, std::int64_t end,
     mu *= 0.1;
   }
   for (int i = 0; i < 3; ++i) x[i] = best[i];
-  if (any(worse)) see(true);
+  if (any(worse)) evaluate(true);
 }
 
-}  // namespace ba
+}  // namespace ba::BA_TARGET

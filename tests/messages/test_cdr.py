@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from ba_node.estimate import Poses
 from ba_node.io.ros_types import ROSBAGS_FACTORY as F
 from ba_node.io.ros_types import encode
+from ba_node.messages.cdr import cloud_message, path_message, pose_messages
 from ba_node.messages.factory import ConversionError, header_message, pose_message
 from ba_node.messages.outputs import POINT_DTYPE
-from ba_node.messages.serialised import cloud_message, path_message, pose_messages
 
 FRAMES = st.text(st.characters(exclude_characters="\x00", exclude_categories=["Cs"]), max_size=12)
 STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)

@@ -1,0 +1,143 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""The C++ kernels (src/bindings/module.cpp). Arguments named ``out`` are written to and have to be float64, contiguous.
+
+Shapes: n_free keyframes that are not fixed, d = 6 or 9 unknowns each, n = n_free d; see core/problem.py for the rest.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Doubles = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+class State(Protocol):
+    """As core.problem.State."""
+
+    @property
+    def rotation(self) -> Doubles: ...
+    @property
+    def translation(self) -> Doubles: ...
+    @property
+    def points(self) -> Doubles: ...
+    @property
+    def intrinsics(self) -> Doubles: ...
+
+class Problem(Protocol):
+    """As core.problem.Problem; of its factors only the pairs of keyframes matter here, which are an argument."""
+
+    @property
+    def start(self) -> State: ...
+    @property
+    def fixed(self) -> NDArray[np.bool_]: ...
+    @property
+    def cameras(self) -> object: ...
+    @property
+    def observations(self) -> object: ...
+
+class PcgLimits(Protocol):
+    """As core.linear.PcgLimits."""
+
+    @property
+    def t_eps(self) -> float: ...
+    @property
+    def max_iterations(self) -> int: ...
+    @property
+    def radius(self) -> float: ...
+    @property
+    def q_eps(self) -> float: ...
+
+class Rays(Protocol):
+    """As core.triangulation.Rays."""
+
+    @property
+    def point(self) -> Ints: ...
+    @property
+    def centre(self) -> Doubles: ...
+    @property
+    def direction(self) -> Doubles: ...
+    @property
+    def px_per_rad(self) -> Doubles: ...
+    @property
+    def distance_m(self) -> Doubles: ...
+    @property
+    def distance_sigma_m(self) -> Doubles: ...
+
+class Kernel:
+    """One problem; the arrays are copied. cost: loss, its scale and cheirality."""
+
+    def __init__(
+        self, problem: Problem, cost: tuple[str, float, str], factor_pairs: tuple[Ints, Ints], threads: int
+    ) -> None: ...
+    @property
+    def n_free(self) -> int: ...
+    @property
+    def n_chunks(self) -> int: ...
+    @property
+    def gradient_norm(self) -> float: ...
+    def pairs(self) -> tuple[int, int]:
+        """Return the number of (point, free keyframe), and of pairs of them with the same point."""
+
+    def linearise(self, state: State) -> float:
+        """Return the objective."""
+
+    def linearise_prepared(self) -> bool:
+        """Linearise where the last inner iterations ended; return False if too little is known of it."""
+
+    def add_factors(self, diagonal: Doubles, gradient: Doubles, pairs: Doubles) -> None:
+        """Add (n_free, 6, 6) and (n_free, 6); set the blocks of the coupled pairs, (n_pairs, 6, 6)."""
+
+    def objective(self, state: State) -> float: ...
+    def inner_iterations(self, state: State, steps: int) -> tuple[float, float, Doubles]:
+        """Return the objective before and after, and the points."""
+
+    def diagonals(self) -> tuple[Doubles, Doubles]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
+
+    def step(self, state: State, step_c: Doubles, steps: int, out: State) -> tuple[float, float, float, float]:
+        """Return predicted reduction, 1/2 p'Dp, and the objective before and after the inner iterations."""
+
+    def factor(self, damping_c: Doubles, damping_p: Doubles) -> None: ...
+    def damp(self, diagonal: bool, mu: float) -> None: ...
+    def rhs(self, out: Doubles) -> None: ...
+    def dense(self, out: Doubles) -> None: ...
+    def solve(self, out: Doubles) -> bool: ...
+    def sparse(self) -> tuple[Doubles, NDArray[np.int32], Ints]:
+        """Return blocks (n_blocks, d, d), columns and row starts of the upper triangle of S."""
+
+    def analyse(self, max_blocks: int, max_products: float) -> tuple[bool, int, float]:
+        """Return whether the sparse factor meets the limits, its blocks, and products of blocks to find it."""
+
+    def solve_sparse(self) -> Doubles | None: ...
+    def pcg(self, scale: Doubles, kind: str, limits: PcgLimits, formed: bool, out: Doubles) -> tuple[bool, int, bool]:
+        """Return whether there is a solution, iterations, and whether it lies on the boundary of the region."""
+
+    def product(self, x: Doubles) -> Doubles: ...
+    def diagonal_blocks(self) -> Doubles: ...
+    def back_substitute(self, step_c: Doubles) -> tuple[Doubles, float]: ...
+
+class RelativePoses:
+    """Factors on relative poses, as core.factors.RelativePoses; the arrays are copied."""
+
+    def __init__(self, factors: object, column: Ints, pair: Ints) -> None: ...
+    def value(self, state: State) -> float: ...
+    def linearise(self, state: State, gradient: Doubles, diagonal: Doubles, pairs: Doubles) -> float:
+        """Return the value; add to the other arguments."""
+
+def targets() -> tuple[str, ...]:
+    """Return what is compiled in and this processor runs, the widest first."""
+
+def target() -> str:
+    """Return which of them new kernels are made of."""
+
+def use_target(name: str) -> None:
+    """Choose one of them for kernels made from now on."""
+
+def allocations() -> int:
+    """Return how often the kernels have asked for memory."""
+
+def residual_norms(problem: Problem, state: State) -> Doubles: ...
+def triangulate(rays: Rays, n_points: int) -> tuple[Doubles, Doubles, NDArray[np.bool_]]: ...
+def agreeing(rays: Rays, n_points: int, gate: float) -> NDArray[np.bool_]: ...

@@ -1,0 +1,11 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Compiled once for each target.
+#include "adjustment/kernel.hpp"
+
+namespace ba::BA_TARGET {
+
+Kernel* make_kernel9(KernelArguments&& arguments) { return new KernelOf<9>(std::move(arguments)); }
+
+}  // namespace ba::BA_TARGET
