@@ -173,7 +173,7 @@ class Develop(develop):
 setup(
     name=NAME,
     cmdclass={"build_ext": BuildKernels, "develop": Develop, "install": Install},
-    version="0.1.0",
+    version="0.2.0",
     description="Bundle-adjustment back-end for ROS 2",
     maintainer="The ba_node Authors",
     maintainer_email="maintainers@example.com",
