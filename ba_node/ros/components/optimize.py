@@ -9,7 +9,6 @@ longer the current one: after a reset, another map, or a new session.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
@@ -17,9 +16,7 @@ import traceback
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.action.server import GoalEvent, GoalStatus
-from rclpy.qos import QoSProfile
+from rclpy.action import CancelResponse, GoalResponse
 
 from ba_node.config import find
 from ba_node.estimate import Status
@@ -27,6 +24,7 @@ from ba_node.messages.topics import ACTIONS
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
+from ba_node.ros.rclpy_compat.actions import LateAction
 from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Owed
 
 if TYPE_CHECKING:
@@ -36,8 +34,6 @@ if TYPE_CHECKING:
 _NAME = "optimize"
 _METHODS = find("solver.method").choices
 _GONE = "the map was reset or replaced meanwhile"
-# Feedback comes in bursts where iterations are short.
-_FEEDBACK_DEPTH = 100
 
 
 @dataclass
@@ -67,21 +63,12 @@ class Optimize(Component):
         super().__init__(host)
         self._goal: _Goal | None = None
         self._type = message_class(ACTIONS[_NAME].type_name)
-        self._server = ActionServer(
-            host.node,
-            self._type,
-            f"~/{_NAME}",
-            execute_callback=_never,
-            goal_callback=self._judge,
-            handle_accepted_callback=self._accept,
-            cancel_callback=self._cancel,
-            feedback_pub_qos_profile=QoSProfile(depth=_FEEDBACK_DEPTH),
-        )
+        self._server = LateAction(host.node, self._type, f"~/{_NAME}", self._answer, self._accept, self._cancel)
         host.at_cleanup.callback(self._stop)
         # Who is answered at cleanup must still hear it.
         host.after_cleanup.callback(self._server.destroy)
 
-    def _judge(self, request: Any) -> Any:
+    def _answer(self, request: Any) -> Any:
         """Accept a goal, or reject it and say why in the log: the answer to a goal has no room for it."""
         try:
             reason = self._objection(request)
@@ -114,8 +101,7 @@ class Optimize(Component):
         self._goal = goal = _Goal(handle, time.monotonic(), owed)
         try:
             with owed.at_work():
-                # What handle.execute() does first; then it would hand over to a callback that returns the result.
-                handle._update_state(GoalEvent.EXECUTE)
+                self._server.begin(handle)
                 self.host.inbox.post(lambda backend: self._copy(backend, goal))
         except Exception:
             log(self.host.node, Severity.ERROR, f"~/{_NAME}: {traceback.format_exc()}")
@@ -200,28 +186,6 @@ class Optimize(Component):
         success = fields["success"]
         status = fields.pop("status", Status.FAILED if self.host.relay.open else Status.SKIPPED)
         result = self._type.Result(reason=reason, status=int(status), elapsed_s=goal.elapsed_s, **fields)
-        event = GoalEvent.SUCCEED if success else GoalEvent.ABORT
-        if goal.handle.is_cancel_requested and not success:
-            event = GoalEvent.CANCELED
-        reached = _end_state(goal.handle, event)
-        response = self._type.Impl.GetResultService.Response(status=reached, result=result)
-        # As rclpy does after its callback; without an executor the result goes out now, before a cleanup goes on.
-        future = self._server._result_futures[bytes(goal.handle.goal_id.uuid)]
-        future._set_executor(None)
-        future.set_result(response)
+        self._server.finish(goal.handle, success=success, result=result)
         severity = Severity.INFO if success else Severity.WARNING
         log(self.host.node, severity, f"~/{_NAME}: {status.name.lower()}: {reason}")
-
-
-def _end_state(handle: Any, event: Any) -> int:
-    """Bring a goal to its end and return the state that it has then; one that never began is aborted."""
-    for step in (event, GoalEvent.EXECUTE, GoalEvent.ABORT):
-        if not handle.is_active:
-            break
-        with contextlib.suppress(Exception):  # a step that is not allowed from here, or nobody to tell of it
-            handle._update_state(step)
-    return GoalStatus.STATUS_ABORTED if handle.is_active else int(handle.status)
-
-
-def _never(_handle: Any) -> None:
-    raise AssertionError("goals are executed by the threads of this module")

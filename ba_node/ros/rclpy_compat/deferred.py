@@ -20,9 +20,9 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from ba_node.ros.log import Severity, fault, log, printable
+from ba_node.ros.rclpy_compat.private import RCLError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     # Sends success, message and further fields of an answer, on the executor's thread.
     Send = Callable[[bool, str, dict[str, Any]], None]
 
-_RCLError = rclpy_implementation.RCLError
 CLEANED_UP = "the node was cleaned up meanwhile"
 DEAD = "the solver's thread has ended: start the node anew"
 # How often it is looked whether the solver lives, and for what was not told of.
@@ -82,7 +81,7 @@ class Relay:
             if not self._open:
                 return
             self._actions.append(action)
-            with contextlib.suppress(_RCLError):  # then the timer finds it
+            with contextlib.suppress(RCLError):  # then the timer finds it
                 self._guard.trigger()
 
     def close(self) -> None:
@@ -136,7 +135,7 @@ class Owed:
         self._relay.settled(self)
         try:
             self._send(success, printable(message), fields)
-        except _RCLError:
+        except RCLError:
             return
         except Exception as error:
             reason = printable(fault(error))

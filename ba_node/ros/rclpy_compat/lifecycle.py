@@ -13,16 +13,16 @@ from __future__ import annotations
 import traceback
 from typing import TYPE_CHECKING, Any
 
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
-from ba_node.ros.log import Severity, log
-from ba_node.ros.rclpy_compat.answering import answering
+from ba_node.ros.log import Severity, fault, log, printable
+from ba_node.ros.rclpy_compat.private import RCLError, part
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_RCLError = rclpy_implementation.RCLError
+_SET = "rcl_interfaces/SetParametersResult"
 
 
 class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
@@ -31,9 +31,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     def __init__(self, node_name: str, **node_options: Any) -> None:
         """Make the node, unconfigured."""
         super().__init__(node_name, **node_options)
-        self._answer = self._service_change_state.callback
-        self._service_change_state.callback = self._on_request
+        self._machine = part(self, "_state_machine", object, "a refused transition is told without what is possible")
         for service in self.services:
+            if service.srv_name.endswith("/change_state"):
+                self._answer, service.callback = service.callback, self._on_request
             service.callback = answering(self, service.srv_name, service.srv_type.Response, service.callback)
 
     def configure(self) -> None:
@@ -55,13 +56,13 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     @property
     def state(self) -> str:
         """Return the label of the state: unconfigured, inactive, active or finalized."""
-        return str(self._state_machine.current_state[1])
+        return "in an unknown state" if self._machine is None else str(self._machine.current_state[1])
 
     def request(self, transition: str) -> bool:
         """Make a transition from within (configure, activate, ...); return False, with a log line, if it fails."""
         try:
             done = getattr(self, f"trigger_{transition}")() == TransitionCallbackReturn.SUCCESS
-        except _RCLError:
+        except RCLError:
             done = False
         if not done:
             self._tell(transition)
@@ -105,13 +106,49 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
         """Answer a request of `ros2 lifecycle set`."""
         try:
             response = self._answer(request, response)
-        except _RCLError:
+        except RCLError:
             response.success = False
         if not response.success:
             self._tell(request.transition.label or str(request.transition.id))
         return response
 
     def _tell(self, transition: str) -> None:
-        possible = sorted({item[1] for item in self._state_machine.available_transitions})
-        text = f"transition {transition!r} was refused or failed; the node is {self.state}, from where it can "
-        log(self, Severity.WARNING, text + (" or ".join(possible) or "go nowhere"))
+        text = f"transition {transition!r} was refused or failed; the node is {self.state}"
+        if self._machine is not None:
+            possible = sorted({item[1] for item in self._machine.available_transitions})
+            text += f", from where it can {' or '.join(possible) or 'go nowhere'}"
+        log(self, Severity.WARNING, text)
+
+
+def answering(node: Any, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return a callback that answers with a refusal, as far as the type of the response can say one, when it raises.
+
+    Args:
+        node: whose log hears of it.
+        name: of the service.
+        kind: class of its responses.
+        callback: takes request and response, returns the response.
+    """
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            log(node, Severity.ERROR, f"{name} was answered with a refusal: {traceback.format_exc()}")
+            return _refusal(kind, request, printable(fault(error)))
+
+    return answer
+
+
+def _refusal(kind: Any, request: Any, reason: str) -> Any:
+    """Return a response without success: rclpy's types have it in different places."""
+    response = kind()
+    types = response.get_fields_and_field_types()
+    if "failure_reason" in types:
+        response.failure_reason = reason
+    if types.get("result") == _SET:
+        response.result.reason = reason
+    if types.get("results") == f"sequence<{_SET}>":
+        reason += "; those of the request before the one at fault are set"
+        response.results = [SetParametersResult(successful=False, reason=reason) for _ in request.parameters]
+    return response

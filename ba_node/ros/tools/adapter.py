@@ -28,7 +28,7 @@ from ba_node.messages.conversion import stamp_ns_from_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
-from ba_node.ros.throttle import Throttle
+from ba_node.ros.log import Throttle
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

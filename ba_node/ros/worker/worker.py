@@ -27,7 +27,7 @@ from ba_node.ros.worker.latency import Budget
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ba_node.backend import Backend
+    from ba_node.backend import Backend, Check
     from ba_node.estimate import Iteration
     from ba_node.ros.worker.inbox import Arrival, Inbox
 
@@ -137,6 +137,16 @@ class Worker:
         self._inbox.close()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
+
+    def check_elsewhere(self, check: Check) -> None:
+        """Check a set-up on a thread of its own, so that no keyframe waits; what is found comes back as a command."""
+
+        def run() -> None:
+            check.run()
+            self._inbox.post(lambda backend: backend.take_check(check))
+
+        # Not a daemon: Python must not end while the kernels run.
+        threading.Thread(target=run, name="setup_check", daemon=False).start()
 
     def outputs(self) -> list[Output]:
         """Return what has come out since the last call, oldest first."""

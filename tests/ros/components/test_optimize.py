@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-import time
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,7 @@ def test_everything_is_refined_with_feedback(
 def test_one_at_a_time_and_cancel(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any
 ) -> None:
-    node = start_node(*SMALL_WINDOW, python=gates.script)
+    node = start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
     _play(peer, scene, *range(6))
     before = [p.pose.position.x for p in peer.received["path"][-1].poses]
@@ -150,7 +150,7 @@ def test_one_at_a_time_and_cancel(
 def test_windows_go_on_and_follow(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any
 ) -> None:
-    start_node(*SMALL_WINDOW, python=gates.script)
+    start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
     _play(peer, scene, *range(8))
     gates.shut("optimize")
@@ -169,7 +169,7 @@ def test_windows_go_on_and_follow(
 
 
 def test_reset_aborts_it(start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any) -> None:
-    start_node(*SMALL_WINDOW, python=gates.script)
+    start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
     _play(peer, scene, *range(6))
     gates.shut("optimize")
@@ -236,7 +236,7 @@ def test_answers_that_warn_and_inform_in_turn(
 def test_the_node_ends_during_it(
     end: str, start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any
 ) -> None:
-    node = start_node(*SMALL_WINDOW, python=gates.script)
+    node = start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
     _play(peer, scene, *range(5))
     gates.shut("optimize")
@@ -252,10 +252,9 @@ def test_the_node_ends_during_it(
         gates.open("optimize")
         assert node.stop() == 0
     else:
-        node.process.send_signal(2)
+        node.send_signal(signal.SIGINT)
         peer.until(lambda: "stopped" in node.out, "the end of all but the solve")
-        time.sleep(0.3)
-        assert node.alive, "Python waits for the solve: to end under its feet would abort"
         gates.open("optimize")
         assert node.wait() == 0, node.err
+        assert gates.passed("optimize"), "Python waits for the solve: to end under its feet would abort"
     assert "internal error" not in node.err + node.out

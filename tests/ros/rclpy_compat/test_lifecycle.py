@@ -14,7 +14,9 @@ from lifecycle_msgs.srv import ChangeState, GetState
 
 from ba_node.measurements import Keyframe
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
+from ba_node.ros.components.publishing import Publishing
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from tests.ros.harness import solve_until_stopped
 
 pytestmark = pytest.mark.dds
 
@@ -153,8 +155,8 @@ def test_cameras_are_taken_while_inactive(start_node: StartNode, make_peer: Make
     peer.until(lambda: peer.received["report"] and peer.received["report"][-1].landmarks > 0, "points")
 
 
-def test_transitions_during_a_solve(start_node: StartNode, make_peer: MakePeer, slow_solve: str) -> None:
-    node, peer = start_node(python=slow_solve), make_peer()
+def test_transitions_during_a_solve(start_node: StartNode, make_peer: MakePeer) -> None:
+    node, peer = start_node(prepare=solve_until_stopped), make_peer()
     peer.advertise()
     for count in range(1, 4):
         peer.connect()
@@ -168,33 +170,28 @@ def test_transitions_during_a_solve(start_node: StartNode, make_peer: MakePeer, 
     assert "Traceback" not in node.err
 
 
-BROKEN = """
-import sys
-from ba_node.ros.components import publishing
+def fail_once() -> None:
+    """Have configure and activate fail the first time."""
+    configure = Publishing.__init__
+    broken = {"configure", "activate"}
 
-configure, activate = publishing.Publishing.__init__, publishing.Publishing.activate
-broken = {"configure", "activate"}
+    def once(name: str) -> None:
+        if name in broken:
+            broken.discard(name)
+            raise RuntimeError(f"no {name} today")
 
-def once(name):
-    if name in broken:
-        broken.discard(name)
-        raise RuntimeError(f"no {name} today")
+    def fragile_configure(self: Any, host: Any) -> None:
+        configure(self, host)
+        once("configure")
 
-def fragile_configure(self, host):
-    configure(self, host)
-    once("configure")
-
-publishing.Publishing.__init__ = fragile_configure
-publishing.Publishing.activate = lambda self: once("activate")
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+    vars_of: Any = Publishing
+    vars_of.__init__, vars_of.activate = fragile_configure, lambda _: once("activate")
 
 
 def test_a_transition_that_fails_is_logged_and_can_be_tried_again(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
-    node, peer = start_node(python=BROKEN), make_peer()
+    node, peer = start_node(prepare=fail_once), make_peer()
     assert _state(peer) == UNCONFIGURED, "the failed autostart leaves the node alive"
     peer.until(lambda: "configure failed: RuntimeError: no configure today" in node.err, "the reason")
     assert not {f"/ba_node/{topic}" for topic in OUTPUT_TYPES} & _node_topics(peer), "what was made is destroyed"

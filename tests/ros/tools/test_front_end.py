@@ -108,13 +108,10 @@ def _send_as_vins(features: Any, odometry: Any, scene: SyntheticData) -> None:
         odometry.publish(_odometry(keyframe))
 
 
-ADAPTER = "import sys\nfrom ba_node.ros.tools.adapter import main\nsys.exit(main())"
-
-
 def test_feature_clouds_and_odometry_reach_the_node(start_node: StartNode, make_peer: MakePeer) -> None:
     size: dict[str, Any] = {"keyframes": 8, "length_m": 10.0, "landmarks": 4000, "tracks": 200}
     scene = generate(SyntheticOptions(seed=3, path="line", outlier_share=0.0, **size))
-    node, converter, peer = start_node(), start_node(python=ADAPTER), make_peer()
+    node, converter, peer = start_node(), start_node(program="ba_node.ros.tools.adapter:main"), make_peer()
     peer.listen("report", "refined_keyframes")
     profile = qos.reliable(100)
     features = peer.node.create_publisher(message_class("sensor_msgs/msg/PointCloud"), "features", profile)
