@@ -137,6 +137,8 @@ def _refined(peer: Any) -> list[int]:
 
 
 def _node_topics(peer: Any) -> set[str]:
+    # Its services may be found before its name is.
+    peer.until(lambda: "ba_node" in peer.node.get_node_names(), "the node's name")
     return {name for name, _ in peer.node.get_publisher_names_and_types_by_node("ba_node", "/")}
 
 
