@@ -77,7 +77,7 @@ class BuildKernels(build_ext):
     def build_extension(self, ext: Extension) -> None:
         """Compile and link the kernels."""
         # Python's own flags ask for debug information, which is most of the size.
-        debug = [] if "-g" in os.environ.get("CFLAGS", "") else ["-g0"]
+        debug = [] if "-g" in os.environ.get("CXXFLAGS", "") else ["-g0"]
         strict = ["-Werror"] if os.environ.get("BA_NODE_WERROR", "0") not in ("", "0") else []
 
         def compiled(unit: Unit) -> str:

@@ -47,6 +47,7 @@ NOTICES: dict[str, str] = {
 WARNINGS: dict[str, str] = {
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
     "stray": "Keyframes whose front-end's pose contradicts their tracks; they are placed by these, or left out.",
+    "moving": "Tracks that move against the rest, as on objects that move; they are left out.",
     "far_from_origin": "Keyframes so far from the origin that the float32 of ~/points loses millimetres.",
     "ids_reused": "Track ids that were used again for other points.",
     "distortion_folds": "A camera whose distortion folds over inside its image.",

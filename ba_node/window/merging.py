@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 _NOTICED = 10.0
 # A point that moves by this share of its distance leaps.
 _LEAP = 0.5
+# From as many keyframes on it is said that tracks move, if more than this share do.
+_KNOWN_KEYFRAMES = 15
+_MANY_MOVING = 0.15
 
 
 class Merged(NamedTuple):
@@ -146,7 +149,19 @@ def apply(
     scene.landmarks.has_position[selection.landmarks] = True
     classify(scene, selection, state, norms, tracks, kernels)
     _displace(scene, selection.lost)
+    _note_moving(scene, selection)
     return norms
+
+
+def _note_moving(scene: Scene, selection: Selection) -> None:
+    """Say that many tracks move, once the map is known well enough to tell."""
+    count, of = int(np.count_nonzero(selection.moving)), len(selection.moving)
+    if selection.problem.n_keyframes >= _KNOWN_KEYFRAMES and count > _MANY_MOVING * of:
+        scene.log.warn(
+            "moving",
+            f"{count} of {of} tracks of the window move against the rest, as those on objects that move do: they were"
+            " left out of the solve, and the motion that the others and the front-end agree on was taken",
+        )
 
 
 def scaled(selection: Selection, measured: FloatArray, state: State) -> State:

@@ -14,8 +14,10 @@ between their refined steps and the front-end's, in standard deviations of three
 
 So images decide where they see enough. Where these see little (no tracks, no parallax, a camera that stands still or
 turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
-images by far, as where the front-end has jumped, pulls at nothing. Rotation and translation have one each, so that a
-wrong one does not release the other.
+images by far, as where the front-end has jumped, pulls at nothing. Once the standard deviations are known to be right
+the loss is wider, for all steps that are not wild belong to that distribution, and keep tracks on moving objects from
+carrying a keyframe along. It is widest in a young map that sees much: nothing but the steps tells there what moves.
+Rotation and translation have a loss each, so that a wrong one does not release the other.
 """
 
 from __future__ import annotations
@@ -44,6 +46,9 @@ _MAX_GAP = 100
 # Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
 _LEAST_STEPS = 8
 _MANY_OBSERVATIONS = 50
+# How many times as wide as stated the loss is once they have told, and before, where all keyframes see much.
+_WIDE = 5.0
+_WIDEST = 20.0
 # Median of the norm of three standard normal numbers.
 _MEDIAN_NORM = 1.538
 
@@ -98,12 +103,18 @@ def factors(
     free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
     if not free.any():
         return ()
-    steps = _inflated(scene, config, problem, keyframes, _front_end(scene, config, keyframes, tied))
+    many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= _MANY_OBSERVATIONS
+    stated = _front_end(scene, config, keyframes, tied)
+    inflated = _inflated(scene, config, keyframes, many, stated)
+    steps = stated if inflated is None else inflated
     if turned is not None:
         rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
-    return steps.factors(free, config.loss_scale)
+    width = 1.0 if inflated is None else _WIDE
+    if inflated is None and many.all():
+        width = _WIDEST
+    return steps.factors(free, width * config.loss_scale)
 
 
 def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first: IntArray) -> _Steps:
@@ -123,14 +134,18 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
     )
 
 
-def _inflated(scene: Scene, config: OdometryConfig, problem: Problem, keyframes: IntArray, steps: _Steps) -> _Steps:
-    """Return steps with standard deviations as well-determined keyframes show them to be, but no smaller ones."""
+def _inflated(
+    scene: Scene, config: OdometryConfig, keyframes: IntArray, many: BoolArray, steps: _Steps
+) -> _Steps | None:
+    """Return steps with standard deviations as well-determined keyframes show them to be, but no smaller ones.
+
+    None where too few of these are known.
+    """
     table = scene.keyframes
-    many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= _MANY_OBSERVATIONS
     sure = many & table.refined[keyframes]
     rows = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
     if len(rows) < _LEAST_STEPS:
-        return steps
+        return None
     first = steps.first[rows]
     rotation, translation = _relative(table.rotation, table.position, keyframes[first], keyframes[first + 1])
     turned = geometry.so3_log(np.swapaxes(steps.rotation[rows], 1, 2) @ rotation)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.core import geometry, native_kernels
-from ba_node.window import arrival, gauge, odometry, trial, turns
+from ba_node.window import arrival, determined, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
 
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from ba_node.scene.scene import Scene
     from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
 
-# A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
-MIN_OBSERVATIONS = 4
 # Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
 _VIEWS = 400
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
@@ -60,6 +58,7 @@ class Selection:
         landmarks: (n_pt,) row of each point, by track id.
         window: rows of all keyframes of the window, those held out included, oldest first.
         lost: rows of landmarks that have a position which their views contradict; they sit this solve out.
+        moving: (n_pt,) points on objects that move, see ``moving.py``; not in the problem, but for their start.
         origin: (3,) of the problem in the map, m.
         unscaled: see ``gauge.Gauge``.
         tried: points whose tracks a solution is tried on, see ``trial.py``.
@@ -79,6 +78,7 @@ class Selection:
     landmarks: IntArray
     window: IntArray
     lost: IntArray
+    moving: BoolArray
     origin: FloatArray
     unscaled: IntArray
     tried: IntArray
@@ -142,9 +142,12 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     part, norms, strays = _arrived(scene, window, config, without)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
+    moves = _moving(scene, part, norms, config)
     least = config.guard.min_points if config.guard.enabled else 2
-    kept, keyframes, points = _determined(part.problem, usable, config.window.max_landmarks, least)
+    kept, keyframes, points = determined.determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
+    moves = moves[points]
+    usable &= ~moves.take(part.problem.observations.point)
     is_new = np.zeros(len(scene.keyframes), bool)
     is_new[window] = True
     is_old = ~is_new[part.keyframes]
@@ -170,6 +173,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         landmarks=part.landmarks,
         window=window,
         lost=lost,
+        moving=moves,
         origin=part.origin,
         unscaled=held.unscaled,
         tried=tried,
@@ -352,6 +356,14 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
     return usable & ~far
 
 
+def _moving(scene: Scene, part: _Part, norms: FloatArray, config: Config) -> BoolArray:
+    """Return which points move; none where outliers are kept."""
+    if config.tracks.outlier_px <= 0 or not config.guard.enabled:
+        return np.zeros(len(part.landmarks), bool)
+    unrefined = ~scene.keyframes.refined[part.keyframes]
+    return moving.moving(part.problem, norms, unrefined, config.solver.kernels)
+
+
 def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     """Return the rows of placed landmarks that absurd residuals leave with too few views, by track id."""
     obs, n = part.problem.observations, len(part.landmarks)
@@ -366,35 +378,3 @@ def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     before = np.bincount(point, weight * heard[rows], n)
     after = np.bincount(point, weight * usable[rows], n)
     return part.landmarks[scene.landmarks.has_position[part.landmarks] & (before >= 2) & (after < 2)]
-
-
-def _determined(
-    problem: Problem, usable: BoolArray, max_landmarks: int, min_points: int
-) -> tuple[IntArray, BoolArray, BoolArray]:
-    """Return which observations, keyframes and points are left without all that does not determine anything."""
-    obs, n_kf, n_pt = problem.observations, problem.n_keyframes, problem.n_points
-    keep_pt = ~np.isnan(problem.start.points[:, 0])
-    if np.count_nonzero(keep_pt) > max_landmarks:
-        keep_pt = _most_seen(keep_pt, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
-    # Views of a point by several cameras of a keyframe are neighbours, and count once.
-    first = np.ones(len(obs), bool)
-    first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
-    while True:
-        used = usable & keep_pt.take(obs.point)
-        keep_kf = np.bincount(obs.keyframe, used, n_kf) >= MIN_OBSERVATIONS
-        keep_kf &= np.bincount(obs.keyframe[used & first], minlength=n_kf) >= min_points
-        used &= keep_kf.take(obs.keyframe)
-        determined = np.bincount(obs.point, used, n_pt) >= 2
-        if len(obs.depth_m):
-            determined |= np.bincount(obs.point, used & np.isfinite(obs.depth_m), n_pt) > 0
-        before, keep_pt = keep_pt, keep_pt & determined
-        if np.array_equal(keep_pt, before):
-            break
-    return np.flatnonzero(keep_pt.take(obs.point) & keep_kf.take(obs.keyframe)), keep_kf, keep_pt
-
-
-def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
-    """Return which of the known points to keep: ``limit`` of them, those with most views, ties by track id."""
-    keep = np.zeros(len(known), bool)
-    keep[np.argsort(np.where(known, -views, 1), kind="stable")[:limit]] = True
-    return keep

@@ -13,8 +13,9 @@ from ba_node.offline.recording import record
 from experiments.robustness.faults import FAULTS, Recording, spoiled
 from tests.cases.conftest import Replay, harmless
 
-# Faults that are not mended yet; a name goes as soon as its tests pass.
-PENDING = {"outliers_moving", "stands_still", "pure_rotation", "hardly_moves"}
+# Fault and rig that are not mended yet; one goes as soon as its tests pass. Of what one camera sees 40 % move, and in
+# places far more than half; on the spot its turns begin too early to be placed.
+PENDING = {("outliers_moving", "mono"), ("pure_rotation", "mono")}
 
 
 def siblings() -> list[Any]:
@@ -26,7 +27,7 @@ def siblings() -> list[Any]:
             fault.rigs[i % len(fault.rigs)],
             fault.amounts[i % len(fault.amounts)],
             100 + number + 50 * i,
-            marks=[pending] if name in PENDING else [],
+            marks=[pending] if (name, fault.rigs[i % len(fault.rigs)]) in PENDING else [],
         )
         for number, (name, fault) in enumerate(FAULTS.items())
         # Of a motion the usual rig, to which it does most harm, and another; of the others one, by turns.

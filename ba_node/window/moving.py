@@ -1,0 +1,100 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tell tracks on objects that move from those of the scene that stands.
+
+Tracks on an object agree with each other as those of the scene do, only on another motion of the camera. Each few of
+their views nearly fit a point, so view by view most pass the gate of outliers, and together they pull the solution. The
+motion that counts is the one that the keyframes begin with: refined before, or as the front-end's step has it. A point
+that stands, seen by it, leaves noise alone; one that moves leaves more in most of its views. So tracks are judged as a
+whole, by the mean of their squared residuals ``r`` in sigmas, none of which counts for more than the gate::
+
+    mean of min(r, 6)^2 > 9,    r > 3 in two views in five, and in two at least
+
+Noise alone gives a mean of 2. A view that is far off in the image, as a mismatch is, does not count at all. Poses are
+somewhat off too, most of all those that were not refined yet: where the best third of the residuals exceed noise, of
+the window or of such a keyframe, its residuals are divided by how many times they do.
+
+What moves sits out the solve that it is found in, and is no point of the map. It is judged anew before each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ba_node.core import consensus, native_kernels, triangulation
+from ba_node.window.problems import part_of
+
+if TYPE_CHECKING:
+    from ba_node.core.problem import Problem
+    from ba_node.scene.tables import BoolArray, FloatArray
+
+# Residuals, sigmas: of a mismatch, which tells nothing of motion; the most that one counts for; and more than noise.
+_MISMATCH = 120.0
+_BOUND = 6.0
+_LARGE = 3.0
+# So many residuals of a track, and that share of them, are larger.
+_LEAST_LARGE = 2
+_LARGE_SHARE = 0.4
+# With fewer observations a keyframe, poses are not known well enough to tell.
+_MANY = 50
+# The residual of this rank tells how far off a keyframe begins, if so many are known; and what noise has at this rank.
+_RANK = 0.3
+_NOISE_AT_RANK = 0.845
+_KNOWN = 10
+
+
+def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: str = "auto") -> BoolArray:
+    """Return which points move, (n_pt,).
+
+    A point that seems to may only be in the wrong place. So it is judged again where most of its views agree.
+
+    Args:
+        problem: with all observations, flagged ones too; points without a place are NaN.
+        norms: (n_obs,) sizes of their residuals at the start, sigmas.
+        unrefined: (n_kf,) keyframes whose poses no solve has refined yet.
+        kernels: native or numpy.
+    """
+    point = problem.observations.point
+    if len(point) < _MANY * problem.n_keyframes:
+        return np.zeros(problem.n_points, bool)
+    norms = np.where(np.isnan(problem.start.points[:, 0]).take(point), np.inf, norms)
+    off = _off(problem, norms, unrefined)
+    found = _leaves_more_than_noise(problem, norms / off.take(problem.observations.keyframe))
+    rows = np.flatnonzero(found.take(point))
+    if not len(rows):
+        return found
+    doubted = part_of(problem, rows, np.ones(problem.n_keyframes, bool), found)
+    places, _ = consensus.triangulate(triangulation.rays_of(doubted), doubted.n_points, _BOUND, kernels)
+    at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
+    again = native_kernels.residual_norms(doubted, at, kernels) / off.take(doubted.observations.keyframe)
+    found[found] = _leaves_more_than_noise(doubted, again)
+    return found
+
+
+def _off(problem: Problem, norms: FloatArray, unrefined: BoolArray) -> FloatArray:
+    """Return how many times as large as noise the residuals of each keyframe are where it begins, (n_kf,)."""
+    off = np.full(problem.n_keyframes, _times_noise(norms))
+    for k in np.flatnonzero(unrefined):
+        off[k] = max(off[k], _times_noise(norms[problem.observations.keyframe == k]))
+    return off
+
+
+def _times_noise(norms: FloatArray) -> float:
+    """Return how many times as large as noise the better ones of some residuals are, 1 or more."""
+    known = norms[np.isfinite(norms)]
+    if len(known) < _KNOWN:
+        return 1.0
+    rank = int(_RANK * len(known))
+    return max(1.0, float(np.partition(known, rank)[rank]) / _NOISE_AT_RANK)
+
+
+def _leaves_more_than_noise(problem: Problem, norms: FloatArray) -> BoolArray:
+    rows, n = np.flatnonzero(norms < _MISMATCH), problem.n_points
+    point, norms = problem.observations.point.take(rows), norms.take(rows)
+    total = np.bincount(point, np.minimum(norms, _BOUND) ** 2, n)
+    large = np.bincount(point[norms > _LARGE], minlength=n)
+    count = np.bincount(point, minlength=n)
+    return np.asarray((total > _LARGE**2 * count) & (large >= np.maximum(_LEAST_LARGE, _LARGE_SHARE * count)))

@@ -1,0 +1,126 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tracks on objects that move: told from those that stand, and no match for the front-end's steps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ba_node import window
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.evaluation.metrics import absolute_error
+from ba_node.scene.scene import Scene
+from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.window.moving import moving
+from ba_node.window.selection import Selection
+from experiments.robustness.faults import Recording, spoiled, without_outliers
+
+# A loop of 30 m; the front-end is very good, or as it often is.
+DRIVE = {
+    "keyframes": 60,
+    "length_m": 30.0,
+    "path": "loop",
+    "tracks": 200,
+    "landmarks": 3000,
+    "outlier_share": 0.0,
+}
+ODOMETRY = {"good": (0.05, 0.005), "usual": (0.5, 0.03)}
+# An observation farther from the truth, px, is of something that moved.
+LIMIT_PX = 3.0
+
+
+def drive(rig: str, odometry: str, share: float, seed: int) -> Recording:
+    rotation_deg, translation = ODOMETRY[odometry]
+    drift = {"drift_rotation_deg": rotation_deg, "drift_translation": translation}
+    return spoiled("outliers_moving", rig, share, seed, **{**DRIVE, **drift})
+
+
+def played(recording: Recording) -> tuple[Backend, float, float]:
+    """Return the back-end, and the errors of the path published: m after alignment, and deg as it stands."""
+    backend = Backend(Config())
+    for measurement in recording.measurements:
+        for admitted in backend.admit(measurement):
+            if backend.completes(admitted):
+                backend.solve()
+            backend.take(admitted)
+    backend.flush(final=True)
+    while backend.ready:
+        backend.solve()
+    path, truth = backend.estimate().trajectory, recording.truth
+    metres = absolute_error(path, truth, "se3").translation.rmse
+    return backend, metres, absolute_error(path, truth, "none").rotation.rmse
+
+
+def at_the_truth() -> tuple[Selection, np.ndarray]:
+    """Return a window at its optimum, and its residuals."""
+    data = generate(SyntheticOptions(
+        seed=5, keyframes=10, length_m=10.0, tracks=150, outlier_share=0.0, drift_rotation_deg=0.01,
+        drift_translation=0.001, baseline_m=0.12,
+    ))  # fmt: skip
+    scene = Scene(Config().scene)
+    for _, _, measurement in data.timeline():
+        scene.add(measurement)
+    selection = window.select(scene, Config())
+    assert isinstance(selection, Selection), selection
+    return selection, selection.norms
+
+
+@pytest.mark.parametrize("kernels", ["native", "numpy"])
+def test_points_that_wander_are_told_from_those_that_stand(kernels: str) -> None:
+    selection, norms = at_the_truth()
+    whole = selection.whole
+    n = whole.n_points
+    wanders = np.arange(n) % 5 == 0
+    # 6 px a keyframe to the right.
+    uv = whole.observations.uv.copy()
+    own = wanders[whole.observations.point]
+    uv[own, 0] += 6.0 * whole.observations.keyframe[own]
+    moved = dataclasses.replace(whole, observations=dataclasses.replace(whole.observations, uv=uv))
+    again = np.where(own, 20.0, norms)
+    views = np.bincount(whole.observations.point, minlength=n)
+    refined = np.zeros(whole.n_keyframes, bool)
+    found = moving(moved, again, refined, kernels)
+    told = views >= 6
+    assert found[wanders & told].mean() > 0.9, f"{found[wanders & told].mean():.2f} of those that wander"
+    assert found[~wanders].mean() < 0.01, f"{found[~wanders].mean():.3f} of those that stand"
+
+
+def test_a_point_in_the_wrong_place_does_not_move() -> None:
+    """Its views agree, only elsewhere."""
+    selection, norms = at_the_truth()
+    again = norms.copy()
+    again[selection.observations.point == 3] = 30.0
+    assert not moving(selection.whole, again, np.zeros(selection.problem.n_keyframes, bool))[3]
+
+
+def test_mismatches_do_not_move() -> None:
+    selection, norms = at_the_truth()
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(norms)) < 0.3
+    uv = selection.observations.uv.copy()
+    uv[wrong] = rng.random((int(wrong.sum()), 2)) * [640.0, 480.0]
+    observations = dataclasses.replace(selection.observations, uv=uv)
+    problem = dataclasses.replace(selection.problem, observations=observations)
+    found = moving(problem, np.where(wrong, 400.0, norms), np.zeros(problem.n_keyframes, bool))
+    assert found.mean() < 0.02, f"{found.mean():.3f}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("odometry", ODOMETRY)
+@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
+def test_a_third_of_the_tracks_may_move(rig: str, odometry: str, seed: int) -> None:
+    recording = drive(rig, odometry, 0.3, seed)
+    backend, metres, degrees = played(recording)
+    _, clean, _ = played(without_outliers(recording, LIMIT_PX))
+    before = absolute_error(recording.odometry, recording.truth, "se3").translation.rmse
+    before_deg = absolute_error(recording.odometry, recording.truth, "none").rotation.rmse
+    assert metres <= 3.0 * clean, f"{clean:.4f} m without them, {metres:.4f} m with them"
+    assert metres <= 1.1 * before, f"{before:.4f} -> {metres:.4f} m"
+    assert degrees <= 1.1 * before_deg + 0.1, f"{before_deg:.3f} -> {degrees:.3f} deg"
+    if rig == "stereo":
+        assert "move against the rest" in backend.scene.log.warnings["moving"]
