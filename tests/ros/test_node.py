@@ -306,9 +306,12 @@ def test_starts_with_a_file_and_a_namespace(
     peer.connect()
     _play(peer, scene)
     assert _in_solve(peer) == 4
-    types = dict(stranger.node.get_topic_names_and_types())
+    stranger.until(lambda: ("ba_node", "/car") in stranger.node.get_node_names_and_namespaces(), "the node's name")
+    types = dict(stranger.node.get_publisher_names_and_types_by_node("ba_node", "/car"))
+    types |= dict(stranger.node.get_subscriber_names_and_types_by_node("ba_node", "/car"))
     for topic, kind in OUTPUT_TYPES.items():
         assert types[f"/car/ba_node/{topic}"] == [kind], message_class(kind)
+    assert "/car/keyframes" in types
     assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
     assert node.stop(signal.SIGTERM) == 0
 
