@@ -52,7 +52,9 @@ def test_the_cpp_example_compiles_against_the_messages(tmp_path: Path) -> None:
     if prefix is None or compiler is None:
         pytest.skip("no C++ headers of ba_msgs, or no C++ compiler")
     source = str(EXAMPLES / "front_end.cpp")
-    include = [f"-I{folder}" for folder in (prefix / "include").iterdir() if folder.is_dir()]
+    # Those that ba_msgs builds on may stand in another prefix, below which it was laid.
+    found = [folder for one in _prefixes() for folder in (one / "include").glob("*") if folder.is_dir()]
+    include = [f"-I{folder}" for folder in found]
     command = [compiler, "-std=c++17", "-Wall", "-Werror", source, "-o", "front_end", f"-I{STUBS}", *include]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
