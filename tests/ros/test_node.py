@@ -55,10 +55,6 @@ def _of_camera(keyframe: Keyframe, rig: CameraRig) -> Keyframe:
     return dataclasses.replace(keyframe, position=at, orientation=geometry.quaternion_from_matrix(turn))
 
 
-def _refined_ids(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
-
-
 def _newest(peer: Any) -> int | None:
     """Return the keyframe of the last report."""
     reports = peer.received["report"]
@@ -80,7 +76,7 @@ def _play(peer: Any, scene: SyntheticData) -> None:
             peer.publish(image, keyframe.stamp_ns)
         peer.until(lambda key=keyframe.keyframe_id: _newest(peer) == key, f"a report on {keyframe.keyframe_id}")
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _burst(peer: Any, scene: SyntheticData) -> None:
@@ -88,7 +84,7 @@ def _burst(peer: Any, scene: SyntheticData) -> None:
     for _, stamp_ns, measurement in scene.timeline():
         peer.publish(measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _position_rms(positions: Any, truth: Any) -> float:
@@ -253,7 +249,7 @@ def test_a_camera_driver_is_heard(
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
         peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in mono.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
     peer.node.destroy_timer(timer)
     assert "rig_changed" not in _rejected(peer)
 

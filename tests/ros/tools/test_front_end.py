@@ -80,10 +80,6 @@ def _prefixes() -> list[Path]:
     return [Path(sys.prefix), *(Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if p)]
 
 
-def _refined(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
-
-
 def _cloud(stamp_ns: int, *columns: Any, names: tuple[str, ...] = ("", "", "", "")) -> Any:
     channels = [
         message_class("sensor_msgs/msg/ChannelFloat32")(name=name, values=FACTORY.array(np.asarray(c, np.float32)))
@@ -126,9 +122,9 @@ def test_feature_clouds_and_odometry_reach_the_node(start_node: StartNode, make_
     for _ in range(5):  # what is sent before the converter and the node have found each other is lost
         _send_as_vins(features, odometry, scene)
         with contextlib.suppress(AssertionError):
-            peer.until(lambda: _refined(peer) >= wanted and peer.received["report"][-1].landmarks > 100, "all", 6.0)
+            peer.until(lambda: peer.refined_ids() >= wanted and peer.received["report"][-1].landmarks > 100, "all", 6.0)
             break
-    assert _refined(peer) == wanted
+    assert peer.refined_ids() == wanted
     last = peer.received["refined_keyframes"][-1]
     truth = dict(zip([k.stamp_ns for k in scene.keyframes], scene.truth.position, strict=True))
     position = np.asarray(last.position).reshape(-1, 3)
