@@ -153,8 +153,8 @@ def test_channels_that_do_not_fit_are_named(columns: Any) -> None:
         adapter.tracks_from_cloud(cloud, 0, Counter())
 
 
-def test_what_waits_is_bounded() -> None:
-    waiting = adapter.Waiting(3)
-    dropped = [waiting.put(stamp, SimpleNamespace(stamp=stamp)) for stamp in range(5)]
-    assert dropped == [0, 0, 0, 1, 1]
-    assert [waiting.take(stamp) is not None for stamp in range(5)] == [False, False, True, True, True]
+def test_what_waits_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adapter, "MAX_WAITING", 3)
+    waiting: dict[int, Any] = {}
+    assert [adapter.keep(waiting, stamp, SimpleNamespace()) for stamp in range(5)] == [0, 0, 0, 1, 1]
+    assert list(waiting) == [2, 3, 4]
