@@ -5,34 +5,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
 from ba_node import window
+from ba_node.arrays import BoolArray, IntArray
 from ba_node.backend.summary import MapSummary, summary_of
 from ba_node.check import two_view
+from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
+from ba_node.config import Config
 from ba_node.core import geometry
-from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport, Status, Transform
+from ba_node.core.problem import State
+from ba_node.estimate import Cloud, Correction, Estimate, Extras, Iteration, Poses, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
+from ba_node.scene.scene import Scene
 from ba_node.window import extras, quality
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
-
-if TYPE_CHECKING:
-    from collections import Counter
-    from collections.abc import Callable, Iterable
-
-    from ba_node.check.diagnosis import Diagnosis
-    from ba_node.config import Config
-    from ba_node.core.problem import State
-    from ba_node.estimate import Iteration
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, IntArray
 
 # The front-end's frame where neither it nor the parameters name one.
 _ODOM_FRAME = "odom"

@@ -5,16 +5,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
+from ba_node.config import SolverConfig
+from ba_node.core.result import Result
+from ba_node.estimate import Iteration
 from ba_node.window import full, quality
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.config import SolverConfig
-    from ba_node.core.result import Result
-    from ba_node.estimate import Iteration
 
 _TOLD = (
     "method",

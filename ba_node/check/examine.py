@@ -6,14 +6,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from ba_node.check import intrinsics, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
-
-if TYPE_CHECKING:
-    from ba_node.check.relations import Relation
-    from ba_node.check.tracks import Tracks
+from ba_node.check.relations import Relation
+from ba_node.check.tracks import Tracks
 
 _RELATIONS = frozenset({"cameras", "poses"})
 _BUILD_ON_THESE = ("intrinsics", "lengths")

@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import cameras as camera_models
 from ba_node.core import geometry
+from ba_node.core.problem import Cameras
+from ba_node.scene.scene import Scene
 
-if TYPE_CHECKING:
-    from ba_node.core.problem import Cameras
-    from ba_node.scene.scene import Scene
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 Image = tuple[int, int]
 
 # Beyond 80 degrees from the axis a small error in the pixel is a large one in X/Z.

@@ -15,12 +15,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import geometry
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Fewest pairs of rays that an estimate is made from, and that must agree with it.
 MIN_PAIRS = 20

@@ -4,18 +4,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import as_given
 from ba_node.check.relations import AGREED, Relation, agreed, rays, relate, spread
+from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
-
-if TYPE_CHECKING:
-    from ba_node.check.tracks import FloatArray, Tracks
 
 # Parallax, in gates, from which on a triangulated depth is worth something; points and pairs that are needed.
 _PARALLAX = 4.0

@@ -27,10 +27,9 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import columns
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 ModelArray = NDArray[np.uint8]
 
 # Columns of a row of camera parameters.

@@ -12,15 +12,12 @@ that agree with them, so these triangulate it, and then all rays are classified 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ba_node import native
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import triangulation
-
-if TYPE_CHECKING:
-    from ba_node.core.triangulation import BoolArray, FloatArray, IntArray, Rays, Triangulation
+from ba_node.core.triangulation import Rays, Triangulation
 
 _MAX_PAIRS = 45
 _MAX_SINGLES = 8

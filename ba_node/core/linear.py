@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
+
 Product = Callable[[FloatArray], FloatArray]
 
 

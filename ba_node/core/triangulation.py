@@ -17,20 +17,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ba_node import native
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from ba_node.core.problem import Problem
 
 _PLAIN_ROUNDS = 3
 _ROBUST_ROUNDS = 5

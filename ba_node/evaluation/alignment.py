@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
+
 Kind = Literal["none", "se3", "sim3"]
 
 # A set whose second singular value is below this share of the first is a line as far as float64 can tell.

@@ -6,19 +6,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core.geometry import matrix_from_quaternion, so3_log
+from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import Alignment, EvaluationError, Kind, align
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Poses
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.intp]
 
 # Stamps farther apart than two weeks are of no pair.
 MAX_DIFFERENCE_S = 1e6
@@ -75,7 +70,7 @@ class TrajectoryError:
 
 def associate(
     estimate_ns: NDArray[np.int64], reference_ns: NDArray[np.int64], max_difference_s: float = 0.01
-) -> tuple[IndexArray, IndexArray]:
+) -> tuple[IntArray, IntArray]:
     """Pair stamps that are nearest to each other.
 
     Args:

@@ -6,9 +6,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import IO, TYPE_CHECKING, Any
+from pathlib import Path
+from typing import IO, Any
 
+from mcap.records import Channel
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -16,12 +19,6 @@ from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
 from ba_node.io.bag_index import BagIndex, Message, read_index, read_messages
 from ba_node.io.files import FileKindError, open_regular
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
-    from pathlib import Path
-
-    from mcap.records import Channel
 
 # Any recording; devices and pipes are refused.
 MAX_BYTES = 2**62

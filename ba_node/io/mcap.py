@@ -8,9 +8,10 @@ import contextlib
 import pickle
 import tempfile
 from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import chain, combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
@@ -24,9 +25,6 @@ from ba_node.io.unpack import ZSTD_MAGIC, unpack
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.conversion import measurement_from_message
 from ba_node.messages.topics import CAMERA_TYPES, CAMERAS, INPUT_TYPES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
 
 __all__ = ["ROSBAGS_FACTORY", "BagError", "BagReader", "BagWriter", "TopicChoice"]
 

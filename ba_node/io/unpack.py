@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import bz2
 import gzip
+from collections.abc import Iterator
 from io import BytesIO
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # Packed data may grow by this factor, as no measurement does, and anything up to this size.
 MAX_GROWTH = 50

@@ -19,16 +19,13 @@ from __future__ import annotations
 
 import re
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ba_node.estimate import Poses
 from ba_node.messages.factory import NS_PER_S, stamp_parts
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ba_node.estimate import Poses
 
 _ENCODING = b"\x00\x01\x00\x00"
 # Values of sensor_msgs/PointField.

@@ -9,21 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IdArray
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Cameras
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.scene.records import Keyframes
 from ba_node.scene.rejections import RejectionLog
-
-if TYPE_CHECKING:
-    from ba_node.measurements import CameraRig, FeatureTracks, IdArray, Keyframe, LandmarkGuesses
-    from ba_node.scene.records import Keyframes
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 MAX_PIXEL = 1e6
 SIGMA_RANGE = (1e-6, 1e6)

@@ -12,20 +12,17 @@ with any, it sits the solve out.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ba_node.config import SolverOptions
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import Config, SolverOptions
 from ba_node.core import geometry, native_kernels
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
+from ba_node.scene.scene import Scene
 from ba_node.window.problems import problem_of
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import FloatArray, IntArray
 
 # Fewer known points than this place no keyframe.
 _MIN_POINTS = 10

@@ -18,15 +18,12 @@ agree with it (within the gate, at their own newest keyframe). Smoothing moves a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.config import FramesConfig
 from ba_node.core import geometry
 from ba_node.estimate import Transform
-
-if TYPE_CHECKING:
-    from ba_node.config import FramesConfig
 
 _S = 1e-9
 

@@ -17,18 +17,14 @@ steps and l of the estimate's. The keyframes keep to it, ``sum (L - 2 l) dl = 0`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import SolverOptions
 from ba_node.core import covariance, geometry
+from ba_node.core.problem import State
 from ba_node.window import gauge
-
-if TYPE_CHECKING:
-    from ba_node.config import SolverOptions
-    from ba_node.core.problem import State
-    from ba_node.scene.tables import FloatArray, IntArray
-    from ba_node.window.selection import Selection
+from ba_node.window.selection import Selection
 
 
 def covariances(selection: Selection, state: State, measured: FloatArray, options: SolverOptions) -> FloatArray:

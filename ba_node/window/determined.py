@@ -4,13 +4,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, IntArray
+from ba_node.arrays import BoolArray, IntArray
+from ba_node.core.problem import Problem
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4

@@ -4,21 +4,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import IntArray
+from ba_node.config import Config
 from ba_node.core import methods
+from ba_node.core.problem import State
+from ba_node.estimate import Extras
+from ba_node.scene.scene import Scene
 from ba_node.window.covariance import covariances
+from ba_node.window.selection import Selection
 from ba_node.window.view import view
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.core.problem import State
-    from ba_node.estimate import Extras
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import IntArray
-    from ba_node.window.selection import Selection
 
 
 def work_out(

@@ -17,13 +17,11 @@ of a problem that common points and ties connect:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.core.problem import Problem
 
 # A fixed keyframe with fewer observations takes part, but is not relied on to hold anything.
 _ANCHOR_OBSERVATIONS = 10

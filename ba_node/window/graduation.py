@@ -12,16 +12,13 @@ known, a wide loss would let clusters of outliers pull, as of moving objects.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
+from ba_node.config import SolverOptions
 from ba_node.core import solver
-
-if TYPE_CHECKING:
-    from ba_node.config import SolverOptions
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import FloatArray
+from ba_node.core.problem import Problem
 
 # Residuals of this rank tell how far off a keyframe begins: most may be wrong.
 _RANK = 0.3

@@ -13,19 +13,13 @@ front of two cameras (one with a measured depth).
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import TracksConfig
 from ba_node.core import consensus, loss, native_kernels, triangulation
-
-if TYPE_CHECKING:
-    from ba_node.config import TracksConfig
-    from ba_node.core.problem import Problem
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ba_node.core.problem import Problem
 
 # Robust error of a view with the point behind the camera, in sigmas: worse than any view that is only bad.
 _BEHIND = 1e4
@@ -48,7 +42,7 @@ SPREAD = 3.0 * 1.4826
 class _Fit:
     """How well points fit their views: views in front, median error (sigmas), summed robust error; each (n_pt,)."""
 
-    in_front: NDArray[np.intp]
+    in_front: IntArray
     median: FloatArray
     robust: FloatArray
 
@@ -177,7 +171,7 @@ def _fit(problem: Problem, points: FloatArray, kernels: str) -> _Fit:
     )
 
 
-def _median_by_point(values: FloatArray, point: NDArray[np.intp], n_points: int) -> FloatArray:
+def _median_by_point(values: FloatArray, point: IntArray, n_points: int) -> FloatArray:
     """Return the (upper) median of each point's values, inf for points without any."""
     order = np.lexsort((values, point))
     begin = np.searchsorted(point[order], np.arange(n_points + 1))

@@ -5,25 +5,22 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import TracksConfig
 from ba_node.core import geometry, native_kernels
+from ba_node.core.problem import Problem, State
+from ba_node.core.result import Result
+from ba_node.scene.scene import Scene
 from ba_node.window import gauge
 from ba_node.window.initial_points import agreed_points, widened
 from ba_node.window.problems import part_of
 from ba_node.window.reuse import note_reuse, part_reused
-
-if TYPE_CHECKING:
-    from ba_node.config import TracksConfig
-    from ba_node.core.problem import Problem, State
-    from ba_node.core.result import Result
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.selection import Selection
-    from ba_node.window.trial import Explained
-
+from ba_node.window.selection import Selection
+from ba_node.window.trial import Explained
 
 # A point so many times as far away as the whole window's parallax can tell is anywhere.
 _NOTICED = 10.0

@@ -20,16 +20,13 @@ What moves sits out the solve that it is found in, and is no point of the map. I
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import consensus, native_kernels, triangulation
+from ba_node.core.problem import Problem
 from ba_node.window.problems import part_of
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, FloatArray
 
 # Residuals, sigmas: of a mismatch, which tells nothing of motion; the most that one counts for; and more than noise.
 _MISMATCH = 120.0

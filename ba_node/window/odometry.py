@@ -24,19 +24,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import OdometryConfig
 from ba_node.core import geometry
 from ba_node.core.factors import RelativePoses
-
-if TYPE_CHECKING:
-    from ba_node.config import OdometryConfig
-    from ba_node.core.problem import Problem
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.turns import Turns
+from ba_node.core.problem import Problem
+from ba_node.scene.scene import Scene
+from ba_node.window.turns import Turns
 
 _LOSS = "cauchy"
 # A standard deviation of zero would be a condition, not a measurement (m, rad).

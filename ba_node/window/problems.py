@@ -8,17 +8,14 @@ All observations of a problem are sorted by point, keyframe, camera. A part keep
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.problem import Observations, Problem, State
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+from ba_node.scene.scene import Scene
 
 
 def problem_of(

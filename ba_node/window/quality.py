@@ -5,20 +5,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
+from ba_node.config import Config
 from ba_node.core import geometry, objective, triangulation
 from ba_node.core.problem import Problem, State
+from ba_node.core.result import Result
+from ba_node.scene.scene import Scene
 from ba_node.window.problems import problem_of
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.core.result import Result
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import FloatArray
-    from ba_node.window.selection import Selection
+from ba_node.window.selection import Selection
 
 STATES = ("input", "refined")
 # A residual that is longer counts as this: it tells no more than that it is wrong.

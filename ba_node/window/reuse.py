@@ -10,18 +10,14 @@ point, which leaves its place little by little, is none, nor are single mismatch
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import consensus, triangulation
+from ba_node.core.problem import Problem
+from ba_node.scene.scene import Scene
 from ba_node.window.problems import part_of
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.selection import Selection
+from ba_node.window.selection import Selection
 
 # Views of either run: two may agree by chance, but where ids are known to be used again that is the better explanation.
 _LEAST_VIEWS = 3

@@ -9,15 +9,12 @@ front-end's step is worth is a standard deviation for its length and one for its
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import GuardConfig
 from ba_node.window.trial import median
-
-if TYPE_CHECKING:
-    from ba_node.config import GuardConfig
-    from ba_node.scene.tables import FloatArray, IntArray
 
 # Steps shorter, and turns smaller, than this many sigmas of the front-end say nothing of its scale.
 _TELLING = 3.0

@@ -13,16 +13,13 @@ sit on the body as the rig says, a solution is a compromise that each camera by 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IdArray, IntArray
 from ba_node.core import native_kernels, triangulation
 from ba_node.core.cameras import FX, FY, rays
 from ba_node.core.problem import Observations, Problem, State
-
-if TYPE_CHECKING:
-    from ba_node.scene.tables import FloatArray, IdArray, IntArray
 
 # One track in so many may sit a solve out: more would be missed by a small window.
 _SHARE = 128

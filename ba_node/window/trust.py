@@ -5,15 +5,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray
+from ba_node.config import Config
 from ba_node.window import steps
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.tables import BoolArray
 
 # Doubt that a held solve adds; the most there may be; up to which one that passes is taken; from which on what was
 # taken of a young map is given up.

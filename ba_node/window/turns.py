@@ -17,15 +17,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras, geometry
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+from ba_node.core.problem import Problem
 
 # A keyframe that sees fewer points with a place than this is looked at.
 _FEW_POINTS = 30

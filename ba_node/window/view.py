@@ -4,17 +4,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy.sparse
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras, geometry, objective
+from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.estimate import WindowView
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Cameras, Observations, Problem, State
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
 
 def view(problem: Problem, state: State, good: BoolArray, place: IntArray, n: int) -> WindowView:
