@@ -200,8 +200,7 @@ class Backend:
     def flush(self, final: bool = False) -> None:
         """Call the newest keyframe complete with what has come, and let a session begin that the front-end asked for.
 
-        Args:
-            final: nothing more will come: give up on what waits for its keyframe or for the rig.
+        ``final``: nothing more will come, and what waits for its keyframe or for the rig is given up.
         """
         self.map.completion.closed = True
         if final:

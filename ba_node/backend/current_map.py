@@ -181,14 +181,10 @@ class CurrentMap:
         clock: Callable[[], float],
         on_iteration: Callable[[Iteration], bool] | None,
     ) -> Estimate:
-        """Refine the newest window.
+        """Refine the newest window; all solutions are held if it is said what is ``wrong``.
 
-        Args:
-            solve_count: number of this solve.
-            wrong: why all solutions are held; empty if they are not.
-            wanted: what to work out beside the estimate.
-            clock: seconds, for the report alone.
-            on_iteration: called with each iteration; returning False ends the solve after it.
+        ``wanted`` is worked out beside the estimate; the clock (s) is for the report alone; ``on_iteration`` ends the
+        solve by returning False.
         """
         due = self.completion.due(self.scene)
         end = self._end(due)
@@ -283,12 +279,9 @@ class CurrentMap:
         )
 
     def rms_px(self, state: str = "refined") -> float:
-        """Return the root mean square reprojection error per coordinate over all observations of the map, px.
+        """Return the rms of all observations of the map, outliers too, px; see ``quality.rms_px``.
 
         Outliers count too; tracks with fewer than two views do not, nor do points without a position.
-
-        Args:
-            state: ``refined``, or ``input`` for the front-end's poses and guesses (without a guess: triangulated).
         """
         return quality.rms_px(self.scene, self.config, state)
 

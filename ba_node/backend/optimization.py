@@ -52,14 +52,9 @@ class Optimization:
         clock: Callable[[], float] = _no_clock,
         on_iteration: Callable[[Iteration], bool] | None = None,
     ) -> None:
-        """Solve; the map is not touched.
+        """Solve; the map is not touched. A method and a number of iterations take the place of the parameters'.
 
-        Args:
-            config: parameters of the solver.
-            method: in place of that of the parameters, if it is not empty.
-            max_iterations: likewise, if it is not 0.
-            clock: seconds, for the report alone.
-            on_iteration: called with each iteration; returning False ends the solve after it.
+        The clock (s) is for the report alone; ``on_iteration`` ends the solve by returning False.
         """
         chosen = full.options(config, method, max_iterations)
         self.solved = self.snapshot.solve(chosen, clock=clock, on_iteration=on_iteration)

@@ -17,11 +17,7 @@ _BUILD_ON_THESE = ("intrinsics", "lengths")
 
 
 def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
-    """Return what the tracks tell about the set-up. Depends on nothing but the tracks.
-
-    Args:
-        tracks: what was seen.
-        told: the tests that were decided before and are left out.
+    """Return what the tracks tell about the set-up, but for the tests ``told``, which were decided before.
 
     Raises:
         ImportError: OpenCV is missing, see :func:`two_view.available`.

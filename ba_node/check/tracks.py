@@ -100,9 +100,7 @@ class Tracks:
 def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:
     """Return a copy of what a scene has been given; None before the first tracks or without a rig.
 
-    Args:
-        scene: what is known.
-        newest: keyframes to look at; None for all.
+    ``newest`` keyframes are looked at; None for all.
     """
     table, cameras = scene.observations, scene.cameras
     order = scene.order if newest is None else scene.order[-newest:]

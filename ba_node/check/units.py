@@ -155,10 +155,7 @@ def _depth_finding(cause: str, evidence: str) -> Finding:
 def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: bool = True) -> Diagnosis:
     """Compare depths of two cameras, which are in units of their baseline, with those of the front-end's steps.
 
-    Args:
-        tracks: what was seen.
-        relations: of images in motion.
-        intrinsics_fit: that is known; where it is not, a mistake needs more pairs of images, as it may be theirs.
+    Where it is not known that ``intrinsics_fit``, a mistake needs more pairs of images, as it may be theirs.
     """
     outcome, given = Diagnosis(), as_given(tracks)
     if len(given.cameras.rotation) > 1 and len(tracks) < _KEYFRAMES:

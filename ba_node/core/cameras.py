@@ -109,10 +109,6 @@ def widest(model: Model, params: FloatArray) -> float:
     """Return how far from the axis a distorted ray may lie and be the image of one ray alone; inf without a limit.
 
     Beyond it the distortion folds over: the image of rays farther out turns back. Tangential terms are left out.
-
-    Args:
-        model: of the camera.
-        params: (12,) of the camera.
     """
     if not params[DISTORTION].any():
         return np.inf

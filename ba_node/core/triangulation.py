@@ -107,10 +107,7 @@ def rays_of(problem: Problem) -> Rays:
 def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulation:
     """Return the point of each group of rays. No ray is rejected here: look at the parallax before using a point.
 
-    Args:
-        rays: in any order.
-        n_points: number of points.
-        kernels: numpy; otherwise the C++ kernels, where they are built.
+    The C++ kernels do it where they are built, unless ``kernels`` is numpy.
     """
     if kernels != "numpy" and native.kernels is not None:
         return Triangulation(*native.kernels.triangulate(rays, n_points))

@@ -52,12 +52,9 @@ class Alignment:
 
 
 def align(estimate: FloatArray, reference: FloatArray, kind: Kind) -> Alignment:
-    """Return the transform that brings an estimate closest to a reference.
+    """Return the transform that brings an estimate closest to a reference, row by row the same places: (n, 3) m each.
 
-    Args:
-        estimate: (n, 3), m.
-        reference: (n, 3), row by row the same places, m.
-        kind: none (identity), se3 (rotation and translation) or sim3 (and scale).
+    ``kind`` is none (identity), se3 (rotation and translation) or sim3 (and scale).
 
     Raises:
         EvaluationError: unknown kind, shapes that differ, numbers that are not finite, fewer than 3 points, or points

@@ -71,12 +71,7 @@ class TrajectoryError:
 def associate(
     estimate_ns: NDArray[np.int64], reference_ns: NDArray[np.int64], max_difference_s: float = 0.01
 ) -> tuple[IntArray, IntArray]:
-    """Pair stamps that are nearest to each other.
-
-    Args:
-        estimate_ns: (n,) in any order.
-        reference_ns: (m,) in any order.
-        max_difference_s: pairs farther apart are no pairs.
+    """Pair stamps, in any order, that are nearest to each other; those farther apart than the limit are no pair.
 
     Returns:
         Rows of the estimate and of the reference, by time; each row is in at most one pair, the closest; of
@@ -102,13 +97,7 @@ def associate(
 def absolute_error(
     estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01
 ) -> TrajectoryError:
-    """Return how far an estimated trajectory is from the reference.
-
-    Args:
-        estimate: poses.
-        reference: true poses, paired with the estimate's by stamp.
-        kind: alignment of the estimate, by the positions of the pairs.
-        max_difference_s: largest difference of the stamps of a pair.
+    """Return how far an estimated trajectory is from the reference, paired by stamp, aligned by the pairs' positions.
 
     Raises:
         EvaluationError: no pose has a partner, or the pairs cannot be aligned.

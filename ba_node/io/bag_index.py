@@ -140,9 +140,8 @@ def read_messages(
 def merge_by_time(parts: Iterator[tuple[int, int, Iterator[Message]]]) -> Iterator[Message]:
     """Yield the messages of all parts by log time; those of the same time by the place of their part.
 
-    Args:
-        parts: log time of the first message, ns, place, and messages by log time of each part, by the first two. A part
-            is read only when its first message may come before all that wait.
+    Parts are the log time (ns) of their first message, place, and messages by log time, sorted by the first two. A part
+    is read only when its first message may come before all that wait.
     """
     part = next(parts, None)
     waiting: list[tuple[int, int, Message, Iterator[Message]]] = []

@@ -69,12 +69,7 @@ class Source:
 
 
 def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
-    """Open a file.
-
-    Args:
-        path: the file.
-        name: what it is called in errors: it may have been unpacked from another.
-        stack: closes it.
+    """Open a file, closed by the stack; errors call it ``name``, as it may have been unpacked from another.
 
     Raises:
         BagError: it cannot be opened, is of another kind, or holds no message that can be read.

@@ -94,10 +94,7 @@ class BagReader:
         self._stack.close()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield (topic, type, log time in ns, CDR bytes) by log time; same times in the order of the file.
-
-        Args:
-            topics: only these; all if None.
+        """Yield (topic, type, log time in ns, CDR bytes) of some topics (None: all) by log time, then by place in the file.
 
         Raises:
             BagError: nothing of the recording can be read after all.
@@ -144,8 +141,7 @@ class BagReader:
         may have got them late. A lone camera (CameraInfo) is read only when there is no rig. See :class:`Chooser` for
         which topics are taken; ``taken`` and ``left`` tell. Messages that cannot be read are counted in ``rejected``.
 
-        Args:
-            cameras_known: the recording may come without cameras.
+        The recording may come without cameras where they are known.
 
         Raises:
             BagError: keyframes, tracks or cameras are missing, several are possible, or a

@@ -33,12 +33,7 @@ def limit_for(packed_size: int, growth: int = MAX_GROWTH, always: int = ALWAYS_A
 
 
 def pieces(kind: str, stream: IO[bytes], limit: int) -> Iterator[bytes]:
-    """Yield what a packed stream holds, piece by piece.
-
-    Args:
-        kind: bz2, gz, lz4 or zstd.
-        stream: the packed bytes.
-        limit: bytes that may come out of it.
+    """Yield what a packed stream (bz2, gz, lz4, zstd) holds, piece by piece, up to ``limit`` bytes.
 
     Raises:
         TooLargeError: there are more; nothing beyond the limit has been unpacked.

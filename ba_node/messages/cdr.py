@@ -97,13 +97,9 @@ def path_message(poses: Poses, stamp_ns: int, frame_id: str) -> bytes:
 
 
 def cloud_message(points: NDArray[np.void], stamp_ns: int, frame_id: str, *, dense: bool) -> bytes:
-    """Return a ``sensor_msgs/PointCloud2`` of one row.
+    """Return a ``sensor_msgs/PointCloud2`` of one row of records of little-endian float32 and uint32 fields, (n,).
 
-    Args:
-        points: (n,) records of little-endian float32 and uint32 fields.
-        stamp_ns: stamp, ns.
-        frame_id: frame of the points.
-        dense: no coordinate is NaN or infinite.
+    ``dense``: no coordinate is NaN or infinite.
     """
     layout, size = points.dtype.fields, points.dtype.itemsize
     assert layout is not None

@@ -36,12 +36,9 @@ _FAINTEST = 0.05
 
 
 def marker_array(estimate: Estimate, config: OutputConfig, *, clear: bool) -> bytes:
-    """Return a ``visualization_msgs/MarkerArray``.
+    """Return a ``visualization_msgs/MarkerArray`` of an estimate with its view.
 
-    Args:
-        estimate: with its view.
-        config: how much to draw, and the scale of the colours.
-        clear: take away everything that was drawn before, as a session of its own begins.
+    ``clear`` takes away everything that was drawn before, as another map begins.
 
     Raises:
         ConversionError: the seconds of the stamp exceed 32 bits.

@@ -32,11 +32,7 @@ def output_messages(
 ) -> list[tuple[str, str, Any]]:
     """Return what a node publishes after a solve; of a failed or skipped one the report only, unless the map is empty.
 
-    Args:
-        factory: makes the messages.
-        estimate: what the solve gave.
-        config: caps on the length of the path and the number of points.
-        wanted: topics that someone listens to; the others are not built.
+    Only topics that are ``wanted`` are built.
 
     Returns:
         (topic below the node's name, type, message) in the order to publish; one pose for each refined keyframe.

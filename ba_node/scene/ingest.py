@@ -65,11 +65,7 @@ def plain_name(frame_id: str) -> str:
 def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -> None:
     """Say so if the name of a keyframe's fixed frame is none, or one that tf2 refuses.
 
-    Args:
-        keyframe: as it came.
-        named: by a parameter, empty if it names none; then an empty name does no harm.
-        taken: what is taken for an empty name.
-        log: where it is said.
+    Where a parameter has ``named`` it, an empty name does no harm; ``taken`` is what is taken for an empty one.
     """
     name = plain_name(keyframe.frame_id)
     if name == keyframe.frame_id and name:

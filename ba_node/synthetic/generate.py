@@ -65,11 +65,9 @@ class SyntheticData:
 def generate(
     options: SyntheticOptions, change: Callable[[World, Path], tuple[World, Path]] | None = None
 ) -> SyntheticData:
-    """Make a recording. The same options give the same numbers.
+    """Make a recording; the same options give the same numbers.
 
-    Args:
-        options: what to record.
-        change: puts another world or another motion in the place of those that the options ask for.
+    ``change`` puts another world or another motion in the place of those that the options ask for.
     """
     # One stream a purpose: a change of the noise must not move the points.
     world_rng, track_rng, drift_rng, noise_rng, id_rng = np.random.default_rng(options.seed).spawn(5)

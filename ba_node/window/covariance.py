@@ -30,11 +30,7 @@ from ba_node.window.selection import Selection
 def covariances(selection: Selection, state: State, measured: FloatArray, options: SolverOptions) -> FloatArray:
     """Return the covariance of every pose of a window's problem.
 
-    Args:
-        selection: what was solved.
-        state: its solution, in the scale that it has in the map.
-        measured: (n_kf, 3) positions of the keyframes by the front-end, m.
-        options: what it was solved with.
+    ``measured`` (n_kf, 3) are the positions of the keyframes by the front-end, m; the state is in the scale of the map.
 
     Returns:
         (n_kf, 6, 6): x, y, z (m), rotation about X, Y, Z (rad) of the fixed frame. NaN where unknown; 0 for fixed ones.

@@ -22,15 +22,9 @@ from ba_node.window.view import view
 def work_out(
     wanted: Extras, scene: Scene, config: Config, selection: Selection, state: State, refined: IntArray
 ) -> dict[str, Any]:
-    """Return what is wanted, by the names of its fields in Estimate.
+    """Return what is wanted of a solution in the scale of the map, by the names of its fields in Estimate.
 
-    Args:
-        wanted: what to work out.
-        scene: into which the solution was merged.
-        config: all parameters.
-        selection: what was solved.
-        state: its solution, in the scale that it has in the map.
-        refined: rows of the keyframes of the estimate, oldest first; rows of the results are as here.
+    ``refined`` are rows of the keyframes of the estimate, oldest first, and so are the rows of the results.
     """
     places = scene.places()
     place = np.searchsorted(places[refined], places[selection.keyframes])

@@ -31,13 +31,7 @@ _FADING = ("cauchy", "geman_mcclure")
 
 
 def begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Problem:
-    """Return a problem with a better start, if its own is bad.
-
-    Args:
-        problem: with the inlier observations.
-        norms: (n_obs,) sizes of their residuals at the start, sigmas.
-        options: what it will be solved with.
-    """
+    """Return a problem with a better start, if its own is bad; ``norms`` (n_obs,) are the residuals there, sigmas."""
     scale = options.loss_scale_px
     if options.loss not in _FADING or problem.n_keyframes > _YOUNG:
         return problem

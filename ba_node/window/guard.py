@@ -79,14 +79,7 @@ class Verdict:
 
 
 def decide(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
-    """Return whether a solution may be taken.
-
-    Args:
-        config: all parameters.
-        selection: what was solved.
-        found: what came of it, with a state.
-        trust: what the solves before are worth.
-    """
+    """Return whether a solution may be taken; ``trust`` is what the solves before are worth."""
     assert found.state is not None and found.explained is not None
     trust = trust or Trust()
     config = trust.bounds(config)

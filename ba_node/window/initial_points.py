@@ -67,12 +67,8 @@ def initial_points(
 ) -> FloatArray:
     """Return first positions (n_pt, 3) of the points of a problem, NaN where none can be had yet.
 
-    Args:
-        problem: views of the points; its start points are not looked at.
-        guess: (n_pt, 3) guesses in the frame of the problem, NaN for none.
-        config: for the parallax.
-        gate: how far off a view may be and agree, sigmas.
-        kernels: native, numpy or auto.
+    ``guess`` is (n_pt, 3) in the frame of the problem, NaN for none; ``gate`` is how far off a view may be and agree,
+    sigmas. The problem's own start points are not looked at.
     """
     found = agreed_points(problem, config, gate, kernels)
     points = np.where(found.good[:, None], found.points, np.nan)
@@ -139,12 +135,9 @@ def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float,
 
 
 def widened(gate: float, errors: FloatArray, bulk: int = BULK) -> float:
-    """Return a gate that lets the bulk of the errors pass: three robust standard deviations.
+    """Return a gate, at least ``gate``, that lets the bulk of the errors pass: three robust standard deviations.
 
-    Args:
-        gate: smallest gate.
-        errors: to look at.
-        bulk: with fewer errors than this there is no bulk, and the gate stays.
+    Fewer errors than ``bulk`` have no bulk, and the gate stays.
     """
     if len(errors) < bulk or not _median_exceeds(gate, errors):
         return gate

@@ -66,12 +66,6 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
 
     Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
     far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
-
-    Args:
-        selection: what was solved.
-        state: the solution, in the scale of the map.
-        tracks: the outlier gate.
-        kernels: native, numpy or auto.
     """
     explained = selection.trial(kernels).explained(selection.measured, (state.rotation, state.translation))
     found = explained.points
@@ -125,13 +119,7 @@ def apply(
 ) -> FloatArray:
     """Put a solution, in the scale of the map, into the scene and classify its observations anew.
 
-    Args:
-        scene: that it goes into.
-        selection: what was solved.
-        state: the solution.
-        norms: (n_all,) sizes of its residuals, as ``Selection.norms``; written over.
-        tracks: the gates.
-        kernels: native, numpy or auto.
+    ``norms`` (n_all,) are the sizes of its residuals, as ``Selection.norms``; they are written over, and returned.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
@@ -164,10 +152,7 @@ def _note_moving(scene: Scene, selection: Selection) -> None:
 def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
     """Give the parts whose scale floats the scale of some steps: the front-end's, unless the map has one already.
 
-    Args:
-        selection: what was solved.
-        measured: (n_kf, 3) positions of its keyframes in that scale, m.
-        state: the solution.
+    ``measured`` (n_kf, 3) are the positions of the keyframes in that scale, m.
     """
     obs = selection.problem.observations
     rotation, position = geometry.inverse(state.rotation, state.translation)

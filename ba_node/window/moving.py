@@ -48,11 +48,8 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
 
     A point that seems to may only be in the wrong place. So it is judged again where most of its views agree.
 
-    Args:
-        problem: with all observations, flagged ones too; points without a place are NaN.
-        norms: (n_obs,) sizes of their residuals at the start, sigmas.
-        unrefined: (n_kf,) keyframes whose poses no solve has refined yet.
-        kernels: native or numpy.
+    The problem has all observations, flagged ones too; points without a place are NaN. ``norms`` (n_obs,) are the
+    residuals at the start, sigmas; no solve has refined the poses of ``unrefined`` (n_kf,) yet.
     """
     point = problem.observations.point
     if len(point) < _MANY * problem.n_keyframes:

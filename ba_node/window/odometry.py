@@ -89,12 +89,8 @@ def factors(
 ) -> tuple[RelativePoses, ...]:
     """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
 
-    Args:
-        scene: where the front-end's poses stand.
-        config: standard deviations.
-        problem: in which they are to count.
-        keyframes: rows of its keyframes, oldest first.
-        turned: what is known of their rotations beside the front-end's.
+    ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
+    beside the front-end's.
     """
     tied = np.flatnonzero(ties(scene, config, keyframes))
     free = ~(problem.fixed[tied] & problem.fixed[tied + 1])

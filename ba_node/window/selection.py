@@ -125,11 +125,7 @@ def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
 def select(scene: Scene, config: Config, end: int | None = None, without: tuple[int, ...] = ()) -> Selection | str:
     """Return the problem of the newest window among the first ``end`` keyframes, or why there is none.
 
-    Args:
-        scene: what is known.
-        config: all parameters.
-        end: keyframes to look at.
-        without: rows of keyframes that are to sit it out.
+    Keyframes of the rows ``without`` sit it out.
     """
     window = rows_of(scene, config, end)
     reason = _nothing(scene, window)
