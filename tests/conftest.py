@@ -29,6 +29,18 @@ settings.register_profile("ba_node", deadline=None, derandomize=True, suppress_h
 settings.load_profile("ba_node")
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Group tests for pytest-xdist: a process runs all that talk over DDS, and each other file as a whole.
+
+    Two nodes that start at the same time are slow to find each other; what the tests of a file share is made once.
+    """
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
+    for item in items:
+        talks = item.get_closest_marker("dds") is not None or _ROOT / "tests" / "ros" in item.path.parents
+        item.add_marker(pytest.mark.xdist_group("dds" if talks else str(item.path)))
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Return the folder of data sets that are not part of the repository, or skip the test."""
