@@ -9,6 +9,7 @@ BA_NODE_TARGETS=baseline,avx2 builds some of them, BA_NODE_WERROR=1 makes the co
 
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -81,15 +82,15 @@ class BuildKernels(build_ext):
 
     def build_extension(self, ext: Extension) -> None:
         """Compile and link the kernels."""
-        # Python's own flags ask for debug information, which is most of the size.
-        debug = [] if "-g" in os.environ.get("CXXFLAGS", "") else ["-g0"]
+        # Python's own flags ask for debug information, which is most of the size. Those that are given come last.
+        given = shlex.split(os.environ.get("CXXFLAGS", ""))
         strict = ["-Werror"] if os.environ.get("BA_NODE_WERROR", "0") not in ("", "0") else []
 
         def compiled(unit: Unit) -> str:
             source, folder = str(SOURCES / unit.source), str(Path(self.build_temp) / unit.folder)
             (result,) = self.compiler.object_filenames([source], output_dir=folder)
             if self.force or is_out_of_date(Path(result), [source, __file__, *ext.depends]):
-                flags = [*debug, *flags_of("common"), *unit.flags, *strict]
+                flags = ["-g0", *flags_of("common"), *unit.flags, *strict, *given]
                 self.compiler.compile([source], folder, include_dirs=ext.include_dirs, extra_postargs=flags)
             return str(result)
 
