@@ -96,7 +96,7 @@ def test_deactivate_holds_the_map_and_cleanup_drops_it(
     n_reports = len(reports)
     peer.publish_keyframes(scene, *range(4, 5))
     peer.until(peer.all_acknowledged, "the node to have got what it ignores")
-    for _ in range(3):  # the executor takes one message of each topic between two answers
+    for _ in range(6):  # the executor takes one message of each topic between two answers
         assert _state(peer) == INACTIVE
     assert peer.change_state("activate")
     peer.publish_keyframes(scene, *range(5, 6))
