@@ -32,6 +32,8 @@ _KEYFRAMES_TO_MEASURE = 10
 _MAX_CAMERAS = 8
 # The given relation fits if it explains this share of what the best does.
 _FITS = 0.9
+# Where the best relation explains less than this, the tracks of two images contradict each other.
+_CONTRADICT = 0.2
 # Another relation is named if it explains this share.
 _NAMED = 0.95
 # Angles below which nothing is named, whatever the residuals: calibration is no better.
@@ -167,6 +169,8 @@ def check_cameras(tracks: Tracks) -> Diagnosis:
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             continue
         found = _check_camera(given, camera, relation)
+        if found.rows[1].share < _CONTRADICT and _agree_alone(tracks, camera):
+            found = Diagnosis([_ids_differ(camera, found.rows[1].share)], rows=found.rows)
         unclear = relation.share < AGREED and found.rows[0].share > _CLEAR * relation.share
         why = "too many outliers" if unclear else "too few keyframes"
         if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
@@ -184,8 +188,10 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
 
     now = given.between_cameras(0, camera)
     rows = [row("as given", now), row("free", relation.pose)]
-    if rows[0].share >= _FITS * rows[1].share or rows[1].share < 0.2:
-        if rows[1].share < 0.2:
+    if not np.linalg.norm(now.translation) > 0.0:
+        return _same_place(camera, relation, rows)
+    if rows[0].share >= _FITS * rows[1].share or rows[1].share < _CONTRADICT:
+        if rows[1].share < _CONTRADICT:
             return Diagnosis(untold=[f"the tracks of cameras 0 and {camera} contradict each other"], rows=rows)
         return Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
     others = {one: one.undo(given, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS}
@@ -210,6 +216,35 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
         f" {best:.0%} with that undone"
     )
     return Diagnosis([_finding(named, evidence, camera)], rows=rows)
+
+
+def _agree_alone(tracks: Tracks, camera: int) -> bool:
+    """Return True if the tracks of each of two cameras agree with those of its next images."""
+    found = []
+    for own in (0, camera):
+        for k in spread(len(tracks) - 1, _PAIRS_NEEDED):
+            a, b = (int(k), own), (int(k) + 1, own)
+            found.append(relate(tracks, a, b, tracks.match(a, b)))
+    return len(found) >= 2 * _PAIRS_NEEDED and all(one is not None and one.share > AGREED for one in found)
+
+
+def _ids_differ(camera: int, share: float) -> Finding:
+    cause = f"track ids of cameras 0 and {camera} do not name the same points"
+    evidence = f"{share:.0%} of those that both see agree, although the tracks of each camera alone do"
+    change = f"track_id in the feature_tracks of camera {camera}: one id for one point, whichever camera sees it"
+    return Finding((cause,), evidence, (change,), usual=True)
+
+
+def _same_place(camera: int, relation: Relation, rows: list[Row]) -> Diagnosis:
+    """Tell of two cameras that are given at one place; where points are far that may be as well."""
+    if not relation.has_direction or rows[1].share < AGREED:
+        return Diagnosis(
+            untold=[f"too little parallax between cameras 0 and {camera} to tell how they stand"], rows=rows
+        )
+    cause = f"baseline of camera {camera} missing: it is given at the same place as camera 0"
+    evidence = f"{rows[1].share:.0%} of the tracks of cameras 0 and {camera} meet if they are apart"
+    change = f"the position in body_from_camera of camera {camera} in camera_rig (or tf_static)"
+    return Diagnosis([Finding((cause,), evidence, (change,), usual=True)], rows=rows)
 
 
 def _share(relation: Relation) -> float:
