@@ -17,7 +17,7 @@ cd out/sanitize
 rm -f ba_node/native/*.so
 # setuptools reads CXXFLAGS for C++, older ones CFLAGS.
 flags="-fPIC -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer"
-BA_NODE_TARGETS=avx2 BA_NODE_WERROR=1 CFLAGS=$flags CXXFLAGS=$flags \
+BA_NODE_TARGETS=baseline BA_NODE_WERROR=1 CFLAGS=$flags CXXFLAGS=$flags \
   LDFLAGS="-fsanitize=address,undefined" "$python" setup.py -q build_ext --inplace
 # Without them the tests would pass by themselves.
 nm ba_node/native/*.so | grep -q __asan

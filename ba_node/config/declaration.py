@@ -130,11 +130,9 @@ def option(default: Value, doc: str, *, choices: Iterable[str | Choice] = (), **
 
 
 def declared(cls: type, group: str = "") -> tuple[Parameter, ...]:
-    """Return the options of a dataclass in order.
+    """Return the options of a dataclass in order; fields that are not made by :func:`option` are left out.
 
-    Args:
-        cls: the dataclass; fields that are not made by :func:`option` are left out.
-        group: of parameters of the node, whose name comes before theirs; empty for options of something else.
+    Parameters of the node have the name of their group before theirs; options of something else have none.
     """
     kinds = get_type_hints(cls)
     found = []

@@ -55,10 +55,6 @@ def _of_camera(keyframe: Keyframe, rig: CameraRig) -> Keyframe:
     return dataclasses.replace(keyframe, position=at, orientation=geometry.quaternion_from_matrix(turn))
 
 
-def _refined_ids(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
-
-
 def _newest(peer: Any) -> int | None:
     """Return the keyframe of the last report."""
     reports = peer.received["report"]
@@ -80,7 +76,7 @@ def _play(peer: Any, scene: SyntheticData) -> None:
             peer.publish(image, keyframe.stamp_ns)
         peer.until(lambda key=keyframe.keyframe_id: _newest(peer) == key, f"a report on {keyframe.keyframe_id}")
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _burst(peer: Any, scene: SyntheticData) -> None:
@@ -88,7 +84,7 @@ def _burst(peer: Any, scene: SyntheticData) -> None:
     for _, stamp_ns, measurement in scene.timeline():
         peer.publish(measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _position_rms(positions: Any, truth: Any) -> float:
@@ -253,7 +249,7 @@ def test_a_camera_driver_is_heard(
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
         peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in mono.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
     peer.node.destroy_timer(timer)
     assert "rig_changed" not in _rejected(peer)
 
@@ -306,9 +302,12 @@ def test_starts_with_a_file_and_a_namespace(
     peer.connect()
     _play(peer, scene)
     assert _in_solve(peer) == 4
-    types = dict(stranger.node.get_topic_names_and_types())
+    stranger.until(lambda: ("ba_node", "/car") in stranger.node.get_node_names_and_namespaces(), "the node's name")
+    types = dict(stranger.node.get_publisher_names_and_types_by_node("ba_node", "/car"))
+    types |= dict(stranger.node.get_subscriber_names_and_types_by_node("ba_node", "/car"))
     for topic, kind in OUTPUT_TYPES.items():
         assert types[f"/car/ba_node/{topic}"] == [kind], message_class(kind)
+    assert "/car/keyframes" in types
     assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
     assert node.stop(signal.SIGTERM) == 0
 
