@@ -154,6 +154,17 @@ def test_tracks_without_rays_are_left_out() -> None:
         assert (np.diff(tracks.track[rows]) > 0).all()
 
 
+@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
+def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
+    """By 60 and 36 px: steps point 10 degrees beside the front-end's, all to the same side."""
+    scene = Scene(Config().scene)
+    for measurement in spoiled("roi_ignored", rig, 60.0, seed=613).measurements:
+        scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    assert re.search("region of interest", examine(tracks).summary())
+
+
 @pytest.mark.parametrize(
     ("kind", "rig", "share", "seed"),
     [
