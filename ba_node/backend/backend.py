@@ -132,6 +132,11 @@ class Backend:
         return self.scene.log.notes
 
     @property
+    def rejection_cause(self) -> str:
+        """Return the first case of what was turned away by itself, in words; empty if nothing was."""
+        return self.scene.log.cause()
+
+    @property
     def ready(self) -> bool:
         """Return True if a complete keyframe has not been solved yet."""
         return len(self.map.completion.due(self.scene)) > 0
