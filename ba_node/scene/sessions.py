@@ -72,7 +72,7 @@ class Sessions:
         return self.state.candidate.keyframes if self.state.candidate else []
 
     def reset(self, loaded: set[int] | None = None) -> None:
-        """Forget what is held; that keyframes ``loaded`` from a file come again does not mean a recording began anew."""
+        """Forget what is held; that keyframes ``loaded`` from a file come again does not begin a recording anew."""
         self.state = State()
         self._loaded = loaded or set()
 
