@@ -54,7 +54,7 @@ FAULTS = {
     "options": ("ba_node.window.full", "options", "KeyError"),
     "solve": ("ba_node.window.full", "Snapshot.solve", "FloatingPointError"),
     "solve_exit": ("ba_node.window.full", "Snapshot.solve", "SystemExit"),
-    "figures": ("ba_node.backend.optimization", "Optimization.statistics", "TypeError"),
+    "figures": ("ba_node.window.full", "Optimization.statistics", "TypeError"),
     "merge": ("ba_node.backend", "Backend.merge", "AssertionError"),
     "state": ("rclpy.action.server", "ServerGoalHandle._update_state", "RuntimeError"),
     "feedback": ("rclpy.action.server", "ServerGoalHandle.publish_feedback", "RuntimeError"),
