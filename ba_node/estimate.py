@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.core import geometry
 from ba_node.core.result import Iteration, Status
 from ba_node.measurements import Keyframe
@@ -28,8 +29,6 @@ __all__ = [
     "WindowView",
 ]
 
-FloatArray = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Poses:
@@ -42,7 +41,7 @@ class Poses:
         orientation: (n, 4) fixed frame from body, unit quaternion x y z w.
     """
 
-    keyframe_id: NDArray[np.uint64]
+    keyframe_id: IdArray
     stamp_ns: NDArray[np.int64]
     position: FloatArray
     orientation: FloatArray
@@ -61,7 +60,7 @@ class Poses:
         """Return the number of poses."""
         return len(self.keyframe_id)
 
-    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Poses:
+    def __getitem__(self, rows: slice | IntArray | BoolArray) -> Poses:
         """Return some of the poses."""
         return Poses(self.keyframe_id[rows], self.stamp_ns[rows], self.position[rows], self.orientation[rows])
 
@@ -77,7 +76,7 @@ class Cloud:
         views: (n,) number of observations.
     """
 
-    track_id: NDArray[np.uint64]
+    track_id: IdArray
     position: FloatArray
     rms_px: NDArray[np.float32]
     views: NDArray[np.int32]
@@ -173,10 +172,10 @@ class WindowView:
         frusta: (n_cam, 5, 3) what each camera sees, in the body: its centre, then the corners at a depth of 1 m.
     """
 
-    free: NDArray[np.bool_]
+    free: BoolArray
     rms_px: FloatArray
-    links: NDArray[np.intp]
-    shared: NDArray[np.intp]
+    links: IntArray
+    shared: IntArray
     frusta: FloatArray
 
 

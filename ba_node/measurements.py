@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IdArray = NDArray[np.uint64]
+from ba_node.arrays import FloatArray, IdArray
 
 
 def _no_floats() -> FloatArray:

@@ -25,7 +25,7 @@ MADE_BY = "python -m tools.draw_architecture"
 # Lowest first; tests/test_layers.py holds the imports against them. The first room of a layer is on the way of a
 # keyframe.
 LAYERS: dict[str, tuple[str, ...]] = {
-    "config": ("native", "config", "licence"),
+    "config": ("native", "config", "licence", "arrays"),
     "core": ("core",),
     "scene": ("scene", "measurements", "estimate"),
     "window": ("window", "check"),
@@ -33,7 +33,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "services": ("messages", "io", "evaluation", "synthetic"),
     "tools": ("ros", "offline", "cli"),
 }
-UNSEEN = ("licence",)
+UNSEEN = ("licence", "arrays")
 
 
 class Step(NamedTuple):

@@ -5,22 +5,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ba_node.config import SceneConfig
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status, Transform
 from ba_node.scene import snapshot
 from ba_node.scene.map_content import MapContent, prefixed, require, require_all, within
+from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column
 from ba_node.window.correction import MapCorrection
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from ba_node.config import SceneConfig
-    from ba_node.scene.scene import Scene
 
 _POSES = {
     "keyframe_id": Column(np.uint64),

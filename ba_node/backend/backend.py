@@ -30,28 +30,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter, deque
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator
 
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.optimization import Optimization
 from ba_node.backend.replay import MapEnded, replay
 from ba_node.check.watch import Check, SetUpWatch
-from ba_node.estimate import Estimate, Extras, SolveReport
+from ba_node.config import Config
+from ba_node.core.problem import Cameras
+from ba_node.estimate import Estimate, Extras, Iteration, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
+from ba_node.scene.map_content import MapContent
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import full, guard, quality
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from ba_node.config import Config
-    from ba_node.core.problem import Cameras
-    from ba_node.estimate import Iteration
-    from ba_node.scene.map_content import MapContent
 
 __all__ = ["FINISHED_KEPT", "Admitted", "Backend", "Check"]
 
@@ -205,8 +200,7 @@ class Backend:
     def flush(self, final: bool = False) -> None:
         """Call the newest keyframe complete with what has come, and let a session begin that the front-end asked for.
 
-        Args:
-            final: nothing more will come: give up on what waits for its keyframe or for the rig.
+        ``final``: nothing more will come, and what waits for its keyframe or for the rig is given up.
         """
         self.map.completion.closed = True
         if final:

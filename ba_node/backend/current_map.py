@@ -5,34 +5,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
 from ba_node import window
+from ba_node.arrays import BoolArray, IntArray
 from ba_node.backend.summary import MapSummary, summary_of
 from ba_node.check import two_view
+from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
+from ba_node.config import Config
 from ba_node.core import geometry
-from ba_node.estimate import Cloud, Correction, Estimate, Extras, Poses, SolveReport, Status, Transform
+from ba_node.core.problem import State
+from ba_node.estimate import Cloud, Correction, Estimate, Extras, Iteration, Poses, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
+from ba_node.scene.scene import Scene
 from ba_node.window import extras, quality
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
-
-if TYPE_CHECKING:
-    from collections import Counter
-    from collections.abc import Callable, Iterable
-
-    from ba_node.check.diagnosis import Diagnosis
-    from ba_node.config import Config
-    from ba_node.core.problem import State
-    from ba_node.estimate import Iteration
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, IntArray
 
 # The front-end's frame where neither it nor the parameters name one.
 _ODOM_FRAME = "odom"
@@ -186,14 +181,10 @@ class CurrentMap:
         clock: Callable[[], float],
         on_iteration: Callable[[Iteration], bool] | None,
     ) -> Estimate:
-        """Refine the newest window.
+        """Refine the newest window; all solutions are held if it is said what is ``wrong``.
 
-        Args:
-            solve_count: number of this solve.
-            wrong: why all solutions are held; empty if they are not.
-            wanted: what to work out beside the estimate.
-            clock: seconds, for the report alone.
-            on_iteration: called with each iteration; returning False ends the solve after it.
+        ``wanted`` is worked out beside the estimate; the clock (s) is for the report alone; ``on_iteration`` ends the
+        solve by returning False.
         """
         due = self.completion.due(self.scene)
         end = self._end(due)
@@ -288,12 +279,9 @@ class CurrentMap:
         )
 
     def rms_px(self, state: str = "refined") -> float:
-        """Return the root mean square reprojection error per coordinate over all observations of the map, px.
+        """Return the rms of all observations of the map, outliers too, px; see ``quality.rms_px``.
 
         Outliers count too; tracks with fewer than two views do not, nor do points without a position.
-
-        Args:
-            state: ``refined``, or ``input`` for the front-end's poses and guesses (without a guess: triangulated).
         """
         return quality.rms_px(self.scene, self.config, state)
 

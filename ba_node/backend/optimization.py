@@ -5,16 +5,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
+from ba_node.config import SolverConfig
+from ba_node.core.result import Result
+from ba_node.estimate import Iteration
 from ba_node.window import full, quality
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.config import SolverConfig
-    from ba_node.core.result import Result
-    from ba_node.estimate import Iteration
 
 _TOLD = (
     "method",
@@ -55,14 +52,9 @@ class Optimization:
         clock: Callable[[], float] = _no_clock,
         on_iteration: Callable[[Iteration], bool] | None = None,
     ) -> None:
-        """Solve; the map is not touched.
+        """Solve; the map is not touched. A method and a number of iterations take the place of the parameters'.
 
-        Args:
-            config: parameters of the solver.
-            method: in place of that of the parameters, if it is not empty.
-            max_iterations: likewise, if it is not 0.
-            clock: seconds, for the report alone.
-            on_iteration: called with each iteration; returning False ends the solve after it.
+        The clock (s) is for the report alone; ``on_iteration`` ends the solve by returning False.
         """
         chosen = full.options(config, method, max_iterations)
         self.solved = self.snapshot.solve(chosen, clock=clock, on_iteration=on_iteration)

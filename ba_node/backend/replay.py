@@ -4,18 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ba_node.measurements import Keyframe
+from ba_node.backend.summary import MapSummary
+from ba_node.estimate import Estimate
+from ba_node.measurements import Keyframe, Measurement
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
     from ba_node.backend.backend import Admitted, Backend
-    from ba_node.backend.summary import MapSummary
-    from ba_node.estimate import Estimate
-    from ba_node.measurements import Measurement
 
 
 @dataclass(frozen=True)

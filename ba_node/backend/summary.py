@@ -5,15 +5,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.config import Config
+from ba_node.scene.scene import Scene
 from ba_node.window import quality
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.scene import Scene
 
 
 @dataclass(frozen=True)

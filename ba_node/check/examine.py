@@ -6,25 +6,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from ba_node.check import intrinsics, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
-
-if TYPE_CHECKING:
-    from ba_node.check.relations import Relation
-    from ba_node.check.tracks import Tracks
+from ba_node.check.relations import Relation
+from ba_node.check.tracks import Tracks
 
 _RELATIONS = frozenset({"cameras", "poses"})
 _BUILD_ON_THESE = ("intrinsics", "lengths")
 
 
 def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
-    """Return what the tracks tell about the set-up. Depends on nothing but the tracks.
-
-    Args:
-        tracks: what was seen.
-        told: the tests that were decided before and are left out.
+    """Return what the tracks tell about the set-up, but for the tests ``told``, which were decided before.
 
     Raises:
         ImportError: OpenCV is missing, see :func:`two_view.available`.

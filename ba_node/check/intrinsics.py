@@ -11,20 +11,17 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
-from ba_node.check.relations import AGREED, median_share, spread
+from ba_node.check.relations import AGREED, Relation, median_share, spread
+from ba_node.check.tracks import Tracks
 from ba_node.config import SolverOptions
 from ba_node.core import cameras, geometry, methods, native_kernels, solver, triangulation
 from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
 from ba_node.core.problem import Observations, Problem, State
-
-if TYPE_CHECKING:
-    from ba_node.check.relations import Relation
-    from ba_node.check.tracks import FloatArray, Tracks
 
 _KEYFRAMES = 10
 _OBSERVATIONS = 1600

@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
+from ba_node.check.tracks import Image, Tracks
 from ba_node.check.two_view import Pose
 from ba_node.core import geometry
-
-if TYPE_CHECKING:
-    from ba_node.check.tracks import FloatArray, Image, Tracks
 
 # Body from optical frame: x right, y down, z forward are -y, -z, x of the body.
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import BETWEEN_CAMERAS, IN_MOTION, Mistake, SetUp, as_given
+from ba_node.check.tracks import Image, Tracks
 from ba_node.check.two_view import MIN_PAIRS, Pair, Pose
 from ba_node.core import geometry
-
-if TYPE_CHECKING:
-    from ba_node.check.tracks import FloatArray, Image, IntArray, Tracks
 
 # Keyframes that are looked at, and rays of two cameras.
 _KEYFRAMES = 20

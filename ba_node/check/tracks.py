@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import cameras as camera_models
 from ba_node.core import geometry
+from ba_node.core.problem import Cameras
+from ba_node.scene.scene import Scene
 
-if TYPE_CHECKING:
-    from ba_node.core.problem import Cameras
-    from ba_node.scene.scene import Scene
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 Image = tuple[int, int]
 
 # Beyond 80 degrees from the axis a small error in the pixel is a large one in X/Z.
@@ -104,9 +100,7 @@ class Tracks:
 def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:
     """Return a copy of what a scene has been given; None before the first tracks or without a rig.
 
-    Args:
-        scene: what is known.
-        newest: keyframes to look at; None for all.
+    ``newest`` keyframes are looked at; None for all.
     """
     table, cameras = scene.observations, scene.cameras
     order = scene.order if newest is None else scene.order[-newest:]

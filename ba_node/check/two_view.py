@@ -15,12 +15,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import geometry
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Fewest pairs of rays that an estimate is made from, and that must agree with it.
 MIN_PAIRS = 20
@@ -146,10 +143,7 @@ def estimate(pair: Pair) -> Pose | None:
 def refined(pair: Pair, pose: Pose, free: int = 5) -> Pose:
     """Return the pose with the least Cauchy sum of residuals near one.
 
-    Args:
-        pair: the rays.
-        pose: where to begin.
-        free: 5 for rotation and direction of the translation, 3 for the rotation alone.
+    ``free`` is 5 for rotation and direction of the translation, 3 for the rotation alone.
     """
     rotation, direction = pose.rotation, pose.translation / np.linalg.norm(pose.translation)
     scale = 0.4 * pair.gate

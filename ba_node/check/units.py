@@ -4,18 +4,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import as_given
 from ba_node.check.relations import AGREED, Relation, agreed, rays, relate, spread
+from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
-
-if TYPE_CHECKING:
-    from ba_node.check.tracks import FloatArray, Tracks
 
 # Parallax, in gates, from which on a triangulated depth is worth something; points and pairs that are needed.
 _PARALLAX = 4.0
@@ -158,10 +155,7 @@ def _depth_finding(cause: str, evidence: str) -> Finding:
 def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: bool = True) -> Diagnosis:
     """Compare depths of two cameras, which are in units of their baseline, with those of the front-end's steps.
 
-    Args:
-        tracks: what was seen.
-        relations: of images in motion.
-        intrinsics_fit: that is known; where it is not, a mistake needs more pairs of images, as it may be theirs.
+    Where it is not known that ``intrinsics_fit``, a mistake needs more pairs of images, as it may be theirs.
     """
     outcome, given = Diagnosis(), as_given(tracks)
     if len(given.cameras.rotation) > 1 and len(tracks) < _KEYFRAMES:

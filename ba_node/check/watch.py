@@ -11,15 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
-
-if TYPE_CHECKING:
-    from ba_node.scene.scene import Scene
+from ba_node.scene.scene import Scene
 
 # Keyframes at which a session is checked. A robot may stand for long before there is anything to tell.
 _AT = (3, 6, 10, 15, 25, 40, 60, 90, 130, 200, 300, 450, 700, 1000)

@@ -24,11 +24,7 @@ def present() -> bool:
 
 
 def load(name: str, what: str) -> ModuleType:
-    """Import a module of ``experiments``.
-
-    Args:
-        name: of the module, for example ``thesis.steps``.
-        what: what the user asked for, for the error.
+    """Import a module of ``experiments``, such as ``thesis.steps``; ``what`` the user asked for is for the error.
 
     Raises:
         CheckoutError: the package is installed without its repository.

@@ -129,20 +129,17 @@ def option(default: Value, doc: str, *, choices: Iterable[str | Choice] = (), **
     return field(default=default, metadata={"default": default, "doc": doc, "allowed": allowed, **details})
 
 
-def declared(cls: type, group: str = "", *, live: bool = True) -> tuple[Parameter, ...]:
-    """Return the options of a dataclass in order.
+def declared(cls: type, group: str = "") -> tuple[Parameter, ...]:
+    """Return the options of a dataclass in order; fields that are not made by :func:`option` are left out.
 
-    Args:
-        cls: the dataclass; fields that are not made by :func:`option` are left out.
-        group: of parameters of the node, whose name comes before theirs; empty for options of something else.
-        live: whether a change takes effect at the next solve, where the declaration does not say.
+    Parameters of the node have the name of their group before theirs; options of something else have none.
     """
     kinds = get_type_hints(cls)
     found = []
     for item in fields(cls):
         if not item.metadata:
             continue
-        details = {"live": live, **item.metadata}
+        details = dict(item.metadata)
         of_node = details.pop("node", {})
         if group:
             details |= of_node

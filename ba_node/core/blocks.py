@@ -5,9 +5,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
 
 # Eigenvalues of a block of unit diagonal that are rounding.
 _ROUNDING = 1e-14

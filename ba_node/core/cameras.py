@@ -27,10 +27,9 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import columns
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 ModelArray = NDArray[np.uint8]
 
 # Columns of a row of camera parameters.
@@ -110,10 +109,6 @@ def widest(model: Model, params: FloatArray) -> float:
     """Return how far from the axis a distorted ray may lie and be the image of one ray alone; inf without a limit.
 
     Beyond it the distortion folds over: the image of rays farther out turns back. Tangential terms are left out.
-
-    Args:
-        model: of the camera.
-        params: (12,) of the camera.
     """
     if not params[DISTORTION].any():
         return np.inf

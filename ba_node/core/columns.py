@@ -11,10 +11,8 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from ba_node.arrays import FloatArray, IntArray
 
 
 def empty(*shape: int) -> FloatArray:

@@ -12,15 +12,12 @@ that agree with them, so these triangulate it, and then all rays are classified 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ba_node import native
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import triangulation
-
-if TYPE_CHECKING:
-    from ba_node.core.triangulation import BoolArray, FloatArray, IntArray, Rays, Triangulation
+from ba_node.core.triangulation import Rays, Triangulation
 
 _MAX_PAIRS = 45
 _MAX_SINGLES = 8
@@ -47,11 +44,8 @@ def triangulate(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -
 def agreeing(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -> BoolArray:
     """Return which rays agree with the place that most rays of their point agree on, (n,).
 
-    Args:
-        rays: in any order.
-        n_points: number of points.
-        gate: largest angle between a ray and the place, sigmas.
-        kernels: numpy; otherwise the C++ kernels, where they are built.
+    ``gate`` is the largest angle between a ray and the place, sigmas. The C++ kernels do it where they are built,
+    unless ``kernels`` is numpy.
     """
     if kernels != "numpy" and native.kernels is not None:
         found: BoolArray = native.kernels.agreeing(rays, n_points, gate)

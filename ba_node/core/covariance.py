@@ -22,21 +22,16 @@ others keep theirs. S is scaled to a unit diagonal first, so that units do not d
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
+from ba_node.config import SolverOptions
 from ba_node.core import native_kernels
 from ba_node.core.kernels import DENSE_LIMIT
 from ba_node.core.objective import Objective
-
-if TYPE_CHECKING:
-    from ba_node.config import SolverOptions
-    from ba_node.core.problem import Problem, State
-
-FloatArray = NDArray[np.float64]
+from ba_node.core.problem import Problem, State
 
 # Eigenvalues of S, scaled to a unit diagonal, that are rounding.
 _ROUNDING = 1e-11

@@ -12,12 +12,9 @@ import itertools
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import columns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _BATCH = 128
 # OpenBLAS shares a larger product (rows x rows x columns) among its threads, and waits for a core that may be busy:

@@ -31,14 +31,10 @@ from typing import Protocol
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry, loss
 from ba_node.core.problem import ProblemError, State
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 # A measured rotation may differ from an orthonormal one by this much.
 _ORTHONORMAL = 1e-6

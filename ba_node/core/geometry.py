@@ -10,9 +10,8 @@ Adjustment* (TU Munich, 2018). Quaternions are x y z w, as in ROS.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
 
 # Below this angle (rad) the closed forms lose digits to cancellation and their series are used.
 _SMALL = 1e-4

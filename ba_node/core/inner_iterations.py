@@ -46,14 +46,7 @@ class InnerIterations:
 
 
 def iterate_points(objective: Objective, structure: Structure, state: State, steps: int) -> InnerIterations:
-    """Take up to ``steps`` damped Newton steps a point.
-
-    Args:
-        objective: of the problem.
-        structure: of the problem.
-        state: where to begin.
-        steps: cap on steps of a point.
-    """
+    """Take up to ``steps`` damped Newton steps a point from a state."""
     best, points = state.points.copy(), state.points.copy()
     best_cost = np.full(len(points), np.inf)
     # The points that still move, the observations of them, and where those of each begin.

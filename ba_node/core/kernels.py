@@ -8,13 +8,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import scipy
-from numpy import float64
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.problem import State
-
-FloatArray = NDArray[float64]
 
 # Up to this many unknowns PCG forms S for its products.
 DENSE_LIMIT = 3000

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
+
 Product = Callable[[FloatArray], FloatArray]
 
 
@@ -34,12 +34,7 @@ class Solution:
 
 
 def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Solution:
-    """Solve ``A x = b`` for a symmetric positive definite A; no solution if A is not.
-
-    Args:
-        matrix: (n, n), dense (written over) or sparse.
-        rhs: (n,).
-    """
+    """Solve ``A x = b`` for a symmetric positive definite A, dense (written over) or sparse; no solution if A is not."""
     try:
         if scipy.sparse.issparse(matrix):
             factor = scipy.sparse.linalg.splu(
@@ -80,11 +75,7 @@ def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limit
     direction, 3.93), or on a direction without curvature: there the model falls without end, so it goes to the
     boundary, or without a region stays where it is.
 
-    Args:
-        product: x -> A x.
-        rhs: (n,) b.
-        precondition: r -> M^-1 r.
-        limits: see PcgLimits.
+    ``product`` is x -> A x, ``precondition`` r -> M^-1 r. The solution is never NaN.
 
     Returns:
         The solution; never NaN.

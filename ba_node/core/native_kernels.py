@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from ba_node import native
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
 from ba_node.core.factors import FactorSum, FactorTerms, KeyframeFactors, RelativePoses
@@ -21,14 +21,8 @@ from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Problem, State
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ba_node.native._kernels import Kernel
-    from ba_node.native._kernels import RelativePoses as CompiledPoses
-
-FloatArray = NDArray[np.float64]
+from ba_node.native._kernels import Kernel
+from ba_node.native._kernels import RelativePoses as CompiledPoses
 
 
 class KernelsError(ValueError):
@@ -247,7 +241,7 @@ class NativeSystem:
 class NativeFactorSum(FactorSum):
     """The sum of all factors of a problem, stepped locally."""
 
-    def __init__(self, factors: Sequence[KeyframeFactors], fixed: NDArray[np.bool_]) -> None:
+    def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray) -> None:
         """Hand those on relative poses over; they are copied."""
         super().__init__(factors, fixed)
         self._kernels = [self._kernel(kind, number) for number, kind in enumerate(self._factors)]

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import blocks, columns, linear, linear_costs, scaling
 from ba_node.core.inner_iterations import InnerIterations, iterate_points
@@ -20,7 +20,6 @@ from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
 from ba_node.core.schur_cameras import CameraReduction, FullSystem
 
-FloatArray = NDArray[np.float64]
 Reduction = ReducedSystem | CameraReduction | FullSystem
 
 # A sparse matrix fuller than this share is factored as a dense one, if there is the memory.

@@ -15,14 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import cameras, columns, loss, parameterisation
 from ba_node.core.factors import FactorSum, FactorTerms
 from ba_node.core.problem import Problem, State
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 # What a point behind its camera costs under ``constant``: as much as a residual of this norm.
 _BEHIND_NORM = 100.0

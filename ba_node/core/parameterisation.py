@@ -10,16 +10,12 @@ Global (3.26-3.28): ``phi <- phi + dphi``, ``t <- t + dt``; ``-G [x]x Jr(phi)`` 
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import columns, geometry
-
-FloatArray = NDArray[np.float64]
 
 
 def pose_jacobian(
-    kind: str, d_point: FloatArray, point: FloatArray, rotation: FloatArray, row_pose: NDArray[np.intp]
+    kind: str, d_point: FloatArray, point: FloatArray, rotation: FloatArray, row_pose: IntArray
 ) -> FloatArray:
     """Return the derivative of residuals by the step of their keyframe's pose.
 

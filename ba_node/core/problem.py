@@ -21,12 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+
 if TYPE_CHECKING:
     from ba_node.core.factors import KeyframeFactors
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 
 class ProblemError(ValueError):

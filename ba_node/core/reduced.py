@@ -15,13 +15,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear, scaling
 from ba_node.core.kernels import DENSE_LIMIT, System
 
-FloatArray = NDArray[np.float64]
 Hessian = Callable[[], tuple[FloatArray, FloatArray]]
 
 # Where few steps of PCG are tried in the place of an exact solution, these go nearly as far.

@@ -12,9 +12,8 @@ determines nothing; their values are those of nine tried that brought ``local_di
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
 
 # Steps by kind of parameter: rotation (rad), translation (m), f (px), k1, k2, point (m).
 INC_STEPS = {"rotation": 1e-8, "translation": 1e-8, "f": 1e-5, "k1": 1e-8, "k2": 1e-8, "point": 1e-8}

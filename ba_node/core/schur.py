@@ -27,15 +27,12 @@ from functools import cached_property
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import columns, dense_products
 from ba_node.core.factors import Pairs
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # S is formed while it takes at most this many block products an observation.
 _PRODUCTS_PER_OBSERVATION = 60.0

@@ -17,12 +17,10 @@ from __future__ import annotations
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.core import blocks, columns
 from ba_node.core.schur import NormalEquations, Structure, block_diagonal
-
-FloatArray = NDArray[np.float64]
 
 
 class CameraReduction:

@@ -17,20 +17,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ba_node import native
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from ba_node.core.problem import Problem
 
 _PLAIN_ROUNDS = 3
 _ROBUST_ROUNDS = 5
@@ -114,10 +107,7 @@ def rays_of(problem: Problem) -> Rays:
 def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulation:
     """Return the point of each group of rays. No ray is rejected here: look at the parallax before using a point.
 
-    Args:
-        rays: in any order.
-        n_points: number of points.
-        kernels: numpy; otherwise the C++ kernels, where they are built.
+    The C++ kernels do it where they are built, unless ``kernels`` is numpy.
     """
     if kernels != "numpy" and native.kernels is not None:
         return Triangulation(*native.kernels.triangulate(rays, n_points))

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ba_node.arrays import FloatArray
+
 Kind = Literal["none", "se3", "sim3"]
 
 # A set whose second singular value is below this share of the first is a line as far as float64 can tell.
@@ -52,12 +52,9 @@ class Alignment:
 
 
 def align(estimate: FloatArray, reference: FloatArray, kind: Kind) -> Alignment:
-    """Return the transform that brings an estimate closest to a reference.
+    """Return the transform that brings an estimate closest to a reference, row by row the same places: (n, 3) m each.
 
-    Args:
-        estimate: (n, 3), m.
-        reference: (n, 3), row by row the same places, m.
-        kind: none (identity), se3 (rotation and translation) or sim3 (and scale).
+    ``kind`` is none (identity), se3 (rotation and translation) or sim3 (and scale).
 
     Raises:
         EvaluationError: unknown kind, shapes that differ, numbers that are not finite, fewer than 3 points, or points

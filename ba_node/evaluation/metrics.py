@@ -6,19 +6,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core.geometry import matrix_from_quaternion, so3_log
+from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import Alignment, EvaluationError, Kind, align
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Poses
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.intp]
 
 # Stamps farther apart than two weeks are of no pair.
 MAX_DIFFERENCE_S = 1e6
@@ -75,13 +70,8 @@ class TrajectoryError:
 
 def associate(
     estimate_ns: NDArray[np.int64], reference_ns: NDArray[np.int64], max_difference_s: float = 0.01
-) -> tuple[IndexArray, IndexArray]:
-    """Pair stamps that are nearest to each other.
-
-    Args:
-        estimate_ns: (n,) in any order.
-        reference_ns: (m,) in any order.
-        max_difference_s: pairs farther apart are no pairs.
+) -> tuple[IntArray, IntArray]:
+    """Pair stamps, in any order, that are nearest to each other; those farther apart than the limit are no pair.
 
     Returns:
         Rows of the estimate and of the reference, by time; each row is in at most one pair, the closest; of
@@ -107,13 +97,7 @@ def associate(
 def absolute_error(
     estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01
 ) -> TrajectoryError:
-    """Return how far an estimated trajectory is from the reference.
-
-    Args:
-        estimate: poses.
-        reference: true poses, paired with the estimate's by stamp.
-        kind: alignment of the estimate, by the positions of the pairs.
-        max_difference_s: largest difference of the stamps of a pair.
+    """Return how far an estimated trajectory is from the reference, paired by stamp, aligned by the pairs' positions.
 
     Raises:
         EvaluationError: no pose has a partner, or the pairs cannot be aligned.

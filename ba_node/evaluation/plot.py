@@ -5,20 +5,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import IO, TYPE_CHECKING, Any
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
+from ba_node.estimate import Poses
+from ba_node.evaluation.alignment import Kind
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ba_node.estimate import Poses
-    from ba_node.evaluation.alignment import Kind
-
-FloatArray = NDArray[np.float64]
 
 # Okabe-Ito colours, told apart by colour-blind readers.
 _TRUTH, _BEFORE, _AFTER, _CLOUD = "#000000", "#D55E00", "#0072B2", "#8C8C8C"

@@ -5,16 +5,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ba_node.io.bag_errors import BagError
 from ba_node.io.files import FileKindError, open_regular
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for, pieces
 from ba_node.io.yaml_file import YamlError, read_yaml
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 METADATA = "metadata.yaml"
 STORAGES = (".mcap", ".db3")

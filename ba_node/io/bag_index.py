@@ -13,9 +13,10 @@ import heapq
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import IO, TYPE_CHECKING, NamedTuple
+from typing import IO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -24,9 +25,6 @@ from mcap.records import Channel, Chunk, Schema
 
 from ba_node.io.bag_errors import BagError, EmptyBagError
 from ba_node.io.unpack import unpack
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
 
 MAGIC = b"\x89MCAP0\r\n"
 # Chunks of recorders hold a few MB. One of more than this is a trap or damaged, and so are more than this waiting.
@@ -142,9 +140,8 @@ def read_messages(
 def merge_by_time(parts: Iterator[tuple[int, int, Iterator[Message]]]) -> Iterator[Message]:
     """Yield the messages of all parts by log time; those of the same time by the place of their part.
 
-    Args:
-        parts: log time of the first message, ns, place, and messages by log time of each part, by the first two. A part
-            is read only when its first message may come before all that wait.
+    Parts are the log time (ns) of their first message, place, and messages by log time, sorted by the first two. A part
+    is read only when its first message may come before all that wait.
     """
     part = next(parts, None)
     waiting: list[tuple[int, int, Message, Iterator[Message]]] = []

@@ -6,9 +6,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import IO, TYPE_CHECKING, Any
+from pathlib import Path
+from typing import IO, Any
 
+from mcap.records import Channel
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -16,12 +19,6 @@ from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
 from ba_node.io.bag_index import BagIndex, Message, read_index, read_messages
 from ba_node.io.files import FileKindError, open_regular
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
-    from pathlib import Path
-
-    from mcap.records import Channel
 
 # Any recording; devices and pipes are refused.
 MAX_BYTES = 2**62
@@ -72,12 +69,7 @@ class Source:
 
 
 def open_source(path: Path, name: Path, stack: contextlib.ExitStack) -> Source:
-    """Open a file.
-
-    Args:
-        path: the file.
-        name: what it is called in errors: it may have been unpacked from another.
-        stack: closes it.
+    """Open a file, closed by the stack; errors call it ``name``, as it may have been unpacked from another.
 
     Raises:
         BagError: it cannot be opened, is of another kind, or holds no message that can be read.

@@ -5,17 +5,15 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from types import TracebackType
+from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError
 from ba_node.io.files import whole_file
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
 
 # The form in which rosbag2 of Jazzy (metadata version 9) stores the profile of a publisher; the durations are
 # RMW_DURATION_INFINITE.

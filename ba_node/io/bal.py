@@ -22,16 +22,13 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core.cameras import Model
 from ba_node.core.geometry import so3_exp, so3_log
 from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.io.files import FileKindError, open_regular, whole_file
 from ba_node.io.unpack import TooLargeError, limit_for, unpack
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
 
@@ -152,7 +149,7 @@ def translated(bal: BalProblem, offset: FloatArray) -> BalProblem:
     return replace(bal, cameras=cameras, points=bal.points + offset)
 
 
-def behind(bal: BalProblem) -> NDArray[np.bool_]:
+def behind(bal: BalProblem) -> BoolArray:
     """Return which observations, (l,), are of a point that is not in front of its camera, which looks along -z."""
     forward = so3_exp(bal.cameras[:, :3])[:, 2]
     seen = np.einsum("ij,ij->i", forward[bal.camera_index], bal.points[bal.point_index])

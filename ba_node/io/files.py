@@ -15,12 +15,10 @@ import io
 import os
 import secrets
 import stat
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from typing import IO, Any
 
 _MODE = 0o666
 _TRIES = 100
@@ -42,9 +40,7 @@ def whole_file(path: Path | str, *, durable: bool = False) -> Iterator[IO[bytes]
 
     On an error what was written is removed, and an older file of the name stays.
 
-    Args:
-        path: the file.
-        durable: wait until file and name are on the disk, so that they outlive a power failure.
+    ``durable`` waits until file and name are on the disk, so that they outlive a power failure.
 
     Raises:
         OSError: it cannot be written, or something else than a file has the name; names the file.

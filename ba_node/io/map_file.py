@@ -14,19 +14,16 @@ import json
 import zipfile
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node import __version__
 from ba_node.backend import MapContent, MapError, archive
+from ba_node.config import SceneConfig
 from ba_node.io.files import FileKindError, open_regular, whole_file
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ba_node.config import SceneConfig
 
 FORMAT = "ba_node map"
 VERSION = 1

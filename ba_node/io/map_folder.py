@@ -16,12 +16,10 @@ class MapPathError(ValueError):
 
 
 def path_in_folder(name: str, folder: str, *, to_write: bool) -> Path:
-    """Return the file that a client means.
+    """Return the file that a client means: relative to the folder or below it; ``.npz`` is added where it is missing.
 
-    Args:
-        name: relative to the folder, or absolute and below it; ``.npz`` is added where it is missing.
-        folder: of the maps, ``~`` for the home; to write into, it is made if missing.
-        to_write: what stands there is to be replaced, if it is a map.
+    ``~`` is the home. To write into, the folder is made if missing, and what stands there is to be replaced if it is a
+    map.
 
     Raises:
         MapPathError: no name, no folder, a way out of it, something that is no regular file, or to write, a file that

@@ -8,9 +8,10 @@ import contextlib
 import pickle
 import tempfile
 from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import chain, combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ba_node.io import ros_types
 from ba_node.io.bag_errors import BagError, EmptyBagError
@@ -24,9 +25,6 @@ from ba_node.io.unpack import ZSTD_MAGIC, unpack
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.conversion import measurement_from_message
 from ba_node.messages.topics import CAMERA_TYPES, CAMERAS, INPUT_TYPES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
 
 __all__ = ["ROSBAGS_FACTORY", "BagError", "BagReader", "BagWriter", "TopicChoice"]
 
@@ -96,10 +94,7 @@ class BagReader:
         self._stack.close()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield (topic, type, log time in ns, CDR bytes) by log time; same times in the order of the file.
-
-        Args:
-            topics: only these; all if None.
+        """Yield (topic, type, log time in ns, CDR bytes) of some topics (None: all) by log time, then by place in the file.
 
         Raises:
             BagError: nothing of the recording can be read after all.
@@ -146,8 +141,7 @@ class BagReader:
         may have got them late. A lone camera (CameraInfo) is read only when there is no rig. See :class:`Chooser` for
         which topics are taken; ``taken`` and ``left`` tell. Messages that cannot be read are counted in ``rejected``.
 
-        Args:
-            cameras_known: the recording may come without cameras.
+        The recording may come without cameras where they are known.
 
         Raises:
             BagError: keyframes, tracks or cameras are missing, several are possible, or a

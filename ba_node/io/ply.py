@@ -8,14 +8,11 @@ Positions are doubles here: at the coordinates of a country, as UTM has them, a 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.estimate import Cloud
 from ba_node.io.files import whole_file
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Cloud
 
 # One point in a file, little endian.
 _FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("rms_px", "<f4"), ("views", "<u4")]

@@ -9,18 +9,15 @@ definitions, and is decoded by them: fields that a later version adds do no harm
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from numpy.typing import NDArray
 
 # Fields of the inputs that nothing here reads, so that a recording may have them otherwise, and those it may lack.
 _UNREAD = frozenset({"covariance", "r", "p"})

@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import bz2
 import gzip
+from collections.abc import Iterator
 from io import BytesIO
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # Packed data may grow by this factor, as no measurement does, and anything up to this size.
 MAX_GROWTH = 50
@@ -35,12 +33,7 @@ def limit_for(packed_size: int, growth: int = MAX_GROWTH, always: int = ALWAYS_A
 
 
 def pieces(kind: str, stream: IO[bytes], limit: int) -> Iterator[bytes]:
-    """Yield what a packed stream holds, piece by piece.
-
-    Args:
-        kind: bz2, gz, lz4 or zstd.
-        stream: the packed bytes.
-        limit: bytes that may come out of it.
+    """Yield what a packed stream (bz2, gz, lz4, zstd) holds, piece by piece, up to ``limit`` bytes.
 
     Raises:
         TooLargeError: there are more; nothing beyond the limit has been unpacked.

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.messages.factory import ConversionError
-
-FloatArray = NDArray[np.float64]
 
 # What no camera has: of a matrix in other units, or of another thing.
 FOCAL_RANGE_PX = (1.0, 1e6)

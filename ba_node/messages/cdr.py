@@ -19,16 +19,13 @@ from __future__ import annotations
 
 import re
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ba_node.estimate import Poses
 from ba_node.messages.factory import NS_PER_S, stamp_parts
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ba_node.estimate import Poses
 
 _ENCODING = b"\x00\x01\x00\x00"
 # Values of sensor_msgs/PointField.
@@ -100,13 +97,9 @@ def path_message(poses: Poses, stamp_ns: int, frame_id: str) -> bytes:
 
 
 def cloud_message(points: NDArray[np.void], stamp_ns: int, frame_id: str, *, dense: bool) -> bytes:
-    """Return a ``sensor_msgs/PointCloud2`` of one row.
+    """Return a ``sensor_msgs/PointCloud2`` of one row of records of little-endian float32 and uint32 fields, (n,).
 
-    Args:
-        points: (n,) records of little-endian float32 and uint32 fields.
-        stamp_ns: stamp, ns.
-        frame_id: frame of the points.
-        dense: no coordinate is NaN or infinite.
+    ``dense``: no coordinate is NaN or infinite.
     """
     layout, size = points.dtype.fields, points.dtype.itemsize
     assert layout is not None

@@ -10,10 +10,13 @@ holds on to the buffer of a message or of a file.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.camera_info import Lens, lens_of
 from ba_node.messages.factory import (
@@ -26,11 +29,6 @@ from ba_node.messages.factory import (
 )
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 __all__ = [
     "INPUT_TYPES",
@@ -160,11 +158,11 @@ def _lens(info: Any) -> tuple[Lens, str]:
         return _NO_LENS, str(error)
 
 
-def _xyz(vector: Any) -> NDArray[np.float64]:
+def _xyz(vector: Any) -> FloatArray:
     return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
 
 
-def _xyzw(quaternion: Any) -> NDArray[np.float64]:
+def _xyzw(quaternion: Any) -> FloatArray:
     return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
 
 

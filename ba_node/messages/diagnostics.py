@@ -11,15 +11,13 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ba_node.config import Config, DiagnosticsConfig
 from ba_node.estimate import Status
 from ba_node.messages.factory import MessageFactory, header_message
 from ba_node.messages.report import Report
 from ba_node.messages.topics import DIAGNOSTICS, TOPICS
-
-if TYPE_CHECKING:
-    from ba_node.config import Config, DiagnosticsConfig
 
 
 class Level(enum.IntEnum):

@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from ba_node.arrays import FloatArray
 
 NS_PER_S = 1_000_000_000
 
@@ -55,7 +55,7 @@ def header_message(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any
     return factory.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
-def pose_message(factory: MessageFactory, position: NDArray[np.float64], orientation: NDArray[np.float64]) -> Any:
+def pose_message(factory: MessageFactory, position: FloatArray, orientation: FloatArray) -> Any:
     """Return a ``geometry_msgs/Pose`` of (3,) m and (4,) x y z w."""
     x, y, z = position.tolist()
     qx, qy, qz, qw = orientation.tolist()
@@ -66,7 +66,7 @@ def pose_message(factory: MessageFactory, position: NDArray[np.float64], orienta
     )
 
 
-def float32(values: NDArray[np.float64]) -> NDArray[np.float32]:
+def float32(values: FloatArray) -> NDArray[np.float32]:
     """Return values in single precision."""
     # A value beyond the range becomes infinite, which the receiver rejects by name; it is no fault of this code.
     with np.errstate(over="ignore"):

@@ -16,19 +16,13 @@ Lines are thousands of points: the arrays are the message (see ``cdr.py``).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import OutputConfig
 from ba_node.core import geometry
+from ba_node.estimate import Estimate, Poses, WindowView
 from ba_node.messages.cdr import Cdr
-
-if TYPE_CHECKING:
-    from ba_node.config import OutputConfig
-    from ba_node.estimate import Estimate, Poses, WindowView
-
-FloatArray = NDArray[np.float64]
 
 NAMESPACES = ("free", "fixed", "older", "links")
 # Values of visualization_msgs/Marker.
@@ -42,12 +36,9 @@ _FAINTEST = 0.05
 
 
 def marker_array(estimate: Estimate, config: OutputConfig, *, clear: bool) -> bytes:
-    """Return a ``visualization_msgs/MarkerArray``.
+    """Return a ``visualization_msgs/MarkerArray`` of an estimate with its view.
 
-    Args:
-        estimate: with its view.
-        config: how much to draw, and the scale of the colours.
-        clear: take away everything that was drawn before, as a session of its own begins.
+    ``clear`` takes away everything that was drawn before, as another map begins.
 
     Raises:
         ConversionError: the seconds of the stamp exceed 32 bits.
@@ -100,7 +91,7 @@ def _frusta(poses: Poses, view: WindowView, config: OutputConfig, colour: FloatA
     return points.reshape(-1, 3), colours.reshape(-1, 4)
 
 
-def _links(poses: Poses, view: WindowView, rows: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+def _links(poses: Poses, view: WindowView, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     points = poses.position[view.links[rows]].reshape(-1, 3)
     colours = np.ones((len(points), 4))
     share = view.shared[rows] / max(int(view.shared.max(initial=1)), 1)

@@ -5,20 +5,18 @@
 from __future__ import annotations
 
 from collections.abc import Container
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ba_node.arrays import IntArray
+from ba_node.config import OutputConfig
 from ba_node.estimate import Cloud, Estimate
 from ba_node.messages.cdr import cloud_message, path_message, pose_messages
 from ba_node.messages.factory import MessageFactory, float32, header_message
 from ba_node.messages.report import Report, report_message
 from ba_node.messages.topics import OUTPUT_TYPES
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ba_node.config import OutputConfig
 
 # One point as it is published and as it is written to a file: five little-endian words.
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rms_px", "<f4"), ("views", "<u4")])
@@ -34,11 +32,7 @@ def output_messages(
 ) -> list[tuple[str, str, Any]]:
     """Return what a node publishes after a solve; of a failed or skipped one the report only, unless the map is empty.
 
-    Args:
-        factory: makes the messages.
-        estimate: what the solve gave.
-        config: caps on the length of the path and the number of points.
-        wanted: topics that someone listens to; the others are not built.
+    Only topics that are ``wanted`` are built.
 
     Returns:
         (topic below the node's name, type, message) in the order to publish; one pose for each refined keyframe.
@@ -64,7 +58,7 @@ def output_messages(
 def point_records(cloud: Cloud, limit: int | None = None) -> NDArray[np.void]:
     """Return the points as ``POINT_DTYPE`` records, thinned evenly to at most ``limit``."""
     n = len(cloud)
-    rows: NDArray[np.intp] | slice = slice(None)
+    rows: IntArray | slice = slice(None)
     if limit is not None and n > limit:
         rows = np.arange(limit) * n // limit
         n = limit

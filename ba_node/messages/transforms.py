@@ -5,18 +5,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ba_node.core import geometry
-from ba_node.estimate import Transform
+from ba_node.estimate import Correction, Estimate, Transform
+from ba_node.measurements import CameraRig
 from ba_node.messages.factory import MessageFactory, header_message, pose_message
 from ba_node.messages.topics import TF, TOPICS
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Correction, Estimate
-    from ba_node.measurements import CameraRig
 
 
 def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:

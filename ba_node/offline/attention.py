@@ -19,12 +19,7 @@ _SLACK_PX = 0.05
 
 
 def attention(report: Mapping[str, Any]) -> list[str]:
-    """Return what a user has to know, one sentence each; empty when all is well.
-
-    Args:
-        report: the content of report.json: warnings, solves that gave nothing, and what was turned away, of the newest
-            session and of the older ones.
-    """
+    """Return what a user has to know by the content of report.json, one sentence each; empty when all is well."""
     lines: list[str] = [*report.get("bag_warnings", {}).values()]
     for session in (*report["older_sessions"], report):
         lines += session["warnings"].values()

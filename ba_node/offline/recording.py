@@ -35,11 +35,9 @@ def record(
 ) -> int:
     """Write a recording; return the number of messages.
 
-    Args:
-        path: the file.
-        timeline: topic (one of INPUT_TYPES), stamp in ns, measurement; the rig before the tracks.
-        truth: true poses, by keyframe id, to be written beside the keyframes; None for none.
-        camera_info: fields of every CameraInfo that differ from what the rig says, those of ``roi`` as a mapping.
+    The timeline has topic (one of INPUT_TYPES), stamp in ns, measurement; the rig before the tracks. True poses are
+    written beside the keyframes of their id. ``camera_info`` are fields of every CameraInfo that differ from what the
+    rig says, those of ``roi`` as a mapping.
 
     Raises:
         BagError: a message cannot be written.

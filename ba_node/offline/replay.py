@@ -95,12 +95,7 @@ def replay(
     The newest session's files go to ``out``, those of older sessions to ``out/session_<id>``, with a number behind
     where an id comes again. report.json is written last: where it stands, all others are whole.
 
-    Args:
-        bag: the recording: a file, a folder, or its files in any order.
-        out: folder for the results.
-        config: all parameters.
-        watch: clock and progress.
-        options: maps, and topics of the recording.
+    The recording is a file, a folder, or its files in any order.
 
     Raises:
         BagError: the recording cannot be read.

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray
 from ba_node.backend import MapSummary
 from ba_node.estimate import Estimate, Poses
 from ba_node.measurements import Keyframe
@@ -155,7 +155,7 @@ def _why_unrefined(summary: MapSummary, statuses: Counter[str], last: Estimate) 
     return last.report.reason
 
 
-def _adjacent(chosen: NDArray[np.bool_]) -> bool:
+def _adjacent(chosen: BoolArray) -> bool:
     """Return True if all that is chosen of a row of things lies side by side, and is more than one."""
     rows = np.flatnonzero(chosen)
     return len(rows) > 1 and int(rows[-1] - rows[0]) == len(rows) - 1

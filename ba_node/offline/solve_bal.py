@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core.objective import rms_px
 from ba_node.core.problem import Problem
@@ -47,7 +47,7 @@ class Solution:
     source: str
     bal: BalProblem
     problem: Problem
-    origin: NDArray[np.float64]
+    origin: FloatArray
     result: Result
     options: SolverOptions
     setup_s: float
@@ -142,7 +142,7 @@ def solve_file(
     return Solution(str(path), bal, problem, origin, result, options, ready - began, clock() - ready)
 
 
-def _origin(bal: BalProblem) -> NDArray[np.float64]:
+def _origin(bal: BalProblem) -> FloatArray:
     """Return the middle of the points if the origin of the file is far from all of them, otherwise zeros."""
     if not len(bal.points):
         return np.zeros(3)

@@ -24,12 +24,9 @@ def option_names() -> tuple[str, ...]:
 
 
 def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
-    """Return the options of a named method with changes.
+    """Return the options of a named method with changes ``name=value``.
 
-    Args:
-        method: name of the method.
-        assignments: ``name=value``, the name being a field of SolverOptions, another name of it, or a parameter
-            ``solver.*``.
+    A name is a field of SolverOptions, another name of it, or a parameter ``solver.*``.
 
     Raises:
         ConfigError: a method, name or value that does not exist or is out of range, choices that contradict each other,

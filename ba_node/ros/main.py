@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import rclpy
 from rclpy.exceptions import InvalidNamespaceException, InvalidNodeNameException
 from rclpy.executors import ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
@@ -22,6 +21,7 @@ from ba_node.ros import arguments
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
 from ba_node.ros.rclpy_compat.executor import NodeExecutor
+from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -33,11 +33,6 @@ _MAX_FAULTS = 20
 # How long a thread keeps the interpreter from another, s. With Python's 5 ms the solver's thread waits until the
 # executor has nothing to do, and the other way round.
 _SWITCH_INTERVAL_S = 0.0005
-_ARGUMENT_ERRORS = (
-    rclpy_implementation.RCLError,
-    rclpy_implementation.RCLInvalidROSArgsError,
-    rclpy_implementation.UnknownROSArgsError,
-)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -51,7 +46,7 @@ def main(args: Sequence[str] | None = None) -> int:
         try:
             # rclpy's own handlers end the context at once: nobody who waits for an answer could be told any more.
             rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
-        except _ARGUMENT_ERRORS as error:
+        except ARGUMENT_ERRORS as error:
             return _refuse(str(error))
         try:
             return _run(given, ended)

@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter as RclpyParameter
 
 from ba_node.config import Config, ConfigError, Parameter, declarations, unknown
 from ba_node.ros import qos
+from ba_node.ros.rclpy_compat.private import part
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -64,17 +65,20 @@ class Parameters:
         self._node = node
         self._declared = {parameter.name: parameter for parameter in declarations()}
         # rclpy has no public way to see overrides of parameters that nobody declared, and those are the typing errors.
-        overrides: dict[str, Any] = node._parameter_overrides
+        found = part(node, "_parameter_overrides", dict, "parameters with names that do not exist go unnoticed")
+        self._overrides: dict[str, Any] = {} if found is None else found
         self.config = Config().with_values(
             {
                 name: given.value
-                for name, given in overrides.items()
+                for name, given in self._overrides.items()
                 if not node.has_parameter(name) and not name.startswith(qos.OVERRIDES)
             }
         )
         # Declared with checked values: rclpy itself would refuse an int for a double, which YAML makes of "5".
         for name, value in self.config.values().items():
-            node.declare_parameter(name, value, describe(self._declared[name]), ignore_override=True)
+            node.declare_parameter(name, value, describe(self._declared[name]), ignore_override=found is not None)
+        if found is None:
+            self.config = self.config.with_values({name: node.get_parameter(name).value for name in self._declared})
         # Requests come here first: rclpy's answer to an unknown name does not say the name.
         self._set = node.set_parameters_atomically
         node.set_parameters_atomically = self._on_request
@@ -88,8 +92,8 @@ class Parameters:
         Raises:
             ConfigError: an override names none of them.
         """
-        there = [name for name in self._node._parameters if name.startswith(qos.OVERRIDES)]
-        for name in self._node._parameter_overrides:
+        there = [name for name in self._node.get_parameters_by_prefix("") if name.startswith(qos.OVERRIDES)]
+        for name in self._overrides:
             if name.startswith(qos.OVERRIDES) and name not in there:
                 raise ConfigError(unknown(name, there))
 
@@ -97,7 +101,7 @@ class Parameters:
         """Take a set of changes or refuse it; what can be set at start only may be given the value that it has."""
         unknown_names = [item.name for item in given if not self._node.has_parameter(item.name)]
         if unknown_names:
-            reason = unknown(unknown_names[0], list(self._node._parameters))
+            reason = unknown(unknown_names[0], list(self._node.get_parameters_by_prefix("")))
             return SetParametersResult(successful=False, reason=reason)
         fixed = [item for item in self._coerce(given) if self._node.describe_parameter(item.name).read_only]
         for item in fixed:

@@ -139,8 +139,12 @@ def _mismatch(node: Any, topic: str, role: str, event: Any) -> Notice:
 
 
 def _peers(infos: Iterable[Any]) -> str:
-    names = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
-    return " and ".join(sorted(names)) or "a node that has gone"
+    return " and ".join(sorted({peer_name(info) for info in infos})) or "a node that has gone"
+
+
+def peer_name(info: Any) -> str:
+    """Return the full name of the node of an endpoint."""
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
 def _is(info: Any, node: Any) -> bool:

@@ -6,18 +6,14 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ba_node.core import geometry
-from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene.ingest import plain_name
-
-if TYPE_CHECKING:
-    from ba_node.measurements import Measurement
-    from ba_node.scene.rejections import RejectionLog
-    from ba_node.scene.scene import Scene
+from ba_node.scene.rejections import RejectionLog
+from ba_node.scene.scene import Scene
 
 NS = 1e-9
 # A gap is usual if it is this many times the median of the last few.

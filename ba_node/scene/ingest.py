@@ -9,21 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IdArray
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Cameras
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.scene.records import Keyframes
 from ba_node.scene.rejections import RejectionLog
-
-if TYPE_CHECKING:
-    from ba_node.measurements import CameraRig, FeatureTracks, IdArray, Keyframe, LandmarkGuesses
-    from ba_node.scene.records import Keyframes
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 MAX_PIXEL = 1e6
 SIGMA_RANGE = (1e-6, 1e6)
@@ -70,11 +65,7 @@ def plain_name(frame_id: str) -> str:
 def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -> None:
     """Say so if the name of a keyframe's fixed frame is none, or one that tf2 refuses.
 
-    Args:
-        keyframe: as it came.
-        named: by a parameter, empty if it names none; then an empty name does no harm.
-        taken: what is taken for an empty name.
-        log: where it is said.
+    Where a parameter has ``named`` it, an empty name does no harm; ``taken`` is what is taken for an empty one.
     """
     name = plain_name(keyframe.frame_id)
     if name == keyframe.frame_id and name:

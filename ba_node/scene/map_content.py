@@ -8,16 +8,15 @@ one that the checks of ``ingest.py`` let through, every index must point at some
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from ba_node.scene.tables import BoolArray, Column
+from ba_node.arrays import BoolArray
+from ba_node.scene.tables import Column
 
 
 class MapError(ValueError):

@@ -9,16 +9,13 @@ however large the map is.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.config import SceneConfig
 from ba_node.core import geometry
 from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
-from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IdIndex, IntArray
-
-if TYPE_CHECKING:
-    from ba_node.config import SceneConfig
+from ba_node.scene.tables import IdIndex
 
 # 2^64 over the golden ratio: its multiples, modulo 2^64, are all different and spread evenly.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray, Table, column
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.scene.tables import Table, column
 
 Float32Array = NDArray[np.float32]
 

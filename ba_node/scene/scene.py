@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, IntArray
+from ba_node.config import SceneConfig
+from ba_node.core.problem import Cameras
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, RejectionLog
-from ba_node.scene.tables import BoolArray, IntArray
 
 if TYPE_CHECKING:
-    from ba_node.config import SceneConfig
-    from ba_node.core.problem import Cameras
     from ba_node.scene.candidates import Refusal
 
 

@@ -17,9 +17,8 @@ remembers a decision.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import (
     NS,
@@ -40,10 +39,7 @@ from ba_node.scene.candidates import (
     same_pose,
     unusual_s,
 )
-
-if TYPE_CHECKING:
-    from ba_node.measurements import Measurement
-    from ba_node.scene.scene import Scene
+from ba_node.scene.scene import Scene
 
 # Keyframes in a row that confirm each other. Messages come twice, late, or under a wrong id now and then, which is no
 # jump: these take more.
@@ -76,11 +72,7 @@ class Sessions:
         return self.state.candidate.keyframes if self.state.candidate else []
 
     def reset(self, loaded: set[int] | None = None) -> None:
-        """Forget what is held.
-
-        Args:
-            loaded: ids of keyframes that come from a file. That they come again does not mean a recording began anew.
-        """
+        """Forget what is held; that keyframes ``loaded`` from a file come again does not mean a recording began anew."""
         self.state = State()
         self._loaded = loaded or set()
 

@@ -7,10 +7,14 @@ What follows from the rest (links between the views of a landmark, counts of vie
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray
+from ba_node.config import SceneConfig
 from ba_node.core.cameras import N_PARAMS, Model
 from ba_node.core.problem import Cameras
 from ba_node.measurements import FeatureTracks
@@ -28,13 +32,6 @@ from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
 from ba_node.scene.rejections import NOTES_KEPT, NOTICES, REASONS, WARNINGS, RejectionLog
 from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column, Table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from ba_node.config import SceneConfig
 
 _DERIVED = ("last", "views", "previous")
 _TABLES: dict[str, type[Table]] = {"keyframes": Keyframes, "landmarks": Landmarks, "sightings": ObservationTable}
@@ -128,7 +125,7 @@ def _cameras(content: MapContent, group: str) -> Cameras | None:
     return Cameras(**{name: np.array(values) for name, values in found.items()})
 
 
-def require_rotations(rotation: NDArray[np.float64], name: str) -> None:
+def require_rotations(rotation: FloatArray, name: str) -> None:
     """Raise MapError unless (n, 3, 3) are rotations."""
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).reshape(-1, 9).max(axis=1, initial=0.0)

@@ -8,18 +8,13 @@ tells 2^64 - 1 from 2^64 - 2 no longer; so ids are only ever sorted, compared an
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-FloatArray = NDArray[np.float64]
-IdArray = NDArray[np.uint64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from ba_node.arrays import BoolArray, IdArray, IntArray
 
 
 class Column(NamedTuple):

@@ -4,25 +4,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import FloatArray, IdArray, IntArray
 from ba_node.core.geometry import compose, inverse, quaternion_from_matrix, so3_exp
 from ba_node.estimate import Poses
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic.tracker import IndexArray, Lens, Tracker, build_rig, lenses
+from ba_node.synthetic.options import SyntheticOptions
+from ba_node.synthetic.tracker import Lens, Tracker, build_rig, lenses
 from ba_node.synthetic.world import Path, World, build
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from ba_node.synthetic.options import SyntheticOptions
-
-FloatArray = NDArray[np.float64]
-IdArray = NDArray[np.uint64]
 
 START_NS = 1_700_000_000_000_000_000
 FIXED_FRAME = "odom"
@@ -51,7 +44,7 @@ class SyntheticData:
     truth: Poses
     landmarks: FloatArray
     track_id: IdArray
-    track_landmark: IndexArray
+    track_landmark: IntArray
 
     @property
     def odometry(self) -> Poses:
@@ -72,11 +65,9 @@ class SyntheticData:
 def generate(
     options: SyntheticOptions, change: Callable[[World, Path], tuple[World, Path]] | None = None
 ) -> SyntheticData:
-    """Make a recording. The same options give the same numbers.
+    """Make a recording; the same options give the same numbers.
 
-    Args:
-        options: what to record.
-        change: puts another world or another motion in the place of those that the options ask for.
+    ``change`` puts another world or another motion in the place of those that the options ask for.
     """
     # One stream a purpose: a change of the noise must not move the points.
     world_rng, track_rng, drift_rng, noise_rng, id_rng = np.random.default_rng(options.seed).spawn(5)
@@ -100,7 +91,7 @@ def generate(
 
 def _follow(
     options: SyntheticOptions, world: World, path: Path, lens: Lens, rng: np.random.Generator
-) -> tuple[list[IndexArray], IndexArray]:
+) -> tuple[list[IntArray], IntArray]:
     """Return the tracks (numbered by appearance) of each keyframe, and the point of each track."""
     tracker = Tracker(options, world)
     steps = [tracker.step(tracker.in_view(lens, path, k), rng) for k in range(options.keyframes)]
@@ -168,11 +159,11 @@ class _Recorder:
     lenses: tuple[Lens, ...]
     rng: np.random.Generator
 
-    def images(self, k: int, keyframe_id: int, track_id: IdArray, landmark: IndexArray) -> tuple[FeatureTracks, ...]:
+    def images(self, k: int, keyframe_id: int, track_id: IdArray, landmark: IntArray) -> tuple[FeatureTracks, ...]:
         """Return what every camera saw of the followed points at keyframe ``k``."""
         return tuple(self._image(k, camera, keyframe_id, (track_id, landmark)) for camera in range(len(self.lenses)))
 
-    def _image(self, k: int, camera: int, keyframe_id: int, followed: tuple[IdArray, IndexArray]) -> FeatureTracks:
+    def _image(self, k: int, camera: int, keyframe_id: int, followed: tuple[IdArray, IntArray]) -> FeatureTracks:
         lens, options = self.lenses[camera], self.options
         track_id, landmark = followed
         uv, depth = lens.project(self.world.points[landmark], self.path, k)
@@ -221,8 +212,8 @@ def _guesses(
     options: SyntheticOptions,
     recorder: _Recorder,
     published: Path,
-    followed: list[IndexArray],
-    tracks: tuple[IdArray, IndexArray],
+    followed: list[IntArray],
+    tracks: tuple[IdArray, IntArray],
 ) -> tuple[LandmarkGuesses | None, ...]:
     """Return, for each keyframe, positions of the tracks that begin there, carried along by the drifted pose."""
     if not options.guesses:

@@ -6,21 +6,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras
 from ba_node.core.geometry import matrix_from_quaternion, quaternion_from_matrix, so3_exp
 from ba_node.measurements import CameraRig
-
-if TYPE_CHECKING:
-    from ba_node.synthetic.options import SyntheticOptions
-    from ba_node.synthetic.world import Path, World
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.intp]
+from ba_node.synthetic.options import SyntheticOptions
+from ba_node.synthetic.world import Path, World
 
 # The camera looks along the body's x: its x (right) is -y of the body, its y (down) is -z (REP-103).
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -89,9 +83,9 @@ class Lens:
         uv[rows] = cameras.project(in_camera[rows], model, np.tile(self.params, (len(rows), 1)))
         return uv, depth
 
-    def in_image(self, uv: FloatArray, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    def in_image(self, uv: FloatArray, margin_px: float = 0.0) -> BoolArray:
         """Return which of uv (n, 2) fall into the image, with a margin inside its border."""
-        inside: NDArray[np.bool_] = (uv >= margin_px) & (uv <= self.image_size - 1.0 - margin_px)
+        inside: BoolArray = (uv >= margin_px) & (uv <= self.image_size - 1.0 - margin_px)
         return np.asarray(inside.all(axis=1))
 
 
@@ -122,7 +116,7 @@ class Tracker:
         self._age = np.zeros(n, dtype=np.intp)
         self._count = 0
 
-    def in_view(self, lens: Lens, path: Path, k: int) -> NDArray[np.bool_]:
+    def in_view(self, lens: Lens, path: Path, k: int) -> BoolArray:
         """Return which points a camera can see at keyframe ``k``: (n_points,)."""
         seen = self._world.visible(lens.eye(path, k), self._options.max_range_m)
         rows = np.flatnonzero(seen)
@@ -131,7 +125,7 @@ class Tracker:
         seen[rows] = lens.in_image(uv, 1.0 + 3.0 * self._options.noise_px)
         return seen
 
-    def step(self, seen: NDArray[np.bool_], rng: np.random.Generator) -> tuple[IndexArray, IndexArray]:
+    def step(self, seen: BoolArray, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
         """Return track number and point index of what is followed in the next keyframe, by track: two (m,)."""
         options, n = self._options, len(seen)
         if options.max_track_keyframes:

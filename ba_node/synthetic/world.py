@@ -9,17 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core.geometry import so3_exp
-
-if TYPE_CHECKING:
-    from ba_node.synthetic.options import SyntheticOptions
-
-FloatArray = NDArray[np.float64]
+from ba_node.synthetic.options import SyntheticOptions
 
 _WALL_HEIGHT = 3.0
 _BODY_HEIGHT = 1.2
@@ -39,7 +35,7 @@ class World:
     normals: FloatArray
     boxes: FloatArray
 
-    def visible(self, eye: FloatArray, max_range_m: float) -> NDArray[np.bool_]:
+    def visible(self, eye: FloatArray, max_range_m: float) -> BoolArray:
         """Return which points can be seen from ``eye``: (3,) -> (n,).
 
         A point is seen if it is between 0.5 m and ``max_range_m`` away, its surface faces the eye at less than
@@ -48,7 +44,7 @@ class World:
         ray = self.points - eye
         distance = np.linalg.norm(ray, axis=1)
         facing = -np.sum(ray * self.normals, axis=1) > math.cos(math.radians(75.0)) * distance
-        seen: NDArray[np.bool_] = facing & (distance > 0.5) & (distance < max_range_m)
+        seen: BoolArray = facing & (distance > 0.5) & (distance < max_range_m)
         rows = np.flatnonzero(seen)
         # Stop short of the point, which lies on the face of its own block.
         segment = 0.999 * ray[rows]

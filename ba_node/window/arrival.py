@@ -12,20 +12,17 @@ with any, it sits the solve out.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ba_node.config import SolverOptions
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import Config, SolverOptions
 from ba_node.core import geometry, native_kernels
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
+from ba_node.scene.scene import Scene
 from ba_node.window.problems import problem_of
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import FloatArray, IntArray
 
 # Fewer known points than this place no keyframe.
 _MIN_POINTS = 10
@@ -50,13 +47,8 @@ def strays(
 ) -> IntArray:
     """Return the rows of keyframes that were not refined yet and begin where they do not see what is known.
 
-    Args:
-        scene: what is known.
-        config: the outlier gate.
-        problem: of these keyframes and landmarks.
-        keyframes: (n_kf,) rows in the scene.
-        landmarks: (n_pt,) rows in the scene.
-        norms: (n_obs,) residuals at the start, sigmas.
+    The problem is of these keyframes and landmarks, rows in the scene; ``norms`` (n_obs,) are its residuals at the
+    start, sigmas.
     """
     new = np.flatnonzero(~scene.keyframes.refined[keyframes])
     if config.tracks.outlier_px <= 0 or len(new) == len(keyframes):
@@ -102,12 +94,9 @@ class Stray(NamedTuple):
 
 
 def place(scene: Scene, config: Config, rows: IntArray) -> tuple[Stray, ...]:
-    """Move keyframes that begin in the wrong place, and say what became of each.
+    """Move keyframes (rows, oldest first) that begin in the wrong place, and say what became of each.
 
-    Args:
-        scene: poses of keyframes that were not refined are changed, until they are settled anew.
-        config: the outlier gate.
-        rows: of keyframes, oldest first.
+    Their poses are changed until they are settled anew.
     """
     newest = set(scene.order[-_SOUGHT:].tolist())
     return tuple(_placed(scene, config, int(row), int(row) in newest) for row in rows)

@@ -4,21 +4,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
+from ba_node.config import Config
 from ba_node.core import methods, solver
+from ba_node.core.result import Iteration, Result
+from ba_node.scene.scene import Scene
 from ba_node.window import guard
 from ba_node.window.graduation import begun
 from ba_node.window.merging import Merged, outcome
 from ba_node.window.selection import Selection, select
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.config import Config
-    from ba_node.core.result import Iteration, Result
-    from ba_node.scene.scene import Scene
-    from ba_node.window.trust import Trust
+from ba_node.window.trust import Trust
 
 
 class Attempt(NamedTuple):

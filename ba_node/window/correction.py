@@ -18,15 +18,12 @@ agree with it (within the gate, at their own newest keyframe). Smoothing moves a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.config import FramesConfig
 from ba_node.core import geometry
 from ba_node.estimate import Transform
-
-if TYPE_CHECKING:
-    from ba_node.config import FramesConfig
 
 _S = 1e-9
 
@@ -61,14 +58,7 @@ class MapCorrection:
         return tuple(one for one in known if one is not None), self._agreeing, self._stamp_ns
 
     def update(self, config: FramesConfig, found: Transform, body: Transform, stamp_ns: int) -> Move:
-        """Take in the correction that a solve found.
-
-        Args:
-            config: gate and smoothing.
-            found: map from odom at the newest keyframe.
-            body: the front-end's pose of that keyframe, odom from body.
-            stamp_ns: its stamp.
-        """
+        """Take in the correction that a solve found at the newest keyframe, and the front-end's pose of that, odom from body."""
         if self._target is None or self.published is None:
             self._target = self.published = found
             self._stamp_ns = stamp_ns

@@ -17,28 +17,20 @@ steps and l of the estimate's. The keyframes keep to it, ``sum (L - 2 l) dl = 0`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import SolverOptions
 from ba_node.core import covariance, geometry
+from ba_node.core.problem import State
 from ba_node.window import gauge
-
-if TYPE_CHECKING:
-    from ba_node.config import SolverOptions
-    from ba_node.core.problem import State
-    from ba_node.scene.tables import FloatArray, IntArray
-    from ba_node.window.selection import Selection
+from ba_node.window.selection import Selection
 
 
 def covariances(selection: Selection, state: State, measured: FloatArray, options: SolverOptions) -> FloatArray:
     """Return the covariance of every pose of a window's problem.
 
-    Args:
-        selection: what was solved.
-        state: its solution, in the scale that it has in the map.
-        measured: (n_kf, 3) positions of the keyframes by the front-end, m.
-        options: what it was solved with.
+    ``measured`` (n_kf, 3) are the positions of the keyframes by the front-end, m; the state is in the scale of the map.
 
     Returns:
         (n_kf, 6, 6): x, y, z (m), rotation about X, Y, Z (rad) of the fixed frame. NaN where unknown; 0 for fixed ones.

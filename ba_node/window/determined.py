@@ -4,13 +4,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, IntArray
+from ba_node.arrays import BoolArray, IntArray
+from ba_node.core.problem import Problem
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
@@ -24,12 +21,8 @@ def determined(
 ) -> tuple[IntArray, BoolArray, BoolArray]:
     """Return which observations, keyframes and points are left without all that does not determine anything.
 
-    Args:
-        problem: points without a place are NaN.
-        usable: (n_obs,) observations that may take part.
-        moves: (n_pt,) points that do not count, as they move.
-        max_landmarks: points to keep.
-        min_points: points that a keyframe has to see.
+    ``usable`` (n_obs,) observations may take part; points that ``moves`` (n_pt,) marks do not count, as they move;
+    points without a place are NaN. ``max_landmarks`` are kept, and a keyframe has to see ``min_points``.
 
     Returns:
         Rows of the observations, (n_kf,) and (n_pt,) True for what is kept.

@@ -4,35 +4,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import IntArray
+from ba_node.config import Config
 from ba_node.core import methods
+from ba_node.core.problem import State
+from ba_node.estimate import Extras
+from ba_node.scene.scene import Scene
 from ba_node.window.covariance import covariances
+from ba_node.window.selection import Selection
 from ba_node.window.view import view
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.core.problem import State
-    from ba_node.estimate import Extras
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import IntArray
-    from ba_node.window.selection import Selection
 
 
 def work_out(
     wanted: Extras, scene: Scene, config: Config, selection: Selection, state: State, refined: IntArray
 ) -> dict[str, Any]:
-    """Return what is wanted, by the names of its fields in Estimate.
+    """Return what is wanted of a solution in the scale of the map, by the names of its fields in Estimate.
 
-    Args:
-        wanted: what to work out.
-        scene: into which the solution was merged.
-        config: all parameters.
-        selection: what was solved.
-        state: its solution, in the scale that it has in the map.
-        refined: rows of the keyframes of the estimate, oldest first; rows of the results are as here.
+    ``refined`` are rows of the keyframes of the estimate, oldest first, and so are the rows of the results.
     """
     places = scene.places()
     place = np.searchsorted(places[refined], places[selection.keyframes])

@@ -22,24 +22,21 @@ drifts, the map has another scale at each of its ends.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.config import Config, SolverConfig, SolverOptions
 from ba_node.core import geometry, methods, native_kernels, solver
+from ba_node.core.problem import State
+from ba_node.core.result import Iteration, Result
+from ba_node.scene.scene import Scene
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.config import Config, SolverConfig, SolverOptions
-    from ba_node.core.problem import State
-    from ba_node.core.result import Iteration, Result
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
 
 MAX_ITERATIONS = 50
 # A window is solved again and again, everything once: it is worth more digits.

@@ -17,13 +17,11 @@ of a problem that common points and ties connect:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.core.problem import Problem
 
 # A fixed keyframe with fewer observations takes part, but is not relied on to hold anything.
 _ANCHOR_OBSERVATIONS = 10
@@ -49,10 +47,8 @@ class Gauge:
 def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
     """Choose what holds a problem.
 
-    Args:
-        problem: keyframes oldest first.
-        old: (n_kf,) keyframes that are fixed in any case.
-        tied: (n_kf - 1,) True where a keyframe is tied to the next by a step of the front-end.
+    Keyframes are oldest first. Those ``old`` (n_kf,) are fixed in any case; where ``tied`` (n_kf - 1,), one is tied to
+    the next by a step of the front-end.
     """
     obs, n_kf = problem.observations, problem.n_keyframes
     fixed, unscaled = old.copy(), np.full(n_kf, -1)
@@ -79,11 +75,8 @@ def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
 def step_ratio(measured: FloatArray, estimated: FloatArray) -> float:
     """Return the scale that makes the steps between estimated positions as long as between measured ones.
 
-    Least squares over the lengths of those consecutive steps that agree; 1 where there is nothing to compare.
-
-    Args:
-        measured: (n, 3) positions by the front-end, m.
-        estimated: (n, 3) positions in the scale of the problem.
+    Least squares over the lengths of those consecutive steps that agree; 1 where there is nothing to compare. Positions
+    are (n, 3), by the front-end (m) and in the scale of the problem.
     """
     long = np.linalg.norm(np.diff(measured, axis=0), axis=1)
     short = np.linalg.norm(np.diff(estimated, axis=0), axis=1)
@@ -95,9 +88,7 @@ def step_ratio(measured: FloatArray, estimated: FloatArray) -> float:
 def agreeing_steps(measured: FloatArray, estimated: FloatArray) -> BoolArray:
     """Return which steps have about the ratio of lengths that most of the way has, (n,): a front-end may jump.
 
-    Args:
-        measured: (n,) lengths by the front-end, m.
-        estimated: (n,) in the scale of the problem.
+    Lengths are (n,), by the front-end (m) and in the scale of the problem.
     """
     ratio = np.where(estimated > 0, measured / np.where(estimated > 0, estimated, 1.0), np.inf)
     order = np.argsort(ratio)

@@ -12,16 +12,13 @@ known, a wide loss would let clusters of outliers pull, as of moving objects.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
+from ba_node.config import SolverOptions
 from ba_node.core import solver
-
-if TYPE_CHECKING:
-    from ba_node.config import SolverOptions
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import FloatArray
+from ba_node.core.problem import Problem
 
 # Residuals of this rank tell how far off a keyframe begins: most may be wrong.
 _RANK = 0.3
@@ -34,13 +31,7 @@ _FADING = ("cauchy", "geman_mcclure")
 
 
 def begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Problem:
-    """Return a problem with a better start, if its own is bad.
-
-    Args:
-        problem: with the inlier observations.
-        norms: (n_obs,) sizes of their residuals at the start, sigmas.
-        options: what it will be solved with.
-    """
+    """Return a problem with a better start, if its own is bad; ``norms`` (n_obs,) are the residuals there, sigmas."""
     scale = options.loss_scale_px
     if options.loss not in _FADING or problem.n_keyframes > _YOUNG:
         return problem

@@ -20,21 +20,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import Config
+from ba_node.core.problem import Problem, State
 from ba_node.window import steps
-from ba_node.window.trial import MIN_PARALLAX, median
+from ba_node.window.merging import Merged
+from ba_node.window.selection import Selection
+from ba_node.window.trial import MIN_PARALLAX, Explained, median
 from ba_node.window.trust import Odd, Trust, agree
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.core.problem import Problem, State
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.merging import Merged
-    from ba_node.window.selection import Selection
-    from ba_node.window.trial import Explained
 
 # A common factor, or half the steps being off, is not told from fewer steps.
 _MIN_STEPS = 4
@@ -83,14 +79,7 @@ class Verdict:
 
 
 def decide(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
-    """Return whether a solution may be taken.
-
-    Args:
-        config: all parameters.
-        selection: what was solved.
-        found: what came of it, with a state.
-        trust: what the solves before are worth.
-    """
+    """Return whether a solution may be taken; ``trust`` is what the solves before are worth."""
     assert found.state is not None and found.explained is not None
     trust = trust or Trust()
     config = trust.bounds(config)

@@ -13,19 +13,13 @@ front of two cameras (one with a measured depth).
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import TracksConfig
 from ba_node.core import consensus, loss, native_kernels, triangulation
-
-if TYPE_CHECKING:
-    from ba_node.config import TracksConfig
-    from ba_node.core.problem import Problem
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ba_node.core.problem import Problem
 
 # Robust error of a view with the point behind the camera, in sigmas: worse than any view that is only bad.
 _BEHIND = 1e4
@@ -48,7 +42,7 @@ SPREAD = 3.0 * 1.4826
 class _Fit:
     """How well points fit their views: views in front, median error (sigmas), summed robust error; each (n_pt,)."""
 
-    in_front: NDArray[np.intp]
+    in_front: IntArray
     median: FloatArray
     robust: FloatArray
 
@@ -73,12 +67,8 @@ def initial_points(
 ) -> FloatArray:
     """Return first positions (n_pt, 3) of the points of a problem, NaN where none can be had yet.
 
-    Args:
-        problem: views of the points; its start points are not looked at.
-        guess: (n_pt, 3) guesses in the frame of the problem, NaN for none.
-        config: for the parallax.
-        gate: how far off a view may be and agree, sigmas.
-        kernels: native, numpy or auto.
+    ``guess`` is (n_pt, 3) in the frame of the problem, NaN for none; ``gate`` is how far off a view may be and agree,
+    sigmas. The problem's own start points are not looked at.
     """
     found = agreed_points(problem, config, gate, kernels)
     points = np.where(found.good[:, None], found.points, np.nan)
@@ -145,12 +135,9 @@ def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float,
 
 
 def widened(gate: float, errors: FloatArray, bulk: int = BULK) -> float:
-    """Return a gate that lets the bulk of the errors pass: three robust standard deviations.
+    """Return a gate, at least ``gate``, that lets the bulk of the errors pass: three robust standard deviations.
 
-    Args:
-        gate: smallest gate.
-        errors: to look at.
-        bulk: with fewer errors than this there is no bulk, and the gate stays.
+    Fewer errors than ``bulk`` have no bulk, and the gate stays.
     """
     if len(errors) < bulk or not _median_exceeds(gate, errors):
         return gate
@@ -177,7 +164,7 @@ def _fit(problem: Problem, points: FloatArray, kernels: str) -> _Fit:
     )
 
 
-def _median_by_point(values: FloatArray, point: NDArray[np.intp], n_points: int) -> FloatArray:
+def _median_by_point(values: FloatArray, point: IntArray, n_points: int) -> FloatArray:
     """Return the (upper) median of each point's values, inf for points without any."""
     order = np.lexsort((values, point))
     begin = np.searchsorted(point[order], np.arange(n_points + 1))

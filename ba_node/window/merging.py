@@ -5,25 +5,22 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import TracksConfig
 from ba_node.core import geometry, native_kernels
+from ba_node.core.problem import Problem, State
+from ba_node.core.result import Result
+from ba_node.scene.scene import Scene
 from ba_node.window import gauge
 from ba_node.window.initial_points import agreed_points, widened
 from ba_node.window.problems import part_of
 from ba_node.window.reuse import note_reuse, part_reused
-
-if TYPE_CHECKING:
-    from ba_node.config import TracksConfig
-    from ba_node.core.problem import Problem, State
-    from ba_node.core.result import Result
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.selection import Selection
-    from ba_node.window.trial import Explained
-
+from ba_node.window.selection import Selection
+from ba_node.window.trial import Explained
 
 # A point so many times as far away as the whole window's parallax can tell is anywhere.
 _NOTICED = 10.0
@@ -69,12 +66,6 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
 
     Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
     far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
-
-    Args:
-        selection: what was solved.
-        state: the solution, in the scale of the map.
-        tracks: the outlier gate.
-        kernels: native, numpy or auto.
     """
     explained = selection.trial(kernels).explained(selection.measured, (state.rotation, state.translation))
     found = explained.points
@@ -128,13 +119,7 @@ def apply(
 ) -> FloatArray:
     """Put a solution, in the scale of the map, into the scene and classify its observations anew.
 
-    Args:
-        scene: that it goes into.
-        selection: what was solved.
-        state: the solution.
-        norms: (n_all,) sizes of its residuals, as ``Selection.norms``; written over.
-        tracks: the gates.
-        kernels: native, numpy or auto.
+    ``norms`` (n_all,) are the sizes of its residuals, as ``Selection.norms``; they are written over, and returned.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
@@ -167,10 +152,7 @@ def _note_moving(scene: Scene, selection: Selection) -> None:
 def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
     """Give the parts whose scale floats the scale of some steps: the front-end's, unless the map has one already.
 
-    Args:
-        selection: what was solved.
-        measured: (n_kf, 3) positions of its keyframes in that scale, m.
-        state: the solution.
+    ``measured`` (n_kf, 3) are the positions of the keyframes in that scale, m.
     """
     obs = selection.problem.observations
     rotation, position = geometry.inverse(state.rotation, state.translation)

@@ -20,16 +20,13 @@ What moves sits out the solve that it is found in, and is no point of the map. I
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import consensus, native_kernels, triangulation
+from ba_node.core.problem import Problem
 from ba_node.window.problems import part_of
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, FloatArray
 
 # Residuals, sigmas: of a mismatch, which tells nothing of motion; the most that one counts for; and more than noise.
 _MISMATCH = 120.0
@@ -51,11 +48,8 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
 
     A point that seems to may only be in the wrong place. So it is judged again where most of its views agree.
 
-    Args:
-        problem: with all observations, flagged ones too; points without a place are NaN.
-        norms: (n_obs,) sizes of their residuals at the start, sigmas.
-        unrefined: (n_kf,) keyframes whose poses no solve has refined yet.
-        kernels: native or numpy.
+    The problem has all observations, flagged ones too; points without a place are NaN. ``norms`` (n_obs,) are the
+    residuals at the start, sigmas; no solve has refined the poses of ``unrefined`` (n_kf,) yet.
     """
     point = problem.observations.point
     if len(point) < _MANY * problem.n_keyframes:

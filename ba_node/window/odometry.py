@@ -24,19 +24,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import OdometryConfig
 from ba_node.core import geometry
 from ba_node.core.factors import RelativePoses
-
-if TYPE_CHECKING:
-    from ba_node.config import OdometryConfig
-    from ba_node.core.problem import Problem
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.turns import Turns
+from ba_node.core.problem import Problem
+from ba_node.scene.scene import Scene
+from ba_node.window.turns import Turns
 
 _LOSS = "cauchy"
 # A standard deviation of zero would be a condition, not a measurement (m, rad).
@@ -92,12 +89,8 @@ def factors(
 ) -> tuple[RelativePoses, ...]:
     """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
 
-    Args:
-        scene: where the front-end's poses stand.
-        config: standard deviations.
-        problem: in which they are to count.
-        keyframes: rows of its keyframes, oldest first.
-        turned: what is known of their rotations beside the front-end's.
+    ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
+    beside the front-end's.
     """
     tied = np.flatnonzero(ties(scene, config, keyframes))
     free = ~(problem.fixed[tied] & problem.fixed[tied + 1])

@@ -8,17 +8,14 @@ All observations of a problem are sorted by point, keyframe, camera. A part keep
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.problem import Observations, Problem, State
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+from ba_node.scene.scene import Scene
 
 
 def problem_of(
@@ -32,14 +29,8 @@ def problem_of(
 ) -> Problem:
     """Return the problem of some observations, sorted by point, keyframe, camera; all poses fixed.
 
-    Args:
-        scene: where they stand.
-        rows: rows of the observations; reordered in place.
-        keyframes: rows of the keyframes of the problem, in its order.
-        landmarks: rows of the points of the problem, in its order.
-        origin: (3,) of the problem in the map, m.
-        positions: (n_pt, 3) of the points in the problem.
-        config: for the precision of depths.
+    Rows of keyframes and landmarks are in the order of the problem; ``rows`` of the observations are reordered in
+    place. ``origin`` (3,) is that of the problem in the map, m; ``positions`` (n_pt, 3) are in the problem.
     """
     table, cameras = scene.observations, scene.cameras
     assert cameras is not None
@@ -72,11 +63,7 @@ def some_observations(problem: Problem, rows: IntArray) -> Problem:
 def part_of(problem: Problem, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> Problem:
     """Return a problem with some observations, keyframes and points of another.
 
-    Args:
-        problem: the whole.
-        rows: observations to keep, ascending, all of kept keyframes and points.
-        keyframes: (n_kf,) keyframes to keep.
-        points: (n_pt,) points to keep.
+    ``rows`` of observations are ascending, all of kept keyframes (n_kf,) and points (n_pt,).
     """
     obs, start = _taken(problem.observations, rows), problem.start
     return Problem(

@@ -5,20 +5,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
+from ba_node.config import Config
 from ba_node.core import geometry, objective, triangulation
 from ba_node.core.problem import Problem, State
+from ba_node.core.result import Result
+from ba_node.scene.scene import Scene
 from ba_node.window.problems import problem_of
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.core.result import Result
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import FloatArray
-    from ba_node.window.selection import Selection
+from ba_node.window.selection import Selection
 
 STATES = ("input", "refined")
 # A residual that is longer counts as this: it tells no more than that it is wrong.
@@ -31,10 +29,6 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
     """Return the rms over the observations of a solve whose point is in front of the camera; 0 without any.
 
     One that is farther off than ``BOUND_PX`` counts as that: a point in the plane of a camera is anywhere.
-
-    Args:
-        selection: what was solved.
-        norms: (n_all,) sizes of its residuals, as ``Selection.norms``.
     """
     error = (norms * selection.observations.sigma_px)[selection.inlier]
     error = np.minimum(error[np.isfinite(error)], BOUND_PX)
@@ -42,13 +36,7 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
 
 
 def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[str, Any]:
-    """Return how a solve went, by the names of a report.
-
-    Args:
-        selection: what was solved.
-        result: what came of it.
-        norms: (n_all,) sizes of the residuals after it, as ``Selection.norms``.
-    """
+    """Return how a solve went, by the names of a report; ``norms`` (n_all,) are the residuals after it."""
     problem = selection.problem
     return {
         "status": result.status,

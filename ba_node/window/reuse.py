@@ -10,18 +10,14 @@ point, which leaves its place little by little, is none, nor are single mismatch
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import consensus, triangulation
+from ba_node.core.problem import Problem
+from ba_node.scene.scene import Scene
 from ba_node.window.problems import part_of
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
-    from ba_node.window.selection import Selection
+from ba_node.window.selection import Selection
 
 # Views of either run: two may agree by chance, but where ids are known to be used again that is the better explanation.
 _LEAST_VIEWS = 3
@@ -43,13 +39,8 @@ def part_reused(
 ) -> int:
     """Give the older views of tracks whose id was used again a landmark of their own; return how many.
 
-    Args:
-        scene: where the views stand.
-        selection: what was solved.
-        whole: its problem with all observations, at the solution.
-        norm: (n_all,) sizes of the residuals.
-        gate: of outliers, sigmas.
-        kernels: native, numpy or auto.
+    ``whole`` has all observations of what was solved, at the solution; ``norm`` (n_all,) are the sizes of its
+    residuals, ``gate`` is that of outliers, both in sigmas.
     """
     obs, n = whole.observations, whole.n_points
     outlier = norm > gate
@@ -83,11 +74,8 @@ def part_reused(
 def _cut(whole: Problem, rows: IntArray, norm: FloatArray, limits: tuple[float, int]) -> tuple[IntArray, IntArray]:
     """Return the first row after the cut of each track that has one, and all rows of the runs that do not fit.
 
-    Args:
-        whole: rows sorted by point, keyframe.
-        rows: those of tracks with outliers.
-        norm: (n_all,) sizes of the residuals.
-        limits: gate of outliers, and the fewest views of a run.
+    Rows are sorted by point and keyframe; ``rows`` are those of tracks with outliers. ``norm`` (n_all,) are the sizes
+    of the residuals, ``limits`` the gate of outliers, and the fewest views of a run.
     """
     gate, least = limits
     obs = whole.observations

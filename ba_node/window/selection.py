@@ -17,21 +17,18 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
+from ba_node.core.problem import Observations, Problem
+from ba_node.scene.scene import Scene
 from ba_node.window import arrival, determined, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import part_of, problem_of, some_observations
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.core.problem import Observations, Problem
-    from ba_node.scene.scene import Scene
-    from ba_node.scene.tables import BoolArray, FloatArray, IdArray, IntArray
 
 # Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
 _VIEWS = 400
@@ -128,11 +125,7 @@ def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
 def select(scene: Scene, config: Config, end: int | None = None, without: tuple[int, ...] = ()) -> Selection | str:
     """Return the problem of the newest window among the first ``end`` keyframes, or why there is none.
 
-    Args:
-        scene: what is known.
-        config: all parameters.
-        end: keyframes to look at.
-        without: rows of keyframes that are to sit it out.
+    Keyframes of the rows ``without`` sit it out.
     """
     window = rows_of(scene, config, end)
     reason = _nothing(scene, window)

@@ -9,15 +9,12 @@ front-end's step is worth is a standard deviation for its length and one for its
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import GuardConfig
 from ba_node.window.trial import median
-
-if TYPE_CHECKING:
-    from ba_node.config import GuardConfig
-    from ba_node.scene.tables import FloatArray, IntArray
 
 # Steps shorter, and turns smaller, than this many sigmas of the front-end say nothing of its scale.
 _TELLING = 3.0
@@ -42,14 +39,7 @@ class Steps:
 
 
 def between(rotation: FloatArray, translation: FloatArray, first: IntArray, second: IntArray) -> Steps:
-    """Return the steps from some keyframes to others.
-
-    Args:
-        rotation: (n_kf, 3, 3) body from world.
-        translation: (n_kf, 3) body from world, m.
-        first: (n,) keyframes that steps begin at.
-        second: (n,) keyframes that they lead to.
-    """
+    """Return the steps from the keyframes ``first`` (n,) to ``second``; poses (n_kf, ...) are body from world, m."""
     turn = rotation[first] @ np.swapaxes(rotation[second], 1, 2)
     return Steps(turn, translation[first] - (turn @ translation[second][:, :, None])[..., 0])
 
@@ -115,10 +105,7 @@ def _common(found: FloatArray, measured: FloatArray, sigma: FloatArray) -> float
     Both are measured along the mean of the two: errors across do not make one longer than the other, and large errors
     of either do not decide which vectors are looked at.
 
-    Args:
-        found: (n, 3).
-        measured: (n, 3).
-        sigma: (n,) standard deviation of the latter.
+    Vectors are (n, 3); ``sigma`` (n,) is the standard deviation of those measured.
     """
     both = found + measured
     length = np.sqrt(np.sum(both**2, axis=1))

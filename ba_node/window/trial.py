@@ -13,16 +13,13 @@ sit on the body as the rig says, a solution is a compromise that each camera by 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IdArray, IntArray
 from ba_node.core import native_kernels, triangulation
 from ba_node.core.cameras import FX, FY, rays
 from ba_node.core.problem import Observations, Problem, State
-
-if TYPE_CHECKING:
-    from ba_node.scene.tables import FloatArray, IdArray, IntArray
 
 # One track in so many may sit a solve out: more would be missed by a small window.
 _SHARE = 128
@@ -42,12 +39,9 @@ _NONE = np.empty(0, np.intp)
 
 
 def choose(track_id: IdArray, point: IntArray, wanted: int) -> tuple[IntArray, IntArray]:
-    """Return the points to try poses on, and those of them that are to sit the solve out.
+    """Return the points to try poses on, ``wanted`` of them, and those that are to sit the solve out.
 
-    Args:
-        track_id: (n_pt,) uint64.
-        point: of each usable observation.
-        wanted: points to try.
+    ``track_id`` is (n_pt,), ``point`` that of each usable observation.
     """
     views = np.bincount(point, minlength=len(track_id))
     candidates = np.flatnonzero(views > _MIN_VIEWS)
@@ -144,12 +138,7 @@ class Trial:
         self._image = _twice(keyframe * self._n_cam + camera, n_kf * self._n_cam)
 
     def explained(self, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]) -> Explained:
-        """Return how well two sets of poses explain the tracks.
-
-        Args:
-            before: (n_kf, 3, 3) and (n_kf, 3) body from world, m.
-            after: the other poses.
-        """
+        """Return how well two sets of poses explain the tracks: (n_kf, 3, 3) and (n_kf, 3) body from world, m."""
         points, parallax, norms = self._tried(*(np.concatenate(pair) for pair in zip(before, after, strict=True)))
         # Rays that are parallel by either set meet anywhere.
         wide = (parallax > MIN_PARALLAX * self._noise_rad).all(axis=0)

@@ -5,15 +5,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray
+from ba_node.config import Config
 from ba_node.window import steps
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.scene.tables import BoolArray
 
 # Doubt that a held solve adds; the most there may be; up to which one that passes is taken; from which on what was
 # taken of a young map is given up.
@@ -93,14 +90,10 @@ class Trust:
         return self.odd if self.agreeing >= needed else None
 
     def hear(self, reason: str, odd: Odd | None, without: tuple[int, ...], config: Config) -> str:
-        """Return why a solution is held after all, empty if it is taken.
+        """Return why a solution, held for ``reason`` or not, is held after all; empty if it is taken.
 
-        Args:
-            reason: why it would be held.
-            odd: its odd steps.
-            without: keyframes that it was made without, as they alone were wrong. One may be; if there are always
-                others, it is not they that are wrong.
-            config: all parameters.
+        ``odd`` are its odd steps, ``without`` the keyframes that it was made without, as they alone were wrong. One may
+        be; if there are always others, it is not they that are wrong.
         """
         if odd is not None:
             same = self.odd is not None and agree(odd, self.odd, config, list(odd.keys)).all()

@@ -18,15 +18,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras, geometry
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Problem
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
+from ba_node.core.problem import Problem
 
 # A keyframe that sees fewer points with a place than this is looked at.
 _FEW_POINTS = 30
@@ -64,10 +61,7 @@ class Turns:
     def between(self, rows: IntArray, first: IntArray, second: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return rotations (n, 3, 3), first body from second, and their standard deviations, NaN where not found.
 
-        Args:
-            rows: (n_kf,) rows of the keyframes in the scene.
-            first: (n,) numbers of keyframes.
-            second: (n,) the same.
+        ``rows`` (n_kf,) are the keyframes in the scene, ``first`` and ``second`` (n,) numbers of keyframes.
         """
         of_anchor = self.anchor[second] == rows[first]
         same = (self.anchor[second] >= 0) & (self.anchor[second] == self.anchor[first])
@@ -80,10 +74,7 @@ class Turns:
 
         Each keyframe keeps its place as seen from the one before.
 
-        Args:
-            problem: whose start is to be changed.
-            rows: (n_kf,) rows of its keyframes in the scene, oldest first.
-            free: (n_kf,) keyframes that may be turned.
+        ``rows`` (n_kf,) are its keyframes in the scene, oldest first; ``free`` (n_kf,) may be turned.
         """
         first = np.arange(len(rows) - 1)
         measured, sigma = self.between(rows, first, first + 1)
@@ -127,11 +118,8 @@ class _Rays:
 def find(problem: Problem, rows: IntArray, used: BoolArray, placed: BoolArray) -> Turns | None:
     """Return the keyframes that differ from an earlier one by a rotation alone; None if there is none.
 
-    Args:
-        problem: keyframes oldest first; its start is not looked at.
-        rows: (n_kf,) their rows in the scene.
-        used: (n_obs,) observations to look at.
-        placed: (n_pt,) points that have a place.
+    Keyframes are oldest first, ``rows`` (n_kf,) in the scene; ``used`` (n_obs,) observations are looked at, ``placed``
+    (n_pt,) points have a place. The problem's start is not looked at.
     """
     obs, n = problem.observations, problem.n_keyframes
     every = np.bincount(obs.keyframe[used], minlength=n)

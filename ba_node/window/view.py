@@ -4,28 +4,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy.sparse
 
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras, geometry, objective
+from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.estimate import WindowView
-
-if TYPE_CHECKING:
-    from ba_node.core.problem import Cameras, Observations, Problem, State
-    from ba_node.scene.tables import BoolArray, FloatArray, IntArray
 
 
 def view(problem: Problem, state: State, good: BoolArray, place: IntArray, n: int) -> WindowView:
     """Return what there is to see.
 
-    Args:
-        problem: as it was solved.
-        state: its solution.
-        good: (n_obs,) observations that are inliers after it: a wrong match says nothing about a pose.
-        place: (n_kf,) row of each keyframe of the problem among the n keyframes of the estimate.
-        n: keyframes of the estimate; those that are not in the problem are neither free nor linked.
+    ``good`` (n_obs,) observations are inliers after it: a wrong match says nothing about a pose. ``place`` (n_kf,) is
+    the row of each keyframe of the problem among the n of the estimate; the others are neither free nor linked.
     """
     free, rms_px = np.zeros(n, bool), np.full(n, np.nan)
     free[place] = ~problem.fixed

@@ -34,17 +34,7 @@ def messages(**options: Any) -> list[Measurement]:
 
 def replay(backend: Backend, stream: Iterable[Measurement]) -> list[Estimate]:
     """Solve once for every keyframe, in order."""
-    estimates = []
-    for measurement in stream:
-        for admitted in backend.admit(measurement):
-            if backend.completes(admitted):
-                estimates.append(backend.solve())
-            backend.take(admitted)
-    backend.flush(final=True)
-    while backend.ready:
-        estimates.append(backend.solve())
-    assert all(estimate is not None for estimate in estimates)
-    return [estimate for estimate in estimates if estimate is not None]
+    return [event for event in backend.replay(stream) if isinstance(event, Estimate)]
 
 
 def in_session(measurement: Any, session_id: int) -> Measurement:

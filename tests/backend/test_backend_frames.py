@@ -27,15 +27,7 @@ def data_of(**options: Any) -> SyntheticData:
 
 
 def run(backend: Backend, stream: list[Measurement]) -> list[Estimate]:
-    estimates = []
-    for measurement in stream:
-        if backend.completes(measurement):
-            estimates.append(backend.solve())
-        backend.add(measurement)
-    backend.flush(final=True)
-    while backend.ready:
-        estimates.append(backend.solve())
-    return [estimate for estimate in estimates if estimate is not None]
+    return [event for event in backend.replay(stream) if isinstance(event, Estimate)]
 
 
 def stream_of(data: SyntheticData) -> list[Measurement]:

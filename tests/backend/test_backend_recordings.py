@@ -12,6 +12,7 @@ import pytest
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.core import geometry, objective
+from ba_node.estimate import Estimate
 from ba_node.io.bal import BalProblem, read_bal, to_problem
 from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
@@ -21,21 +22,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-    from ba_node.estimate import Estimate
-
 
 def replay(backend: Backend, stream: Iterable[Measurement]) -> Estimate:
     """Solve once for every keyframe, in order, and return the last estimate."""
-    last = None
-    for measurement in stream:
-        if backend.completes(measurement):
-            last = backend.solve()
-        backend.add(measurement)
-    backend.flush(final=True)
-    while backend.ready:
-        last = backend.solve()
-    assert last is not None
-    return last
+    return [event for event in backend.replay(stream) if isinstance(event, Estimate)][-1]
 
 
 def messages_of(problem: BalProblem) -> Iterator[Measurement]:

@@ -64,13 +64,8 @@ def stream(only_in_front: bool) -> Iterator[Measurement]:
 def run(only_in_front: bool, backend: str = "auto") -> Backend:
     config = Config().with_values({"solver.kernels": backend})
     node = Backend(config)
-    for measurement in stream(only_in_front):
-        if node.completes(measurement):
-            node.solve()
-        node.add(measurement)
-    node.flush(final=True)
-    while node.ready:
-        node.solve()
+    for _event in node.replay(stream(only_in_front)):
+        pass
     return node
 
 

@@ -46,15 +46,7 @@ def recording(**options: Any) -> tuple[Stream, Poses]:
 
 
 def replay(backend: Backend, stream: Iterable[Measurement]) -> list[Estimate]:
-    found = []
-    for measurement in stream:
-        if backend.completes(measurement):
-            found.append(backend.solve())
-        backend.add(measurement)
-    backend.flush(final=True)
-    while backend.ready:
-        found.append(backend.solve())
-    return [estimate for estimate in found if estimate is not None]
+    return [event for event in backend.replay(stream) if isinstance(event, Estimate)]
 
 
 def errors(stream: Stream, truth: Poses, last: Estimate, without: tuple[int, ...] = ()) -> tuple[float, float]:

@@ -17,7 +17,7 @@ pytest.importorskip("ba_msgs")
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--rate", "-1"], "rate = -1.0: expected a finite number, 0 or more"),
+        (["--rate", "-1"], "--rate -1: expected a finite number, 0 or more"),
         (["--namespace", "bad name"], "bad name"),
         (["--remap", "nonsense"], "nonsense"),
         (["--topics", "/nope"], "no topic can be played; topics in the recording: /camera_rig"),

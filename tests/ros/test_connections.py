@@ -164,7 +164,7 @@ def test_keyframes_out_of_order_are_sorted_by_their_stamps(
             peer.publish(image, scene.keyframes[i].stamp_ns)
         wanted = scene.keyframes[i].keyframe_id
         # The first has nothing to be refined against.
-        peer.until(lambda i=i, wanted=wanted: i == 0 or wanted in _ids(peer), f"keyframe {wanted}, refined")
+        peer.until(lambda i=i, wanted=wanted: i == 0 or wanted in peer.refined_ids(), f"keyframe {wanted}, refined")
     stamps = [keyframe.stamp_ns for keyframe in scene.keyframes]
 
     def path_stamps() -> list[int]:
@@ -202,10 +202,6 @@ def test_a_pause_of_nine_seconds_changes_nothing(
 
 def _part(scene: SyntheticData, rows: slice) -> SyntheticData:
     return dataclasses.replace(scene, keyframes=scene.keyframes[rows], tracks=scene.tracks[rows])
-
-
-def _ids(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
 
 
 def _stamps(peer: Any) -> set[int]:

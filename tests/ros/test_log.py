@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from ba_node.ros.log import Severity, log, printable
+from ba_node.ros.log import Severity, Throttle, log, printable
 
 ROOT = Path(__file__).resolve().parents[2]
 SEVERITIES = {"debug", "info", "warning", "warn", "error", "fatal", "critical"}
@@ -131,3 +131,16 @@ def test_a_log_that_raises_is_survived(capsys: pytest.CaptureFixture[str]) -> No
 
     log(Broken(), Severity.WARNING, "what I wanted to say")
     assert capsys.readouterr().err == "warning: what I wanted to say (not in the log: no log)\n"
+
+
+def test_lets_each_key_through_once_a_period() -> None:
+    throttle = Throttle(5.0)
+    passed = [(key, t) for t in range(12) for key in ("a", "b") if throttle.passes(key, float(t))]
+    assert passed == [("a", 0), ("b", 0), ("a", 5), ("b", 5), ("a", 10), ("b", 10)]
+
+
+def test_remembers_a_bounded_number_of_keys() -> None:
+    throttle = Throttle(5.0, max_keys=2)
+    assert all(throttle.passes(key, 0.0) for key in ("a", "b", "c"))
+    assert not throttle.passes("c", 1.0)
+    assert throttle.passes("a", 1.0), "the oldest key was forgotten to make room"

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,17 @@ from rclpy.parameter import Parameter as RclpyParameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo
 
+from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Status
 from ba_node.measurements import CameraRig, Keyframe
 from ba_node.messages import conversion
-from ba_node.messages.conversion import OUTPUT_TYPES
+from ba_node.messages.factory import stamp_ns_from_message
+from ba_node.messages.topics import OUTPUT_TYPES
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from tests.ros.harness import NodeProcess, Peer, solve_until_stopped
 
 pytestmark = pytest.mark.dds
 
@@ -51,10 +55,6 @@ def _of_camera(keyframe: Keyframe, rig: CameraRig) -> Keyframe:
     return dataclasses.replace(keyframe, position=at, orientation=geometry.quaternion_from_matrix(turn))
 
 
-def _refined_ids(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
-
-
 def _newest(peer: Any) -> int | None:
     """Return the keyframe of the last report."""
     reports = peer.received["report"]
@@ -76,7 +76,7 @@ def _play(peer: Any, scene: SyntheticData) -> None:
             peer.publish(image, keyframe.stamp_ns)
         peer.until(lambda key=keyframe.keyframe_id: _newest(peer) == key, f"a report on {keyframe.keyframe_id}")
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _burst(peer: Any, scene: SyntheticData) -> None:
@@ -84,7 +84,7 @@ def _burst(peer: Any, scene: SyntheticData) -> None:
     for _, stamp_ns, measurement in scene.timeline():
         peer.publish(measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _position_rms(positions: Any, truth: Any) -> float:
@@ -98,56 +98,69 @@ def _rejected(peer: Any) -> dict[str, int]:
     return dict(zip(last.rejected_reason, (int(n) for n in last.rejected_count), strict=True))
 
 
-@pytest.mark.parametrize("send", [_play, _burst])
-def test_keyframes_come_back_refined(
-    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, send: Callable[[Any, SyntheticData], None]
-) -> None:
-    node, peer = start_node(), make_peer()
-    peer.advertise()
-    peer.listen()
-    peer.connect()
-    send(peer, scene)
-    newest_ns = scene.keyframes[-1].stamp_ns
-    # In a burst a keyframe may overtake its tracks, which then take part in the next solve.
-    peer.until(lambda: _in_solve(peer) == KEYFRAMES, "a solve with all keyframes")
-    last = peer.received["refined_keyframes"][-1]
+@pytest.fixture(scope="module", params=[_play, _burst])
+def played(domain: int, request: pytest.FixtureRequest, scene: SyntheticData) -> Iterator[tuple[NodeProcess, Peer]]:  # noqa: ARG001
+    """Return a node that has solved a scene, and who listens to it."""
+    with contextlib.closing(NodeProcess()) as node, contextlib.closing(Peer()) as peer:
+        peer.advertise()
+        peer.listen()
+        peer.connect()
+        request.param(peer, scene)
+        # In a burst a keyframe may overtake its tracks, which then take part in the next solve.
+        peer.until(lambda: _in_solve(peer) == KEYFRAMES, "a solve with all keyframes")
+        yield node, peer
+
+
+def test_keyframes_come_back_refined(played: tuple[NodeProcess, Peer], scene: SyntheticData) -> None:
+    last = played[1].received["refined_keyframes"][-1]
     assert list(last.keyframe_id) == list(range(KEYFRAMES))
     assert last.header.frame_id == "map"
     position = np.asarray(last.position).reshape(-1, 3)
     orientation = np.asarray(last.orientation).reshape(-1, 4)
-    assert np.isfinite(position).all()
     np.testing.assert_allclose(np.linalg.norm(orientation, axis=1), 1.0, rtol=1e-9)
     before = _position_rms(scene.odometry.position, scene.truth.position)
     after = _position_rms(position, scene.truth.position)
     assert after < before / 4, f"position error {after:.3f} m after, {before:.3f} m before"
 
-    report = peer.received["report"][-1]
-    assert Status(report.status).usable, report.reason
-    assert report.dropped == 0
-    assert report.rms_px_after < report.rms_px_before
-    assert (report.landmarks > 100, report.observations > 1000) == (True, True)
-    counts = [message.solve_count for message in peer.received["report"]]
-    assert counts == list(range(1, len(counts) + 1)), "no report is lost"
-    assert len(counts) + report.coalesced >= KEYFRAMES, "every keyframe is solved, alone or with others"
 
-    # Everything of the last solve is there, and belongs together.
-    stamp_of = conversion.stamp_ns_from_message
-    peer.until(lambda: peer.received["points"] and stamp_of(peer.received["points"][-1].header.stamp) == newest_ns, "")
-    peer.until(lambda: peer.received["path"] and stamp_of(peer.received["path"][-1].header.stamp) == newest_ns, "")
-    n_poses = sum(len(message.keyframe_id) for message in peer.received["refined_keyframes"])
-    peer.until(lambda: len(peer.received["pose"]) == n_poses, f"{n_poses} poses")
-    assert len(peer.received["path"][-1].poses) == KEYFRAMES
-    points = peer.received["points"][-1]
+def test_reports_account_for_every_keyframe(played: tuple[NodeProcess, Peer]) -> None:
+    reports = played[1].received["report"]
+    last = reports[-1]
+    assert Status(last.status).usable, last.reason
+    assert last.dropped == 0
+    assert last.rms_px_after < last.rms_px_before
+    assert (last.landmarks > 100, last.observations > 1000) == (True, True)
+    counts = [message.solve_count for message in reports]
+    assert counts == list(range(1, len(counts) + 1)), "no report is lost"
+    assert len(counts) + last.coalesced >= KEYFRAMES, "every keyframe is solved, alone or with others"
+
+
+def test_all_outputs_of_a_solve_belong_together(played: tuple[NodeProcess, Peer], scene: SyntheticData) -> None:
+    peer, newest_ns = played[1], scene.keyframes[-1].stamp_ns
+    received = peer.received
+
+    def is_there(topic: str) -> bool:
+        return bool(received[topic]) and stamp_ns_from_message(received[topic][-1].header.stamp) == newest_ns
+
+    peer.until(lambda: is_there("points") and is_there("path"), "the map after the last solve")
+    n_poses = sum(len(message.keyframe_id) for message in received["refined_keyframes"])
+    peer.until(lambda: len(received["pose"]) == n_poses, f"{n_poses} poses")
+    assert len(received["path"][-1].poses) == KEYFRAMES
+    points = received["points"][-1]
     assert [field.name for field in points.fields] == ["x", "y", "z", "rms_px", "views"]
     assert points.width > 100
     assert np.isfinite(np.frombuffer(bytes(points.data), "<f4").reshape(-1, 5)[:, :3]).all()
 
-    # Someone who comes late still gets the map.
-    late = make_peer()
-    late.listen("points", "path")
-    late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
-    assert late.received["points"][0].width == points.width
 
+def test_who_comes_late_still_gets_the_map(played: tuple[NodeProcess, Peer]) -> None:
+    with contextlib.closing(Peer()) as late:
+        late.listen("points", "path")
+        late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
+        assert late.received["points"][0].width == played[1].received["points"][-1].width
+
+
+def test_a_node_that_ends_says_what_it_has_done(played: tuple[NodeProcess, Peer]) -> None:
+    node, _ = played
     assert node.stop() == 0, node.err
     assert node.out == f"stopped: {KEYFRAMES} keyframes refined\n"
 
@@ -236,7 +249,7 @@ def test_a_camera_driver_is_heard(
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
         peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in mono.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
     peer.node.destroy_timer(timer)
     assert "rig_changed" not in _rejected(peer)
 
@@ -289,9 +302,12 @@ def test_starts_with_a_file_and_a_namespace(
     peer.connect()
     _play(peer, scene)
     assert _in_solve(peer) == 4
-    types = dict(stranger.node.get_topic_names_and_types())
+    stranger.until(lambda: ("ba_node", "/car") in stranger.node.get_node_names_and_namespaces(), "the node's name")
+    types = dict(stranger.node.get_publisher_names_and_types_by_node("ba_node", "/car"))
+    types |= dict(stranger.node.get_subscriber_names_and_types_by_node("ba_node", "/car"))
     for topic, kind in OUTPUT_TYPES.items():
         assert types[f"/car/ba_node/{topic}"] == [kind], message_class(kind)
+    assert "/car/keyframes" in types
     assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
     assert node.stop(signal.SIGTERM) == 0
 
@@ -333,10 +349,8 @@ def test_help_is_given_and_a_file_for_another_node_is_told(start_node: StartNode
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_during_a_solve(
-    start_node: StartNode, make_peer: MakePeer, slow_solve: str, number: int
-) -> None:
-    node, peer = start_node(python=slow_solve), make_peer()
+def test_a_signal_ends_it_during_a_solve(start_node: StartNode, make_peer: MakePeer, number: int) -> None:
+    node, peer = start_node(prepare=solve_until_stopped), make_peer()
     peer.advertise()
     peer.connect()
     peer.publish(Keyframe(0, 1, 1, "odom", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
@@ -347,29 +361,23 @@ def test_a_signal_ends_it_during_a_solve(
     assert "Traceback" not in node.err
 
 
-BROKEN_SOLVE = """
-import sys
-from ba_node import backend
+def fail_in_the_second_solve() -> None:
+    backend: Any = Backend
+    solve, calls = Backend.solve, []
 
-solve = backend.Backend.solve
-calls = []
+    def sometimes(self: Any, on_iteration: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise RuntimeError("a fault nobody thought of")
+        return solve(self, on_iteration)
 
-def sometimes(self, on_iteration):
-    calls.append(1)
-    if len(calls) == 2:
-        raise RuntimeError("a fault nobody thought of")
-    return solve(self, on_iteration)
-
-backend.Backend.solve = sometimes
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+    backend.solve = sometimes
 
 
 def test_a_fault_in_a_solve_does_not_end_the_node(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
-    node, peer = start_node(python=BROKEN_SOLVE), make_peer()
+    node, peer = start_node(prepare=fail_in_the_second_solve), make_peer()
     peer.advertise()
     peer.listen("report", "refined_keyframes")
     peer.connect()

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from rcl_interfaces.srv import GetParameters
 
+from ba_node.core import solver
 from ba_node.estimate import Status
 from ba_node.synthetic import SyntheticOptions, generate
 
@@ -21,24 +22,19 @@ KEYFRAMES = 60
 SOLVE_S = 0.25
 PERIOD_S = SOLVE_S / 5
 
-# Every solve takes SOLVE_S at least, in iterations that let go of the interpreter as the kernels do.
-SLOW_SOLVER = f"""
-import sys, time
-from ba_node.core import solver
 
-solve = solver.solve
+def solve_slowly() -> None:
+    """Have every solve take SOLVE_S at least, in a wait that lets go of the interpreter as the kernels do."""
+    solve = solver.solve
 
-def slowly(problem, options, *, clock, on_iteration):
-    end = time.monotonic() + {SOLVE_S}
-    result = solve(problem, options, clock=clock, on_iteration=on_iteration)
-    while time.monotonic() < end:
-        time.sleep(0.01)
-    return result
+    def slowly(problem: Any, options: Any, **others: Any) -> Any:
+        end = time.monotonic() + SOLVE_S
+        result = solve(problem, options, **others)
+        while time.monotonic() < end:
+            time.sleep(0.01)
+        return result
 
-solver.solve = slowly
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+    vars(solver)["solve"] = slowly
 
 
 @pytest.mark.parametrize("inbox_size", [500, 12], ids=["coalescing", "dropping"])
@@ -46,7 +42,7 @@ def test_five_times_the_rate_it_can_hold(
     start_node: Callable[..., Any], make_peer: Callable[..., Any], inbox_size: int
 ) -> None:
     arguments = ["--ros-args", "-p", f"node.inbox_size:={inbox_size}", "-p", "node.latency_budget_ms:=100"]
-    node, peer = start_node(*arguments, python=SLOW_SOLVER), make_peer()
+    node, peer = start_node(*arguments, prepare=solve_slowly), make_peer()
     peer.advertise()
     peer.listen("report", "refined_keyframes")
     peer.connect()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.ros.conftest import NodeProcess, Peer
+from tests.ros.harness import NodeProcess, Peer
 from tests.soak import runs
 from tests.soak.drive import Drive
 from tests.soak.measure import MORE_MB, Part, growth

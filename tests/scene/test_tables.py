@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.scene.tables import FloatArray, IdArray, IdIndex, Table, column
+from ba_node.arrays import FloatArray, IdArray
+from ba_node.scene.tables import IdIndex, Table, column
 
 ids_near_the_ends = st.integers(0, 3) | st.integers(2**63 - 2, 2**63 + 2) | st.integers(2**64 - 4, 2**64 - 1)
 

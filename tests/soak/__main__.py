@@ -50,7 +50,7 @@ def _show(name: str, parts: Iterator[Part], timed: bool) -> list[str]:
 
 def _node(count: int) -> list[str]:
     from ba_node.ros.tools.domain import free_domain, isolation  # noqa: PLC0415
-    from tests.ros.conftest import NodeProcess, Peer  # noqa: PLC0415
+    from tests.ros.harness import NodeProcess, Peer  # noqa: PLC0415
 
     os.environ.update(isolation(free_domain()))
     process, peer = NodeProcess(), Peer()
@@ -61,7 +61,7 @@ def _node(count: int) -> list[str]:
         return _show("node", runs.node(process, peer, Drive(tracks=150), count, count // _PARTS), timed=True)
     finally:
         peer.close()
-        process.kill()
+        process.close()
 
 
 if __name__ == "__main__":

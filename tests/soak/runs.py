@@ -18,7 +18,7 @@ from tests.soak.drive import Drive
 from tests.soak.measure import Part, processor_s, resident_mb
 
 if TYPE_CHECKING:
-    from tests.ros.conftest import NodeProcess, Peer
+    from tests.ros.harness import NodeProcess, Peer
 
 _BURST = 40
 
@@ -46,7 +46,7 @@ def node(process: NodeProcess, peer: Peer, drive: Drive, keyframes: int, part: i
     """Yield the parts of a run of the node: a keyframe when the one before was solved, and bursts between the parts."""
     peer.publish(drive.rig)
     times: list[float] = []
-    before = processor_s(process.process.pid)
+    before = processor_s(process.pid)
     for count, frame in enumerate(itertools.islice(drive.frames(), keyframes), start=1):
         began = time.monotonic()
         for measurement in frame:
@@ -60,7 +60,7 @@ def node(process: NodeProcess, peer: Peer, drive: Drive, keyframes: int, part: i
             del peer.received["report"][:-1]
         if count % part == 0:
             assert process.alive, process.err[-2000:]
-            pid = process.process.pid
+            pid = process.pid
             spent, before = processor_s(pid) - before, processor_s(pid)
             yield Part(count, resident_mb(pid), times, 1e3 * spent / part)
             times = []

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from ba_node import window
+from ba_node.arrays import IntArray
 from ba_node.config import Config
 from ba_node.core import geometry, objective
 from ba_node.core.result import Result, Status
 from ba_node.measurements import FeatureTracks, Keyframe, Measurement
 from ba_node.scene.scene import Scene
-from ba_node.scene.tables import IntArray
 from ba_node.synthetic import SyntheticOptions, generate
 
 TRACKS = Config().tracks

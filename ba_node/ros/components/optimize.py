@@ -9,7 +9,6 @@ longer the current one: after a reset, another map, or a new session.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
@@ -17,9 +16,7 @@ import traceback
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.action.server import GoalEvent, GoalStatus
-from rclpy.qos import QoSProfile
+from rclpy.action import CancelResponse, GoalResponse
 
 from ba_node.config import find
 from ba_node.estimate import Status
@@ -27,7 +24,8 @@ from ba_node.messages.topics import ACTIONS
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
-from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Owed
+from ba_node.ros.rclpy_compat.actions import DeferredAction
+from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Answer
 
 if TYPE_CHECKING:
     from ba_node.backend import Backend, Optimization
@@ -36,8 +34,6 @@ if TYPE_CHECKING:
 _NAME = "optimize"
 _METHODS = find("solver.method").choices
 _GONE = "the map was reset or replaced meanwhile"
-# Feedback comes in bursts where iterations are short.
-_FEEDBACK_DEPTH = 100
 
 
 @dataclass
@@ -46,7 +42,7 @@ class _Goal:
 
     handle: Any
     began_s: float
-    owed: Owed
+    answer: Answer
     stop: str = ""
     result: dict[str, Any] = field(default_factory=dict)
 
@@ -56,7 +52,7 @@ class _Goal:
 
     def end(self, status: Status, reason: str) -> None:
         """Answer, from any thread."""
-        self.owed.give_later(success=status.usable, message=reason, status=status, **self.result)
+        self.answer.send_later(success=status.usable, message=reason, status=status, **self.result)
 
 
 class Optimize(Component):
@@ -67,21 +63,12 @@ class Optimize(Component):
         super().__init__(host)
         self._goal: _Goal | None = None
         self._type = message_class(ACTIONS[_NAME].type_name)
-        self._server = ActionServer(
-            host.node,
-            self._type,
-            f"~/{_NAME}",
-            execute_callback=_never,
-            goal_callback=self._judge,
-            handle_accepted_callback=self._accept,
-            cancel_callback=self._cancel,
-            feedback_pub_qos_profile=QoSProfile(depth=_FEEDBACK_DEPTH),
-        )
+        self._server = DeferredAction(host.node, self._type, f"~/{_NAME}", self._decide, self._accept, self._cancel)
         host.at_cleanup.callback(self._stop)
         # Who is answered at cleanup must still hear it.
         host.after_cleanup.callback(self._server.destroy)
 
-    def _judge(self, request: Any) -> Any:
+    def _decide(self, request: Any) -> Any:
         """Accept a goal, or reject it and say why in the log: the answer to a goal has no room for it."""
         try:
             reason = self._objection(request)
@@ -94,9 +81,9 @@ class Optimize(Component):
 
     def _objection(self, request: Any) -> str:
         reason = ""
-        if not self.host.relay.open:
+        if not self.host.deferred.open:
             reason = CLEANED_UP
-        elif self._goal is not None and not self._goal.owed.given:
+        elif self._goal is not None and not self._goal.answer.sent:
             reason = "another goal is at work: cancel it, or wait for its result"
         elif request.method and request.method not in _METHODS:
             reason = f"method = {request.method!r}: choose one of {', '.join(_METHODS)}"
@@ -110,12 +97,11 @@ class Optimize(Component):
         def send(success: bool, message: str, fields: dict[str, Any]) -> None:
             self._finish(goal, message, {"success": success} | fields)
 
-        owed = self.host.relay.owe(send)
-        self._goal = goal = _Goal(handle, time.monotonic(), owed)
+        answer = self.host.deferred.expect(send)
+        self._goal = goal = _Goal(handle, time.monotonic(), answer)
         try:
-            with owed.at_work():
-                # What handle.execute() does first; then it would hand over to a callback that returns the result.
-                handle._update_state(GoalEvent.EXECUTE)
+            with answer.guarded():
+                self._server.begin(handle)
                 self.host.inbox.post(lambda backend: self._copy(backend, goal))
         except Exception:
             log(self.host.node, Severity.ERROR, f"~/{_NAME}: {traceback.format_exc()}")
@@ -132,7 +118,7 @@ class Optimize(Component):
 
     def _copy(self, backend: Backend, goal: _Goal) -> None:
         """Copy the map, on the solver's thread."""
-        with goal.owed.at_work():
+        with goal.answer.guarded():
             taken = backend.begin_optimization()
             if isinstance(taken, str):
                 goal.end(Status.SKIPPED, taken)
@@ -142,7 +128,7 @@ class Optimize(Component):
 
     def _solve(self, backend: Backend, goal: _Goal, taken: Optimization) -> None:
         """Solve the copy, on a thread of its own."""
-        with goal.owed.at_work():
+        with goal.answer.guarded():
             taken = self._solved(backend, goal, taken)
             goal.result = taken.statistics()
             if goal.stop:
@@ -156,11 +142,11 @@ class Optimize(Component):
 
         def watch(row: Iteration) -> bool:
             nonlocal out_of_time
-            self.host.relay.call(lambda: self._tell(goal, row, goal.elapsed_s))
+            self.host.deferred.call(lambda: self._tell(goal, row, goal.elapsed_s))
             if not backend.is_current(taken):
                 goal.stop = goal.stop or _GONE
             out_of_time = 0.0 < request.time_budget_s <= goal.elapsed_s
-            return not (goal.stop or goal.owed.given or out_of_time)
+            return not (goal.stop or goal.answer.sent or out_of_time)
 
         choices = (self.host.config.solver, request.method, request.max_iterations)
         taken.solve(*choices, clock=time.perf_counter, on_iteration=watch)
@@ -170,8 +156,8 @@ class Optimize(Component):
 
     def _merge(self, backend: Backend, goal: _Goal, taken: Optimization) -> Estimate | None:
         """Put the result in, on the solver's thread; what it returns is published."""
-        with goal.owed.at_work():
-            merged = None if goal.stop or goal.owed.given else backend.merge(taken)
+        with goal.answer.guarded():
+            merged = None if goal.stop or goal.answer.sent else backend.merge(taken)
             if merged is None:
                 lost = taken.result.status.usable
                 reason = (goal.stop or backend.refusal or _GONE) if lost else taken.result.reason
@@ -184,7 +170,7 @@ class Optimize(Component):
 
     def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:
         """Publish feedback."""
-        if not goal.owed.given:
+        if not goal.answer.sent:
             feedback = self._type.Feedback(
                 iteration=row.iteration,
                 accepted=row.accepted,
@@ -198,30 +184,8 @@ class Optimize(Component):
     def _finish(self, goal: _Goal, reason: str, fields: dict[str, Any]) -> None:
         """Send the result of a goal; what raises before it has left may be tried again with fewer fields."""
         success = fields["success"]
-        status = fields.pop("status", Status.FAILED if self.host.relay.open else Status.SKIPPED)
+        status = fields.pop("status", Status.FAILED if self.host.deferred.open else Status.SKIPPED)
         result = self._type.Result(reason=reason, status=int(status), elapsed_s=goal.elapsed_s, **fields)
-        event = GoalEvent.SUCCEED if success else GoalEvent.ABORT
-        if goal.handle.is_cancel_requested and not success:
-            event = GoalEvent.CANCELED
-        reached = _end_state(goal.handle, event)
-        response = self._type.Impl.GetResultService.Response(status=reached, result=result)
-        # As rclpy does after its callback; without an executor the result goes out now, before a cleanup goes on.
-        future = self._server._result_futures[bytes(goal.handle.goal_id.uuid)]
-        future._set_executor(None)
-        future.set_result(response)
+        self._server.finish(goal.handle, success=success, result=result)
         severity = Severity.INFO if success else Severity.WARNING
         log(self.host.node, severity, f"~/{_NAME}: {status.name.lower()}: {reason}")
-
-
-def _end_state(handle: Any, event: Any) -> int:
-    """Bring a goal to its end and return the state that it has then; one that never began is aborted."""
-    for step in (event, GoalEvent.EXECUTE, GoalEvent.ABORT):
-        if not handle.is_active:
-            break
-        with contextlib.suppress(Exception):  # a step that is not allowed from here, or nobody to tell of it
-            handle._update_state(step)
-    return GoalStatus.STATUS_ABORTED if handle.is_active else int(handle.status)
-
-
-def _never(_handle: Any) -> None:
-    raise AssertionError("goals are executed by the threads of this module")

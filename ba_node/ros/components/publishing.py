@@ -14,8 +14,7 @@ from ba_node.messages.report import LatencyReport, Report, report_message
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
-from ba_node.ros.log import Severity, log
-from ba_node.ros.throttle import Throttle
+from ba_node.ros.log import Severity, Throttle, log
 from ba_node.ros.worker.latency import Sliding
 
 if TYPE_CHECKING:

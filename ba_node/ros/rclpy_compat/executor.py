@@ -17,11 +17,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sized
 from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import EventHandler
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
+
+from ba_node.ros.rclpy_compat.private import part
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -49,8 +52,11 @@ class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is no
         self._has_events = False
         self._next_events_s = clock()
         self._spinning: int | None = None
-        # A version of rclpy that is made otherwise waits twice a callback, as it does by itself.
-        if isinstance(getattr(self, "_guard", None), GuardCondition) and hasattr(self, "_tasks"):
+        guard, tasks = (
+            part(self, name, kind, "waits end twice a callback")
+            for name, kind in (("_guard", GuardCondition), ("_tasks", Sized))
+        )
+        if guard is not None and tasks is not None:
             self._guard.destroy()
             self._guard = _Alarm(self._knows, self._context)
 

@@ -13,16 +13,32 @@ from __future__ import annotations
 import traceback
 from typing import TYPE_CHECKING, Any
 
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
-from ba_node.ros.log import Severity, log
-from ba_node.ros.rclpy_compat.answering import answering
+from ba_node.ros.log import Severity, fault, log, printable
+from ba_node.ros.rclpy_compat.private import RCLError, part
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_RCLError = rclpy_implementation.RCLError
+_SET = "rcl_interfaces/SetParametersResult"
+
+
+def _guarded(method: str, name: str = "") -> Callable[[ManagedNode, Any], Any]:
+    """Return what rclpy calls for a transition: runs a method of the node, and says how it went."""
+
+    def run(node: ManagedNode, _state: Any) -> Any:
+        try:
+            getattr(node, method)()
+        except Exception as error:
+            text = f"{name or method} failed: {type(error).__name__}: {error}"
+            log(node, Severity.ERROR, f"{text}\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.ERROR
+        log(node, Severity.INFO, f"{name or method}: done")
+        return TransitionCallbackReturn.SUCCESS
+
+    return run
 
 
 class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
@@ -31,9 +47,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     def __init__(self, node_name: str, **node_options: Any) -> None:
         """Make the node, unconfigured."""
         super().__init__(node_name, **node_options)
-        self._answer = self._service_change_state.callback
-        self._service_change_state.callback = self._on_request
+        self._machine = part(self, "_state_machine", object, "a refused transition is told without what is possible")
         for service in self.services:
+            if service.srv_name.endswith("/change_state"):
+                self._answer, service.callback = service.callback, self._on_request
             service.callback = answering(self, service.srv_name, service.srv_type.Response, service.callback)
 
     def configure(self) -> None:
@@ -55,63 +72,71 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     @property
     def state(self) -> str:
         """Return the label of the state: unconfigured, inactive, active or finalized."""
-        return str(self._state_machine.current_state[1])
+        return "in an unknown state" if self._machine is None else str(self._machine.current_state[1])
 
     def request(self, transition: str) -> bool:
         """Make a transition from within (configure, activate, ...); return False, with a log line, if it fails."""
         try:
             done = getattr(self, f"trigger_{transition}")() == TransitionCallbackReturn.SUCCESS
-        except _RCLError:
+        except RCLError:
             done = False
         if not done:
             self._tell(transition)
         return bool(done)
 
-    def on_configure(self, _state: Any) -> Any:
-        """Configure, for rclpy."""
-        return self._guarded("configure", self.configure)
-
-    def on_activate(self, _state: Any) -> Any:
-        """Activate, for rclpy."""
-        return self._guarded("activate", self.activate)
-
-    def on_deactivate(self, _state: Any) -> Any:
-        """Deactivate, for rclpy."""
-        return self._guarded("deactivate", self.deactivate)
-
-    def on_cleanup(self, _state: Any) -> Any:
-        """Clean up, for rclpy."""
-        return self._guarded("cleanup", self.cleanup)
-
-    def on_shutdown(self, _state: Any) -> Any:
-        """Shut down, for rclpy, from any state."""
-        return self._guarded("shutdown", self.cleanup)
-
-    def on_error(self, _state: Any) -> Any:
-        """Release everything after a transition that raised: rclpy then goes back to unconfigured."""
-        return self._guarded("cleanup after the error", self.cleanup)
-
-    def _guarded(self, name: str, action: Callable[[], None]) -> Any:
-        try:
-            action()
-        except Exception as error:
-            text = f"{name} failed: {type(error).__name__}: {error}"
-            log(self, Severity.ERROR, f"{text}\n{traceback.format_exc()}")
-            return TransitionCallbackReturn.ERROR
-        log(self, Severity.INFO, f"{name}: done")
-        return TransitionCallbackReturn.SUCCESS
+    on_configure, on_activate = _guarded("configure"), _guarded("activate")
+    on_deactivate, on_cleanup = _guarded("deactivate"), _guarded("cleanup")
+    on_shutdown = _guarded("cleanup", "shutdown")
+    # After a transition that raised: rclpy then goes back to unconfigured.
+    on_error = _guarded("cleanup", "cleanup after the error")
 
     def _on_request(self, request: Any, response: Any) -> Any:
         """Answer a request of `ros2 lifecycle set`."""
         try:
             response = self._answer(request, response)
-        except _RCLError:
+        except RCLError:
             response.success = False
         if not response.success:
             self._tell(request.transition.label or str(request.transition.id))
         return response
 
     def _tell(self, transition: str) -> None:
-        possible = sorted({item[1] for item in self._state_machine.available_transitions})
-        text = f"transition {transition!r} was refused or failed; the node is {self.state}, from where it can "
-        log(self, Severity.WARNING, text + (" or ".join(possible) or "go nowhere"))
+        text = f"transition {transition!r} was refused or failed; the node is {self.state}"
+        if self._machine is not None:
+            possible = sorted({item[1] for item in self._machine.available_transitions})
+            text += f", from where it can {' or '.join(possible) or 'go nowhere'}"
+        log(self, Severity.WARNING, text)
+
+
+def answering(node: Any, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return a callback that answers with a refusal, as far as the type of the response can say one, when it raises.
+
+    Args:
+        node: whose log hears of it.
+        name: of the service.
+        kind: class of its responses.
+        callback: takes request and response, returns the response.
+    """
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            log(node, Severity.ERROR, f"{name} was answered with a refusal: {traceback.format_exc()}")
+            return _refusal(kind, request, printable(fault(error)))
+
+    return answer
+
+
+def _refusal(kind: Any, request: Any, reason: str) -> Any:
+    """Return a response without success: rclpy's types have it in different places."""
+    response = kind()
+    types = response.get_fields_and_field_types()
+    if "failure_reason" in types:
+        response.failure_reason = reason
+    if types.get("result") == _SET:
+        response.result.reason = reason
+    if types.get("results") == f"sequence<{_SET}>":
+        reason += "; those of the request before the one at fault are set"
+        response.results = [SetParametersResult(successful=False, reason=reason) for _ in request.parameters]
+    return response

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.time import Time
 
@@ -30,21 +29,20 @@ from ba_node.io.mcap import BagReader
 from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
+from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
     from pathlib import Path
 
-_WRONG_OPTIONS = (
-    rclpy_implementation.RCLError,
-    rclpy_implementation.UnknownROSArgsError,
-    InvalidNamespaceException,
-)
+_WRONG_OPTIONS = (*ARGUMENT_ERRORS, InvalidNamespaceException)
 _POLL_S = 0.02
 # Fast DDS asks for acknowledgements every 3 s.
 _ACK_TIMEOUT_S = 10.0
 _LATCHED_DEPTH = 10
 _playing: list[Any] = []
+# What a user calls the fields of PlayOptions that are numbers.
+_OPTIONS = {"rate": "--rate", "wait_s": "--wait", "start_s": "--start", "rounds": "--loop", "clock_hz": "--clock"}
 
 
 class PlayError(ValueError):
@@ -76,10 +74,10 @@ class PlayOptions:
     ros_args: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("rate", "wait_s", "start_s", "rounds", "clock_hz"):
+        for name, option in _OPTIONS.items():
             value = getattr(self, name)
             if not math.isfinite(value) or value < 0:
-                raise PlayError(f"{name} = {value!r}: expected a finite number, 0 or more")
+                raise PlayError(f"{option} {value:g}: expected a finite number, 0 or more")
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ def _node(options: PlayOptions) -> Iterator[Any]:
                 enable_rosout=False,
             )
         except _WRONG_OPTIONS as error:
-            raise PlayError(f"namespace or remapping: {error}") from error
+            raise PlayError(f"--namespace or --remap: {error}") from error
         _playing.append(node)
         try:
             yield node
@@ -266,7 +264,7 @@ class _Player:
             return next((log_time_ns for _, _, log_time_ns, _ in self._reader.messages()), 0)
         length_s = (times[-1] - times[0]) * 1e-9
         if self._options.start_s > length_s:
-            raise PlayError(f"start_s = {self._options.start_s:g}: the recording is {length_s:.1f} s long")
+            raise PlayError(f"--start {self._options.start_s:g}: the recording is {length_s:.1f} s long")
         return times[0] + round(self._options.start_s * 1e9)
 
     def _publish(self, publisher: Any, data: bytes) -> None:
@@ -303,6 +301,6 @@ def _try_to_publish(publisher: Any, data: bytes) -> Exception | None:
     """Publish; return the error if the writer is full, which it reports after 0.1 s."""
     try:
         publisher.publish(data)
-    except rclpy_implementation.RCLError as error:
-        return error  # type: ignore[no-any-return]  # rclpy is not typed
+    except RCLError as error:
+        return error
     return None

@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+from ba_node.core import solver
+from ba_node.core.result import Result, Status
 from ba_node.ros import qos
 from ba_node.ros.components.diagnostics import _resident_mb, _since
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
@@ -80,29 +82,21 @@ def test_silence_is_stale_and_names_who_is_missing(
     assert node.stop() == 0
 
 
-FAILING_SOLVE = """
-import sys
-from ba_node.core import solver
-from ba_node.core.result import Result, Status
+def fail_from_the_third() -> None:
+    calls, solve = [], solver.solve
 
-solve = solver.solve
-calls = []
+    def failing(problem: Any, *arguments: Any, **options: Any) -> Result:
+        calls.append(1)
+        if len(calls) < 3:
+            return solve(problem, *arguments, **options)
+        return Result(problem.start, Status.FAILED, "made to fail", "test", ())
 
-def fail_from_the_third(problem, *arguments, **options):
-    calls.append(1)
-    if len(calls) < 3:
-        return solve(problem, *arguments, **options)
-    return Result(problem.start, Status.FAILED, "made to fail", "test", ())
-
-solver.solve = fail_from_the_third
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+    vars(solver)["solve"] = failing
 
 
 @pytest.mark.dds
 def test_a_solve_that_fails_is_an_error(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
-    start_node(python=FAILING_SOLVE)
+    start_node(prepare=fail_from_the_third)
     peer = listening(make_peer)
     peer.advertise()
     peer.listen("report")

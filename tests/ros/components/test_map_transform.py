@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,7 @@ from ba_node.core import geometry
 from ba_node.estimate import Transform
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.ros import qos
+from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 tf2 = pytest.importorskip("tf2_msgs.msg", reason="needs tf2_msgs: make setup", exc_type=ImportError)
@@ -136,18 +138,18 @@ def test_a_front_end_that_calls_its_frame_map_leaves_no_room(
     assert node.err.count("give frames.map_frame another name") == 1
 
 
-WITHOUT_TF2 = """
-import sys
-sys.modules["tf2_msgs"] = None
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+def forget_tf2_msgs() -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == "tf2_msgs"]:
+        del sys.modules[name]
+    modules: Any = sys.modules
+    modules["tf2_msgs"] = None
+    message_class.cache_clear()
 
 
 def test_without_tf2_msgs_it_runs_and_says_once_what_is_off(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
-    node, peer = start_node("--ros-args", "-p", "frames.extrinsics:=tf_static", python=WITHOUT_TF2), make_peer()
+    node, peer = start_node("--ros-args", "-p", "frames.extrinsics:=tf_static", prepare=forget_tf2_msgs), make_peer()
     peer.advertise()
     peer.listen("report", "refined_keyframes")
     peer.connect()

@@ -10,39 +10,42 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
+from ba_node.ros.components import publishing
 from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from ba_node.window import extras
 
 pytestmark = pytest.mark.dds
 
 StartNode = Callable[..., Any]
 MakePeer = Callable[..., Any]
 
-TELLING = """
-import sys
-from ba_node.window import extras
-from ba_node.ros.components import publishing
 
-def telling(name):
-    work = getattr(extras, name)
-    def tell(*arguments):
-        print("works out", name, flush=True)
-        return work(*arguments)
-    return tell
+def tell_of_work() -> None:
+    """Have the node say what it works out and what it builds."""
 
-for name in ("covariances", "view"):
-    setattr(extras, name, telling(name))
-build = publishing.output_messages
-def tell_topics(*arguments):
-    built = build(*arguments)
-    print("builds", *sorted({topic for topic, _, _ in built}), flush=True)
-    return built
-publishing.output_messages = tell_topics
-from ba_node.ros.main import main
-sys.exit(main())
-"""
+    def telling(name: str) -> Callable[..., Any]:
+        work = getattr(extras, name)
+
+        def tell(*arguments: Any) -> Any:
+            print("works out", name, flush=True)
+            return work(*arguments)
+
+        return tell
+
+    for name in ("covariances", "view"):
+        setattr(extras, name, telling(name))
+    build = output_messages
+
+    def tell_topics(*arguments: Any) -> Any:
+        built = build(*arguments)
+        print("builds", *sorted({topic for topic, _, _ in built}), flush=True)
+        return built
+
+    vars(publishing)["output_messages"] = tell_topics
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +63,13 @@ def watch(peer: Any, topic: str) -> Any:
 def test_nothing_is_worked_out_that_nobody_looks_at(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
-    node, peer = start_node(python=TELLING), make_peer()
+    node, peer = start_node(prepare=tell_of_work), make_peer()
     peer.advertise()
     peer.listen("report", "refined_keyframes")
     peer.connect()
     peer.play(data, session_id=0)
     assert "works out" not in node.out
-    assert set(node.out.splitlines()) == {"builds refined_keyframes"}
+    assert set(node.out.splitlines()) == {"builds", "builds refined_keyframes"}
     assert "pose" not in node.out and "path" not in node.out and "points" not in node.out
     late = make_peer()
     late.listen("path", "points")

@@ -4,6 +4,10 @@
 
 from __future__ import annotations
 
+import builtins
+import contextlib
+import functools
+import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from ba_node.core.result import Status
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
-from tests.ros.conftest import NodeProcess, Peer
+from tests.ros.harness import NodeProcess, Peer
 
 pytestmark = pytest.mark.dds
 
@@ -41,16 +45,16 @@ FAULTS = {
     "disk": ("ba_node.ros.components.services", "write_map", "OSError"),
     "write_exit": ("ba_node.ros.components.services", "write_map", "SystemExit"),
     "thread": ("threading", "Thread.start", "RuntimeError"),
-    "counts": ("ba_node.ros.components.services", "_counts", "IndexError"),
+    "counts": ("ba_node.scene.map_content", "MapContent.sizes", "IndexError"),
     "read": ("ba_node.ros.components.services", "load_map", "MemoryError"),
     "take_over": ("ba_node.backend", "Backend.take_over", "KeyError"),
-    "known": ("ba_node.ros.components.services", "_known", "ValueError"),
+    "known": ("ba_node.backend.archive", "MapState.sizes", "ValueError"),
     "logger": ("rclpy.impl.rcutils_logger", "RcutilsLogger.log", "ValueError"),
-    "copy": ("ba_node.window.full", "copy", "IndexError"),
+    "copy": ("ba_node.window.full", "take_snapshot", "IndexError"),
     "options": ("ba_node.window.full", "options", "KeyError"),
-    "solve": ("ba_node.window.full", "Copy.solve", "FloatingPointError"),
-    "solve_exit": ("ba_node.window.full", "Copy.solve", "SystemExit"),
-    "figures": ("ba_node.ros.components.optimize", "_figures", "TypeError"),
+    "solve": ("ba_node.window.full", "Snapshot.solve", "FloatingPointError"),
+    "solve_exit": ("ba_node.window.full", "Snapshot.solve", "SystemExit"),
+    "figures": ("ba_node.backend.optimization", "Optimization.statistics", "TypeError"),
     "merge": ("ba_node.backend", "Backend.merge", "AssertionError"),
     "state": ("rclpy.action.server", "ServerGoalHandle._update_state", "RuntimeError"),
     "feedback": ("rclpy.action.server", "ServerGoalHandle.publish_feedback", "RuntimeError"),
@@ -61,46 +65,49 @@ FAULTS = {
     "cleanup": ("ba_node.ros.worker.worker", "Worker.stop", "RuntimeError"),
     "solver": ("ba_node.ros.worker.worker", "Worker._guard", "SystemExit"),
 }
-SCRIPT = """
-import builtins, functools, importlib, pathlib, sys
+PARTLY: dict[str, Callable[[Any, Any], bool]] = {
+    # Not where rclpy makes an empty response, nor its own lines of debugging.
+    "response": lambda _, options: bool(options),
+    "logger": lambda arguments, _: bool(arguments[2] >= 20),
+}
 
-folder = pathlib.Path({folder!r})
 
-PARTLY = {{"response": lambda _, options: options, "logger": lambda arguments, _: arguments[2] >= 20}}
-
-def put(name, module, place, kind):
-    owner = importlib.import_module(module)
+def _owner(module: str, place: str) -> tuple[Any, str]:
+    """Return what has the function at a place, and its name there."""
     *path, last = place.split(".")
-    owner = functools.reduce(getattr, path, owner)
+    return functools.reduce(getattr, path, importlib.import_module(module)), last
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_fault_has_a_place(fault: str) -> None:
+    assert callable(getattr(*_owner(*FAULTS[fault][:2])))
+
+
+def put_faults(folder: str) -> None:
+    """Put all faults in, to be armed by files."""
+    for name, place in FAULTS.items():
+        _put(Path(folder), name, *place)
+
+
+def _put(folder: Path, name: str, module: str, place: str, kind: str) -> None:
+    owner, last = _owner(module, place)
     real = getattr(owner, last)
 
     @functools.wraps(real)
-    def call(*arguments, **options):
-        # Not where rclpy makes an empty response, nor its own lines of debugging.
+    def call(*arguments: Any, **options: Any) -> Any:
         armed = name not in PARTLY or PARTLY[name](arguments, options)
         if armed and (folder / name).exists():
             if name != "logger":
                 (folder / name).unlink()
-            raise getattr(builtins, kind)("put in: " + name)
+            raise getattr(builtins, kind)(f"put in: {name}")
         return real(*arguments, **options)
 
     setattr(owner, last, call)
-
-for name, place in {faults!r}.items():
-    put(name, *place)
-from ba_node.ros.main import main
-sys.exit(main(sys.argv))
-"""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("faults")
-
-
-@pytest.fixture(scope="module")
-def script(folder: Path) -> str:
-    return SCRIPT.format(folder=str(folder), faults=FAULTS)
 
 
 @pytest.fixture(scope="module")
@@ -154,17 +161,18 @@ class Client:
 
 
 @pytest.fixture(scope="module")
-def shared(domain: int, script: str, folder: Path, scene: SyntheticData) -> Iterator[Client]:  # noqa: ARG001
+def shared(domain: int, folder: Path, scene: SyntheticData) -> Iterator[Client]:  # noqa: ARG001
     """Return a client of a node that outlives all faults of this module."""
-    node = NodeProcess("--ros-args", "-p", f"node.map_folder:={folder}", python=script)
-    peer = Peer()
-    peer.advertise()
-    peer.play(scene)
-    client = Client(node, peer, folder)
-    assert client.peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path="kept")).success
-    yield client
-    peer.close()
-    node.kill()
+    arguments = ("--ros-args", "-p", f"node.map_folder:={folder}")
+    with (
+        contextlib.closing(NodeProcess(*arguments, prepare=put_faults, folder=str(folder))) as node,
+        contextlib.closing(Peer()) as peer,
+    ):
+        peer.advertise()
+        peer.play(scene)
+        client = Client(node, peer, folder)
+        assert client.peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path="kept")).success
+        yield client
 
 
 @pytest.fixture
@@ -265,11 +273,11 @@ def test_twenty_faults_in_a_row_do_not_end_the_node(client: Client) -> None:
 @pytest.fixture
 def start_alone(
     start_node: Callable[..., Any], make_peer: Callable[..., Any], folder: Path, scene: SyntheticData
-) -> Callable[[str], Client]:
-    """Return a function that starts a node of its own with a script, and returns a client of it."""
+) -> Callable[..., Client]:
+    """Return a function that starts a node of its own with options, and returns a client of it."""
 
-    def start(script: str) -> Client:
-        node = start_node(*ALONE, "-p", f"node.map_folder:={folder}", python=script)
+    def start(**options: Any) -> Client:
+        node = start_node(*ALONE, "-p", f"node.map_folder:={folder}", **options)
         peer = make_peer(namespace="alone")
         peer.advertise()
         peer.play(scene)
@@ -278,9 +286,9 @@ def start_alone(
     return start
 
 
-def test_the_solvers_thread_dies(start_alone: Callable[[str], Client], script: str, scene: SyntheticData) -> None:
+def test_the_solvers_thread_dies(start_alone: Callable[..., Client], folder: Path, scene: SyntheticData) -> None:
     """Whoever waits then is answered, and whoever comes later too."""
-    alone = start_alone(script)
+    alone = start_alone(prepare=put_faults, folder=str(folder))
     peer = alone.peer
     alone.arm("solver")
     assert alone.call("reset").message == "the solver's thread has ended: start the node anew"
@@ -295,9 +303,9 @@ def test_the_solvers_thread_dies(start_alone: Callable[[str], Client], script: s
 
 @pytest.mark.parametrize("number", [2, 15])
 def test_who_waits_when_a_signal_comes_is_answered(
-    number: int, start_alone: Callable[[str], Client], gates: Any, folder: Path
+    number: int, start_alone: Callable[..., Client], gates: Any, folder: Path
 ) -> None:
-    alone = start_alone(gates.script)
+    alone = start_alone(**gates.options)
     node, peer = alone.node, alone.peer
     gates.shut("optimize")
     handle = alone.send_goal()
@@ -306,7 +314,7 @@ def test_who_waits_when_a_signal_comes_is_answered(
     gates.shut("map file")
     saving = peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path="late"))
     peer.until(lambda: gates.waits("map file"), "the file")
-    node.process.send_signal(number)
+    node.send_signal(number)
     peer.until(lambda: saving.done() and result.done(), "answers")
     assert saving.result().message == result.result().result.reason == "the node was cleaned up meanwhile"
     gates.open("optimize")

@@ -171,10 +171,13 @@ def test_nothing_to_play_is_an_error(bag: Path) -> None:
         play(bag, PlayOptions(topics=("/images",)))
 
 
-@pytest.mark.parametrize(("name", "value"), [("rate", -1.0), ("rate", float("nan")), ("wait_s", float("inf"))])
-def test_senseless_options_are_refused(name: str, value: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [("rate", -1.0, "--rate -1:"), ("rate", float("nan"), "--rate nan:"), ("wait_s", float("inf"), "--wait inf:")],
+)
+def test_senseless_options_are_refused(name: str, value: float, words: str) -> None:
     options: dict[str, Any] = {name: value}
-    with pytest.raises(PlayError, match=f"{name} = .*expected a finite number"):
+    with pytest.raises(PlayError, match=f"{words} expected a finite number"):
         PlayOptions(**options)
 
 
@@ -241,7 +244,8 @@ def test_the_time_goes_with_the_recording(bag: Path, scene: SyntheticData, make_
     options = PlayOptions(rate=rate, start_s=start_s, rounds=2, clock_hz=50.0)
     summary = _play(peer, bag, options)
     later = [keyframe for keyframe in scene.keyframes if keyframe.stamp_ns >= start_ns]
-    assert len(received["keyframes"]) == summary.published["/keyframes"] == 2 * len(later) == 8
+    assert summary.published["/keyframes"] == 2 * len(later) == 8
+    peer.until(lambda: len(received["keyframes"]) == 8, "every keyframe")
     assert len(received["camera_rig"]) == 2
     peer.until(lambda: len(times) == summary.published["/clock"], "every time")
     last_ns = scene.keyframes[-1].stamp_ns
@@ -285,7 +289,7 @@ def test_a_loop_goes_on_until_it_is_interrupted(bag: Path, scene: SyntheticData,
 
 
 def test_a_start_after_the_end_is_refused(bag: Path) -> None:
-    with pytest.raises(PlayError, match=r"start_s = 100: the recording is 1\.8 s long"):
+    with pytest.raises(PlayError, match=r"--start 100: the recording is 1\.8 s long"):
         play(bag, PlayOptions(wait_s=0.0, start_s=100.0))
 
 
