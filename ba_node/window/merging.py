@@ -144,9 +144,9 @@ def _note_moving(scene: Scene, selection: Selection) -> None:
     if selection.problem.n_keyframes >= _KNOWN_KEYFRAMES and count > _MANY_MOVING * of:
         scene.log.warn(
             "moving",
-            f"{count} of {of} tracks of the window move against the rest, as those on objects that move do, or those that"
-            " slip off their points: they were left out of the solve; the motion that the others and the front-end agree"
-            " on was taken",
+            f"{count} of {of} tracks of the window move against the rest, as those on objects that move do, or those"
+            " that slip off their points: they were left out of the solve; the motion that the others and the front-end"
+            " agree on was taken",
         )
 
 
