@@ -35,7 +35,7 @@ from collections.abc import Callable, Iterable, Iterator
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.optimization import Optimization
-from ba_node.backend.replay import MapEnded, replay
+from ba_node.backend.summary import MapEnded
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
 from ba_node.core.problem import Cameras
@@ -238,7 +238,30 @@ class Backend:
             Every estimate; every keyframe that the map has now, as it came; and what became of a map when another one
             took its place, before the first keyframe of that.
         """
-        return replay(self, stream)
+        for measurement in stream:
+            for admitted in self.admit(measurement):
+                yield from self._taken(admitted)
+        for admitted in self.admit_rest():
+            yield from self._taken(admitted)
+        self.flush(final=True)
+        while self.ready:
+            yield from self._solved()
+
+    def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
+        if self.completes(admitted):
+            yield from self._solved()
+        before = self.map
+        self.take(admitted)
+        if self.map is not before:
+            yield MapEnded(before.summary(), admitted.begins is not None and admitted.begins.replaces)
+        one = admitted.measurement
+        if isinstance(one, Keyframe) and self.scene.find_keyframe(one.keyframe_id) is not None:
+            yield one
+
+    def _solved(self) -> Iterator[Estimate]:
+        estimate = self.solve()
+        if estimate is not None:
+            yield estimate
 
     def take_check(self, check: Check) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""

@@ -5,6 +5,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from dataclasses import dataclass
+
+from ba_node.measurements import Measurement
 
 # Reason -> what was turned away and why. The keys are published in ba_msgs/SolverReport.
 REASONS: dict[str, str] = {
@@ -63,6 +66,15 @@ WARNINGS: dict[str, str] = {
 }
 
 NOTES_KEPT = 50
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A measurement that is turned away: reason from ``REASONS``, and why in words."""
+
+    measurement: Measurement
+    reason: str
+    text: str
 
 
 class RejectionLog:

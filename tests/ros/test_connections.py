@@ -18,6 +18,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, stamp_ns_from_message
+from ba_node.ros.components import silence
 from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
@@ -225,9 +226,14 @@ def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(
     assert [node.stop() for node in nodes] == [0, 0]
 
 
+def lose_patience() -> None:
+    """Have the node say sooner that a clock stands still."""
+    vars(silence)["_CLOCK_PATIENCE_S"] = 0.6
+
+
 def test_simulated_time_without_a_clock_is_told(start_node: StartNode, make_peer: MakePeer) -> None:
     """By name, in the log and on /diagnostics; a clock that comes, or another parameter, ends it."""
-    node = start_node("--ros-args", "-p", "use_sim_time:=true")
+    node = start_node("--ros-args", "-p", "use_sim_time:=true", prepare=lose_patience)
     peer = make_peer()
     peer.node.create_subscription(DiagnosticArray, "/diagnostics", peer.received["/diagnostics"].append, 10)
 
