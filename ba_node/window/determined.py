@@ -11,8 +11,8 @@ from ba_node.core.problem import Problem
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
-# Of the tracks that a keyframe shares with others this share has to have a place. If only few have, nothing shows
-# parallax, and they are mismatches or worse.
+# Of the tracks that a keyframe shares with others this share has to have a place where one camera sees them. If only
+# few have, nothing shows parallax, and they are mismatches or worse.
 _LEAST_PLACED = 0.3
 
 
@@ -39,7 +39,9 @@ def determined(
     views = np.bincount(obs.point[first], minlength=n_pt)
     shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
     known = np.bincount(obs.keyframe[first & usable & static & placed.take(obs.point)], minlength=n_kf)
-    mostly = known >= _LEAST_PLACED * shared
+    # Several cameras, or depths, place points where nothing moves: if they place few, that is for the guard to say.
+    metric = len(problem.cameras.model) > 1 or bool(np.isfinite(obs.depth_m).any())
+    mostly = np.full(n_kf, True) if metric else known >= _LEAST_PLACED * shared
     while True:
         used = usable & keep_pt.take(obs.point)
         keep_kf = mostly & (np.bincount(obs.keyframe, used & static, n_kf) >= MIN_OBSERVATIONS)
