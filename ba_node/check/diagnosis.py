@@ -136,10 +136,6 @@ class Diagnosis:
         }
 
 
-def _or_none(value: Any) -> Any:
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
 def angle(degrees: float) -> str:
     """Return an angle as precisely as it is usually known."""
     number = f"{degrees:.1f}" if degrees < 0.75 else f"{degrees:.0f}"
