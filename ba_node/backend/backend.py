@@ -34,7 +34,6 @@ from collections.abc import Callable, Iterable, Iterator
 
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
-from ba_node.backend.optimization import Optimization
 from ba_node.backend.summary import MapEnded
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
@@ -288,22 +287,21 @@ class Backend:
         merged = self.merge(begun)
         return merged[0] if merged else None
 
-    def begin_optimization(self) -> Optimization | str:
+    def begin_optimization(self) -> full.Optimization | str:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
-        taken = full.take_snapshot(self.scene, self.config)
-        return taken if isinstance(taken, str) else Optimization(taken)
+        return full.take_snapshot(self.scene, self.config)
 
-    def is_current(self, optimization: Optimization) -> bool:
+    def is_current(self, optimization: full.Optimization) -> bool:
         """Return True if a solve of everything is of the current map."""
-        return optimization.snapshot.scene is self.scene
+        return optimization.scene is self.scene
 
-    def merge(self, optimization: Optimization) -> tuple[Estimate, int] | None:
+    def merge(self, optimization: full.Optimization) -> tuple[Estimate, int] | None:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
 
         Returns:
             What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
         """
-        taken, result = optimization.snapshot, optimization.result
+        taken, result = optimization, optimization.result
         self.refusal = ""
         if not result.status.usable or not result.state.is_finite():
             return None
@@ -319,7 +317,7 @@ class Backend:
             return None
         self.solve_count += 1
         newest = int(self.scene.order[-1])
-        statistics = quality.statistics(taken.selection, result, found.norms) | dataclasses.asdict(verdict.health)
+        statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
         return self.estimate(), followed

@@ -24,7 +24,7 @@ from ba_node.core.problem import State
 from ba_node.estimate import Cloud, Correction, Estimate, Extras, Iteration, Poses, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import extras, quality
+from ba_node.window import quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -199,7 +199,7 @@ class CurrentMap:
             taking_part = _taking_part_of(self.scene, selection)
             if state is not None:
                 self.correct(int(taking_part[-1]))
-                extra = extras.work_out(wanted, self.scene, self.config, selection, state, taking_part)
+                extra = view.work_out(wanted, self.scene, self.config, selection, state, taking_part)
         self.scene.keyframes.solved[_reached(self.scene, due, end)] = True
         return dataclasses.replace(self.estimate(taking_part), **extra)
 
@@ -229,7 +229,7 @@ class CurrentMap:
         elif state is not None:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
-        statistics = quality.statistics(selection, tried.result, norms) | dataclasses.asdict(tried.health)
+        statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}
         self.report = dataclasses.replace(self.base_report(*which), **statistics, solve_time_s=tried.solve_time_s)

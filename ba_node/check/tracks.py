@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import cameras as camera_models
-from ba_node.core import geometry
 from ba_node.core.problem import Cameras
 from ba_node.scene.scene import Scene
 
@@ -145,10 +144,3 @@ def _rays(cameras: Cameras, camera: IntArray, uv: FloatArray) -> FloatArray:
 
 def _focal(cameras: Cameras) -> FloatArray:
     return np.asarray(np.sqrt(cameras.params[:, camera_models.FX] * cameras.params[:, camera_models.FY]))
-
-
-def relative(
-    rotation_a: FloatArray, position_a: FloatArray, rotation_b: FloatArray, position_b: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return ``x_b = R x_a + t`` between two poses that are given in a common frame."""
-    return geometry.compose(*geometry.inverse(rotation_b, position_b), rotation_a, position_a)

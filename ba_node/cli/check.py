@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    from ba_node.io.json_file import write_json  # noqa: PLC0415
+    from ba_node.io.files import write_json  # noqa: PLC0415
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
     require_folder(args.json)

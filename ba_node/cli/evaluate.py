@@ -37,8 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from ba_node.evaluation.metrics import absolute_error  # noqa: PLC0415
-    from ba_node.io.files import whole_file  # noqa: PLC0415
-    from ba_node.io.json_file import write_json  # noqa: PLC0415
+    from ba_node.io.files import whole_file, write_json  # noqa: PLC0415
     from ba_node.io.trajectory import read_tum  # noqa: PLC0415
 
     require_folder(args.json)

@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve."""
     from ba_node.io.bal import write_bal  # noqa: PLC0415
-    from ba_node.io.json_file import write_json  # noqa: PLC0415
+    from ba_node.io.files import write_json  # noqa: PLC0415
     from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
     from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
 

@@ -120,12 +120,21 @@ class Parameter:
         return self.check(next((choice.name for choice in self.allowed if value in choice.aliases), value))
 
 
-def option(default: Value, doc: str, *, choices: Iterable[str | Choice] = (), **details: Any) -> Any:
-    """Declare a field of a dataclass as an option; ``details`` are attributes of Parameter.
+def option(
+    default: Value,
+    doc: str,
+    *,
+    choices: Iterable[str | Choice] = (),
+    within: tuple[float, float] | None = None,
+    **details: Any,
+) -> Any:
+    """Declare a field of a dataclass as an option; ``details`` are attributes of Parameter, ``within`` two of them.
 
     ``node`` among them says that the option is a parameter of the node too, and which attributes differ there.
     """
     allowed = tuple(Choice(choice) if isinstance(choice, str) else choice for choice in choices)
+    if within is not None:
+        details["minimum"], details["maximum"] = within
     return field(default=default, metadata={"default": default, "doc": doc, "allowed": allowed, **details})
 
 

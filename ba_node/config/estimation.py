@@ -13,20 +13,14 @@ from ba_node.config.declaration import option
 class WindowConfig:
     """Which keyframes and tracks take part in a solve."""
 
-    max_keyframes: int = option(
-        20, "Newest keyframes whose poses are refined in each solve.", minimum=2, maximum=100_000
-    )
+    max_keyframes: int = option(20, "Newest keyframes whose poses are refined in each solve.", within=(2, 100_000))
     max_fixed_keyframes: int = option(
         20,
         "Older keyframes that see the window's points and take part with fixed poses; most shared tracks first.",
-        minimum=0,
-        maximum=100_000,
+        within=(0, 100_000),
     )
     max_landmarks: int = option(
-        5000,
-        "Points in a solve; beyond it those with the fewest observations are left out.",
-        minimum=10,
-        maximum=10_000_000,
+        5000, "Points in a solve; beyond it those with the fewest observations are left out.", within=(10, 10_000_000)
     )
 
 
@@ -34,28 +28,21 @@ class WindowConfig:
 class SceneConfig:
     """What is remembered."""
 
-    max_keyframes: int = option(
-        5000, "Keyframes kept; beyond it the oldest are forgotten.", minimum=10, maximum=10_000_000
-    )
+    max_keyframes: int = option(5000, "Keyframes kept; beyond it the oldest are forgotten.", within=(10, 10_000_000))
     max_landmarks: int = option(
-        500_000,
-        "Tracks kept; beyond it those seen longest ago are forgotten.",
-        minimum=100,
-        maximum=100_000_000,
+        500_000, "Tracks kept; beyond it those seen longest ago are forgotten.", within=(100, 100_000_000)
     )
     max_reorder_s: float = option(
         10.0,
         "Keyframes whose stamps are further than this before the newest begin a new session, as when the clock is set"
         " back, and one alone is rejected; closer ones are sorted in. One this far ahead waits for the next. 0: never.",
         unit="s",
-        minimum=0.0,
-        maximum=1e9,
+        within=(0.0, 1e9),
     )
     max_pending: int = option(
         200,
         "Track messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",
-        minimum=1,
-        maximum=100_000,
+        within=(1, 100_000),
     )
 
 
@@ -67,28 +54,22 @@ class TracksConfig:
         1.0,
         "Smallest angle between two viewing rays of a track for it to be triangulated.",
         unit="deg",
-        minimum=0.0,
-        maximum=90.0,
+        within=(0.0, 90.0),
     )
     max_triangulation_px: float = option(
         12.0,
         "Largest reprojection error, in sigmas, of a view that agrees where a point begins; half of it for two views.",
         unit="px",
-        minimum=0.1,
-        maximum=1e6,
+        within=(0.1, 1e6),
     )
     outlier_px: float = option(
         6.0,
         "Observations beyond this many sigmas (at least 4.4 x the median) sit out the next solve; 0 keeps all.",
         unit="px",
-        minimum=0.0,
-        maximum=1e6,
+        within=(0.0, 1e6),
     )
     depth_sigma_ratio: float = option(
-        0.02,
-        "Standard deviation of a measured depth, as a share of the depth.",
-        minimum=1e-6,
-        maximum=10.0,
+        0.02, "Standard deviation of a measured depth, as a share of the depth.", within=(1e-6, 10.0)
     )
 
 
@@ -98,31 +79,27 @@ class OdometryConfig:
 
     enabled: bool = option(True, "Let the steps count; they give one camera its scale, and hold what images do not.")
     sigma_m: float = option(
-        0.001, "Standard deviation of a step's translation along each axis at rest.", unit="m", minimum=0.0, maximum=1e6
+        0.001, "Standard deviation of a step's translation along each axis at rest.", unit="m", within=(0.0, 1e6)
     )
-    sigma_m_per_m: float = option(
-        0.01, "The same, added for each metre of the step.", unit="m/m", minimum=0.0, maximum=1e6
-    )
+    sigma_m_per_m: float = option(0.01, "The same, added for each metre of the step.", unit="m/m", within=(0.0, 1e6))
     sigma_rad: float = option(
-        0.001, "Standard deviation of a step's rotation about each axis at rest.", unit="rad", minimum=0.0, maximum=1e3
+        0.001, "Standard deviation of a step's rotation about each axis at rest.", unit="rad", within=(0.0, 1e3)
     )
     sigma_rad_per_m: float = option(
-        0.003, "The same, added for each metre of the step.", unit="rad/m", minimum=0.0, maximum=1e3
+        0.003, "The same, added for each metre of the step.", unit="rad/m", within=(0.0, 1e3)
     )
     sigma_rad_per_rad: float = option(
-        0.01, "The same, added for each radian of the step.", unit="rad/rad", minimum=0.0, maximum=1e3
+        0.01, "The same, added for each radian of the step.", unit="rad/rad", within=(0.0, 1e3)
     )
     max_inflation: float = option(
         10.0,
         "Standard deviations grow up to this many times where well-determined keyframes show the steps to be worse.",
-        minimum=1.0,
-        maximum=1e6,
+        within=(1.0, 1e6),
     )
     loss_scale: float = option(
         1.0,
         "Where Cauchy's loss leaves the square, in standard deviations: steps that are off by far more count little.",
-        minimum=1e-3,
-        maximum=1e6,
+        within=(1e-3, 1e6),
     )
 
 
@@ -142,50 +119,42 @@ class GuardConfig:
         0.03,
         "What the front-end's step between two keyframes is off at least: standard deviation along each axis.",
         unit="m",
-        minimum=1e-6,
-        maximum=1e6,
+        within=(1e-6, 1e6),
     )
     step_sigma_share: float = option(
-        0.1, "The same, as a share of the length of the step, on top of it.", minimum=1e-6, maximum=10.0
+        0.1, "The same, as a share of the length of the step, on top of it.", within=(1e-6, 10.0)
     )
-    turn_sigma_rad: float = option(
-        0.02, "The same for its turn, about each axis.", unit="rad", minimum=1e-6, maximum=1.0
-    )
-    turn_sigma_share: float = option(0.1, "The same, as a share of the turn, on top of it.", minimum=1e-6, maximum=10.0)
+    turn_sigma_rad: float = option(0.02, "The same for its turn, about each axis.", unit="rad", within=(1e-6, 1.0))
+    turn_sigma_share: float = option(0.1, "The same, as a share of the turn, on top of it.", within=(1e-6, 10.0))
     turn_sigma_rad_per_m: float = option(
-        0.02, "The same, for each metre of the step, on top of it.", unit="rad/m", minimum=0.0, maximum=10.0
+        0.02, "The same, for each metre of the step, on top of it.", unit="rad/m", within=(0.0, 10.0)
     )
     max_sigmas: float = option(
         5.0,
         "A step of a solution that is this many sigmas off the front-end's, and not borne out by tracks, is held.",
-        minimum=0.5,
-        maximum=1e6,
+        within=(0.5, 1e6),
     )
     max_typical_sigmas: float = option(
-        2.5, "A solution of which half the steps are this many sigmas off is held.", minimum=0.5, maximum=1e6
+        2.5, "A solution of which half the steps are this many sigmas off is held.", within=(0.5, 1e6)
     )
     max_scale_error: float = option(
         0.12,
         "A solution whose steps or turns are all longer or shorter than the front-end's by this share is held.",
-        minimum=1e-3,
-        maximum=1e6,
+        within=(1e-3, 1e6),
     )
     min_inlier_share: float = option(
         0.4,
         "A solution that fewer of its observations agree with (within tracks.outlier_px) is held.",
-        minimum=0.0,
-        maximum=1.0,
+        within=(0.0, 1.0),
     )
-    min_points: int = option(5, "A keyframe that sees fewer points of a solve is not refined.", minimum=2, maximum=1000)
+    min_points: int = option(5, "A keyframe that sees fewer points of a solve is not refined.", within=(2, 1000))
     held_out_tracks: int = option(
         16,
         "Tracks that a solution is tried on, at most one in 128 of which takes no part in it; 0: no trial.",
-        minimum=0,
-        maximum=10_000,
+        within=(0, 10_000),
     )
     max_worse_share: float = option(
         0.15,
         "A solution that explains these tracks worse than the front-end's poses by this share is held.",
-        minimum=0.0,
-        maximum=10.0,
+        within=(0.0, 10.0),
     )

@@ -69,8 +69,7 @@ class SolverConfig:
         1,
         "Threads of the C++ kernels, 0 for one a core. Results are the same, bit for bit, for any number;"
         " one leaves the other cores to the front-end.",
-        minimum=0,
-        maximum=256,
+        within=(0, 256),
         node={},
     )
     loss: str = option(
@@ -87,30 +86,27 @@ class SolverConfig:
         1.0,
         "Residual, in units of sigma, where the robust loss leaves the square.",
         unit="px",
-        minimum=1e-6,
-        maximum=1e6,
+        within=(1e-6, 1e6),
         aliases=("loss_scale", "gamma"),
         node={"default": 2.0},
     )
     max_iterations: int = option(
         50,
         "Cap on outer iterations of a solve, rejected ones included.",
-        minimum=1,
-        maximum=100_000,
+        within=(1, 100_000),
         node={"default": 12},
     )
     max_linear_iterations: int = option(
-        500, "Cap on PCG steps in one outer iteration.", minimum=1, maximum=1_000_000, aliases=("cap",), node={}
+        500, "Cap on PCG steps in one outer iteration.", within=(1, 1_000_000), aliases=("cap",), node={}
     )
     function_tolerance: float = option(
         1e-6,
         "Stop when an accepted step lowers the objective by less than this share.",
-        minimum=0.0,
-        maximum=1.0,
+        within=(0.0, 1.0),
         node={"default": 1e-3},
     )
     gradient_tolerance: float = option(
-        1e-9, "Stop when the norm of the gradient falls below this.", minimum=0.0, maximum=1e12, node={}
+        1e-9, "Stop when the norm of the gradient falls below this.", within=(0.0, 1e12), node={}
     )
     cheirality: str = option(
         "keep",
@@ -162,7 +158,7 @@ class SolverOptions(SolverConfig):
             Choice("fast", "as nielsen, but mu/5 where rho > 1/2, and mu/2 where rho > 1/4"),
         ),
     )
-    initial_damping: float = option(1e-4, "First mu.", minimum=0.0, maximum=1e100)
+    initial_damping: float = option(1e-4, "First mu.", within=(0.0, 1e100))
     gain_model: str = option(
         "undamped",
         "The reduction that the gain ratio rho expects of a step p.",
@@ -183,7 +179,7 @@ class SolverOptions(SolverConfig):
         aliases=("scaling",),
     )
     initial_radius: float = option(
-        1e4, "First radius of the region, in units of the scaled step.", minimum=1e-100, maximum=1e100
+        1e4, "First radius of the region, in units of the scaled step.", within=(1e-100, 1e100)
     )
     schur: str = option(
         "points",
@@ -209,18 +205,16 @@ class SolverOptions(SolverConfig):
     inner_iterations: int = option(
         3,
         "Newton steps of every point alone after each step of the keyframes; 0 for none.",
-        minimum=0,
-        maximum=1000,
+        within=(0, 1000),
         aliases=("polish_steps",),
     )
-    t_eps: float = option(0.1, "PCG stops at |r| <= min(t_eps, |b|) |b|.", minimum=0.0, maximum=1e100)
+    t_eps: float = option(0.1, "PCG stops at |r| <= min(t_eps, |b|) |b|.", within=(0.0, 1e100))
     q_eps: float = option(
         0.0,
         "PCG also stops where step i adds less than q_eps / i of what the model has gained; 0 for never.",
-        minimum=0.0,
-        maximum=1e100,
+        within=(0.0, 1e100),
     )
-    objective_tolerance: float = option(0.0, "Stop when the objective falls below this.", minimum=0.0, maximum=1e300)
+    objective_tolerance: float = option(0.0, "Stop when the objective falls below this.", within=(0.0, 1e300))
 
     @property
     def scaled_space(self) -> str:

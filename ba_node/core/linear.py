@@ -34,7 +34,7 @@ class Solution:
 
 
 def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Solution:
-    """Solve ``A x = b``, A dense (written over) or sparse; no solution if A is not symmetric positive definite."""
+    """Solve ``A x = b`` for symmetric positive definite A, dense (written over) or sparse; no solution if A is not."""
     try:
         if scipy.sparse.issparse(matrix):
             factor = scipy.sparse.linalg.splu(
@@ -76,9 +76,6 @@ def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limit
     boundary, or without a region stays where it is.
 
     ``product`` is x -> A x, ``precondition`` r -> M^-1 r. The solution is never NaN.
-
-    Returns:
-        The solution; never NaN.
     """
     x = np.zeros_like(rhs)
     norm_b = float(np.linalg.norm(rhs))

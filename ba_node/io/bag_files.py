@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ba_node.io.bag_errors import BagError
+from ba_node.io.bag_topics import BagError
 from ba_node.io.files import FileKindError, open_regular
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for, pieces
 from ba_node.io.yaml_file import YamlError, read_yaml

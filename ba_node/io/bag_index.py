@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema
 
-from ba_node.io.bag_errors import BagError, EmptyBagError
+from ba_node.io.bag_topics import BagError, EmptyBagError
 from ba_node.io.unpack import unpack
 
 MAGIC = b"\x89MCAP0\r\n"

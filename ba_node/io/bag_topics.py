@@ -15,12 +15,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ba_node.io.bag_errors import BagError
 from ba_node.measurements import CameraRig
 from ba_node.messages.topics import CAMERAS, INPUT_TYPES
 
 # Numbers of a camera that differ by less than this, relative or px, are the same: they may have gone through a text.
 _SAME = 1e-3
+
+
+class BagError(ValueError):
+    """A recording that cannot be read or written: empty, truncated, not MCAP, without the topics that are needed."""
+
+
+class EmptyBagError(BagError):
+    """A file of a recording that is whole and holds no message, as a recorder may leave the last of several."""
 
 
 @dataclass(frozen=True)

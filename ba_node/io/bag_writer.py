@@ -12,7 +12,7 @@ from typing import Any
 from mcap.writer import CompressionType, Writer
 
 from ba_node.io import ros_types
-from ba_node.io.bag_errors import BagError
+from ba_node.io.bag_topics import BagError
 from ba_node.io.files import whole_file
 
 # The form in which rosbag2 of Jazzy (metadata version 9) stores the profile of a publisher; the durations are

@@ -12,10 +12,12 @@ import contextlib
 import errno
 import fcntl
 import io
+import json
+import math
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -129,6 +131,23 @@ def open_regular(path: Path | str, max_bytes: int) -> IO[bytes]:
         os.close(descriptor)
         raise
     return os.fdopen(descriptor, "rb")
+
+
+def write_json(path: Path | str, content: Mapping[str, Any]) -> None:
+    """Write JSON that every reader takes: null for infinity and NaN, which JSON does not have."""
+    text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
+    with whole_file(path) as stream:
+        stream.write(f"{text}\n".encode())
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def _require_regular(path: Path | str, found: os.stat_result, max_bytes: int) -> None:

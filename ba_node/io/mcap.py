@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from ba_node.io import ros_types
-from ba_node.io.bag_errors import BagError, EmptyBagError
 from ba_node.io.bag_files import PACKED, find_files, unpack_file
 from ba_node.io.bag_index import MAX_CHUNK_BYTES, Message, merge_by_time
 from ba_node.io.bag_source import BagChannel, Source, open_source
-from ba_node.io.bag_topics import NO_CHOICE, Chooser, Chosen, TopicChoice
+from ba_node.io.bag_topics import NO_CHOICE, BagError, Chooser, Chosen, EmptyBagError, TopicChoice
 from ba_node.io.bag_writer import BagWriter
 from ba_node.io.ros_types import ROSBAGS_FACTORY, TypeMismatchError
 from ba_node.io.unpack import ZSTD_MAGIC, unpack
@@ -94,7 +93,7 @@ class BagReader:
         self._stack.close()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield (topic, type, log time in ns, CDR bytes) of some topics (None: all), by log time, then as in the file.
+        """Yield (topic, type, log time in ns, CDR bytes) of topics (None: all) by log time, then place in the file.
 
         Raises:
             BagError: nothing of the recording can be read after all.

@@ -22,8 +22,7 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.io.files import locked_folder, whole_file
-from ba_node.io.json_file import write_json
+from ba_node.io.files import locked_folder, whole_file, write_json
 from ba_node.io.map_file import load_map, map_name, write_map
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter, TopicChoice
 from ba_node.io.parameters import NODE_NAME, parameters_yaml

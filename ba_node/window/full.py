@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from ba_node.core import geometry, methods, native_kernels, solver
 from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
 from ba_node.scene.scene import Scene
+from ba_node.window import quality
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
@@ -45,6 +46,18 @@ _FUNCTION_TOLERANCE = 1e-6
 _MIN_POINTS = 3
 # Windows are not to wait long for it.
 _MAX_JOINED = 100
+# What is told of it.
+_TOLD = (
+    "method",
+    "iterations",
+    "objective_before",
+    "objective_after",
+    "rms_px_before",
+    "rms_px_after",
+    "keyframes",
+    "landmarks",
+    "observations",
+)
 
 
 def options(config: SolverConfig, method: str = "", max_iterations: int = 0) -> SolverOptions:
@@ -59,16 +72,9 @@ def options(config: SolverConfig, method: str = "", max_iterations: int = 0) -> 
     return methods.from_config(changed)
 
 
-class Solved(NamedTuple):
-    """What the solver made of a snapshot, and the sizes of the residuals after it, as ``Selection.norms``."""
-
-    result: Result
-    norms: FloatArray
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The problem of everything that was kept at a moment, and by which ids to find its parts again.
+@dataclass
+class Optimization:
+    """A solve of everything that was kept at a moment, with the ids by which to find its parts again.
 
     Attributes:
         scene: where it is from; asked only whether it is still the current one.
@@ -77,6 +83,7 @@ class Snapshot:
         track_id: (n_pt,) uint64.
         placed: (n_pt,) True where the point had a position.
         position: (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it.
+        solved: result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`.
     """
 
     scene: Scene
@@ -85,18 +92,38 @@ class Snapshot:
     track_id: IdArray
     placed: BoolArray
     position: FloatArray
+    solved: tuple[Result, FloatArray] | None = None
 
     def solve(
         self,
-        chosen: SolverOptions,
+        config: SolverConfig,
+        method: str = "",
+        max_iterations: int = 0,
         *,
         clock: Callable[[], float] = lambda: 0.0,
         on_iteration: Callable[[Iteration], bool] | None = None,
-    ) -> Solved:
-        """Solve, on any thread. The scene is not touched."""
+    ) -> None:
+        """Solve, on any thread; the map is not touched. Arguments as of :func:`options` and ``solver.solve``."""
+        chosen = options(config, method, max_iterations)
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration)
-        whole = dataclasses.replace(self.selection.problem, observations=self.selection.observations)
-        return Solved(result, native_kernels.residual_norms(whole, result.state, chosen.kernels))
+        self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
+
+    @property
+    def result(self) -> Result:
+        """Return what the solver gave back."""
+        assert self.solved is not None, "solve() comes first"
+        return self.solved[0]
+
+    def with_result(self, **changes: Any) -> Optimization:
+        """Return the same with another result of the solver: other words, for example, for why it stopped."""
+        assert self.solved is not None, "solve() comes first"
+        return dataclasses.replace(self, solved=(dataclasses.replace(self.result, **changes), self.solved[1]))
+
+    def statistics(self) -> dict[str, Any]:
+        """Return how the solve went, by the names of a report."""
+        assert self.solved is not None, "solve() comes first"
+        statistics = quality.statistics(self.selection, *self.solved)
+        return {name: statistics[name] for name in _TOLD}
 
     def outcome(self, state: State, config: Config) -> Merged:
         """Return a solution in the scale of the map, with its points where they may be published."""
@@ -118,7 +145,7 @@ class _Similarity:
         return np.asarray(self.scale[which, None] * turned + self.translation[which])
 
 
-def take_snapshot(scene: Scene, config: Config) -> Snapshot | str:
+def take_snapshot(scene: Scene, config: Config) -> Optimization | str:
     """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
@@ -127,7 +154,7 @@ def take_snapshot(scene: Scene, config: Config) -> Snapshot | str:
     problem = selection.problem
     fixed = _fixed(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
-    return Snapshot(
+    return Optimization(
         scene,
         selection,
         scene.keyframes.keyframe_id[selection.keyframes],
@@ -152,8 +179,8 @@ def _fixed(fixed: BoolArray, unscaled: IntArray, position: FloatArray) -> BoolAr
     return more
 
 
-def merge_snapshot(scene: Scene, config: Config, taken: Snapshot, state: State) -> int | None:
-    """Merge the result for a snapshot, in the scale of the map (``Snapshot.outcome``), into the map.
+def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: State) -> int | None:
+    """Merge the result for a snapshot, in the scale of the map (``Optimization.outcome``), into the map.
 
     Returns:
         How many refined keyframes that are not of the snapshot followed; None if nothing of the snapshot is left.
@@ -206,7 +233,7 @@ def _join(scene: Scene, config: Config, later: int) -> None:
 
 def _corrections(
     scene: Scene,
-    taken: Snapshot,
+    taken: Optimization,
     result: tuple[FloatArray, FloatArray, FloatArray],
     keyframes: IntArray,
     landmarks: IntArray,

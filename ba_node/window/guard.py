@@ -48,31 +48,19 @@ _MAX_HELD_SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class Health:
-    """Figures of a solve for the report; see ``ba_msgs/SolverReport``."""
-
-    inlier_share: float = 0.0
-    parallax_deg: float = 0.0
-    held_out_px_before: float = 0.0
-    held_out_px_after: float = 0.0
-    weakest_m: float = 0.0
-    weakest_rad: float = 0.0
-
-
-@dataclass(frozen=True)
 class Verdict:
     """What is to become of a solution.
 
     Attributes:
         reason: why it is held, in words; empty if it may be taken.
-        health: figures for the report.
+        health: what ``ba_msgs/SolverReport`` tells of it, by name.
         keyframes: rows in the scene of keyframes that alone are wrong: without them it may be worth another solve.
         odd: steps that need another solve to agree.
         systematic: a window that is wrong as a whole, not a part of it.
     """
 
     reason: str = ""
-    health: Health = field(default_factory=Health)
+    health: dict[str, float] = field(default_factory=dict)
     keyframes: tuple[int, ...] = ()
     odd: Odd | None = None
     systematic: bool = False
@@ -87,12 +75,13 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     agrees = found.norms <= gate
     share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
     sigma = median(selection.observations.sigma_px[:: 1 + len(found.norms) // _LOOKED_AT])
-    health = Health(
-        inlier_share=share,
-        parallax_deg=float(np.degrees(found.explained.parallax_rad)),
-        held_out_px_before=found.explained.held_out[0] * sigma,
-        held_out_px_after=found.explained.held_out[1] * sigma,
-    )
+    held_out = found.explained.held_out * sigma
+    health = {
+        "inlier_share": share,
+        "parallax_deg": float(np.degrees(found.explained.parallax_rad)),
+        "held_out_px_before": float(held_out[0]),
+        "held_out_px_after": float(held_out[1]),
+    }
     if not config.guard.enabled:
         return Verdict(health=health)
     compared = _Compared.of(config, selection, found.state, found.norms)
@@ -214,7 +203,7 @@ class _Compared:
             )
         return ""
 
-    def verdict(self, health: Health, confirmed: Odd | None) -> Verdict:
+    def verdict(self, health: dict[str, float], confirmed: Odd | None) -> Verdict:
         """Return what is to become of a solution that is right as a whole."""
         limit = self.config.guard.max_sigmas
         odd = self.off.sigmas > limit

@@ -1,16 +1,42 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Say what there is to see of a solved window: what was free, how well each keyframe fits, and who sees the same."""
+"""Work out what somebody looks at beside the estimate: covariances, and what there is to see of a solved window."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray
-from ba_node.core import cameras, geometry, objective
+from ba_node.config import Config
+from ba_node.core import cameras, geometry, methods, objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.estimate import WindowView
+from ba_node.estimate import Extras, WindowView
+from ba_node.scene.scene import Scene
+from ba_node.window.covariance import covariances
+from ba_node.window.selection import Selection
+
+
+def work_out(
+    wanted: Extras, scene: Scene, config: Config, selection: Selection, state: State, refined: IntArray
+) -> dict[str, Any]:
+    """Return what is wanted of a solution in the scale of the map, by the names of its fields in Estimate.
+
+    ``refined`` are rows of the keyframes of the estimate, oldest first, and so are the rows of the results.
+    """
+    places = scene.places()
+    place = np.searchsorted(places[refined], places[selection.keyframes])
+    found: dict[str, Any] = {}
+    if wanted.covariance:
+        measured = scene.keyframes.input_position[selection.keyframes]
+        found["covariance"] = np.full((len(refined), 6, 6), np.nan)
+        found["covariance"][place] = covariances(selection, state, measured, methods.from_config(config.solver))
+    if wanted.view:
+        good = ~scene.observations.outlier[selection.rows[selection.inlier]]
+        found["view"] = view(selection.problem, state, good, place, len(refined))
+    return found
 
 
 def view(problem: Problem, state: State, good: BoolArray, place: IntArray, n: int) -> WindowView:

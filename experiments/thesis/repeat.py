@@ -9,7 +9,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from ba_node.io.json_file import write_json
+from ba_node.io.files import write_json
 from experiments.thesis.claims import CLAIMS
 from experiments.thesis.experiments import Experiment
 from experiments.thesis.findings import FINDINGS

@@ -15,7 +15,7 @@ from typing import Any
 
 from ba_node.core.result import Iteration, Result
 from ba_node.core.solver import solve
-from ba_node.io.json_file import write_json
+from ba_node.io.files import write_json
 from ba_node.offline.solver_settings import describe
 from experiments.thesis import final_state, measures
 from experiments.thesis.problems import NAMES, Library, Posed

@@ -14,55 +14,51 @@ from ba_node.config import Checked, ConfigError, option
 class SphereOptions(Checked):
     """What to make. A value of the wrong type or out of range raises ConfigError."""
 
-    seed: int = option(0, "Seed of every random number.", minimum=0, maximum=2**32 - 1)
-    images: int = option(10, "Number of images, each with a camera of its own.", minimum=2, maximum=10_000)
-    points: int = option(253, "Number of points, each seen in two images or more.", minimum=10, maximum=1_000_000)
+    seed: int = option(0, "Seed of every random number.", within=(0, 2**32 - 1))
+    images: int = option(10, "Number of images, each with a camera of its own.", within=(2, 10_000))
+    points: int = option(253, "Number of points, each seen in two images or more.", within=(10, 1_000_000))
     observations: int = option(
         0,
         "Number of observations, a random choice of what is visible; 0 for all of it.",
-        minimum=0,
-        maximum=100_000_000,
+        within=(0, 100_000_000),
     )
-    radius: float = option(500.0, "Radius of the sphere, in units of length.", minimum=1e-3, maximum=1e6)
+    radius: float = option(500.0, "Radius of the sphere, in units of length.", within=(1e-3, 1e6))
     focal_px: float = option(
-        350.0, "Mean focal length; as a number it is best below the radius.", unit="px", minimum=10.0, maximum=1e5
+        350.0, "Mean focal length; as a number it is best below the radius.", unit="px", within=(10.0, 1e5)
     )
     camera_spread: float = option(
-        1.0, "How much f, k1 and k2 differ between images; 0: one camera took all.", minimum=0.0, maximum=10.0
+        1.0, "How much f, k1 and k2 differ between images; 0: one camera took all.", within=(0.0, 10.0)
     )
-    near: float = option(1.6, "Least distance of a camera from the centre, in radii.", minimum=1.05, maximum=100.0)
-    far: float = option(2.0, "Largest distance of a camera from the centre, in radii.", minimum=1.05, maximum=100.0)
+    near: float = option(1.6, "Least distance of a camera from the centre, in radii.", within=(1.05, 100.0))
+    far: float = option(2.0, "Largest distance of a camera from the centre, in radii.", within=(1.05, 100.0))
     cone_deg: float = option(
         15.0,
         "Cameras lie within this angle of one axis: the larger, the fewer images see a point; 180 for all round.",
         unit="deg",
-        minimum=1.0,
-        maximum=180.0,
+        within=(1.0, 180.0),
     )
     tilt_deg: float = option(
-        15.0, "Largest angle between optical axis and ray to the centre.", unit="deg", minimum=0.0, maximum=30.0
+        15.0, "Largest angle between optical axis and ray to the centre.", unit="deg", within=(0.0, 30.0)
     )
     min_image_points: int = option(
-        20, "An image with fewer observations is dropped, and another one taken.", minimum=6, maximum=1_000_000
+        20, "An image with fewer observations is dropped, and another one taken.", within=(6, 1_000_000)
     )
     min_image_area: float = option(
-        0.25, "So is one whose observations span a smaller share of 800 x 600 px.", minimum=0.0, maximum=0.95
+        0.25, "So is one whose observations span a smaller share of 800 x 600 px.", within=(0.0, 0.95)
     )
     noise_px: float = option(
-        0.17, "Standard deviation of the Gaussian noise on u and v.", unit="px", minimum=0.0, maximum=100.0
+        0.17, "Standard deviation of the Gaussian noise on u and v.", unit="px", within=(0.0, 100.0)
     )
-    outlier_share: float = option(0.0, "Share of observations displaced by 10 to 60 px.", minimum=0.0, maximum=0.9)
+    outlier_share: float = option(0.0, "Share of observations displaced by 10 to 60 px.", within=(0.0, 0.9))
     start_rotation_deg: float = option(
-        1.0, "Error of a rotation at the start, about each axis.", unit="deg", minimum=0.0, maximum=90.0
+        1.0, "Error of a rotation at the start, about each axis.", unit="deg", within=(0.0, 90.0)
     )
     start_translation: float = option(
-        0.01, "Error of a translation at the start, along each axis, in radii.", minimum=0.0, maximum=10.0
+        0.01, "Error of a translation at the start, along each axis, in radii.", within=(0.0, 10.0)
     )
-    start_point: float = option(
-        0.015, "Error of a point at the start, along each axis, in radii.", minimum=0.0, maximum=10.0
-    )
+    start_point: float = option(0.015, "Error of a point at the start, along each axis, in radii.", within=(0.0, 10.0))
     start_focal: float = option(
-        0.01, "Error of a focal length at the start, as a share of it; k1 and k2 start at 0.", minimum=0.0, maximum=0.5
+        0.01, "Error of a focal length at the start, as a share of it; k1 and k2 start at 0.", within=(0.0, 0.5)
     )
 
     def __post_init__(self) -> None:

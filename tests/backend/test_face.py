@@ -85,7 +85,7 @@ def test_everything_is_solved_in_one_call_as_in_three() -> None:
     assert estimate.report.status is Status.CONVERGED
     assert estimate.trajectory.position.tobytes() == merged[0].trajectory.position.tobytes()
     statistics = begun.statistics()
-    assert statistics["keyframes"] + int(begun.snapshot.selection.problem.fixed.sum()) == N
+    assert statistics["keyframes"] + int(begun.selection.problem.fixed.sum()) == N
     assert statistics["objective_after"] <= statistics["objective_before"]
     three.reset()
     assert not three.is_current(begun) and three.merge(begun) is None

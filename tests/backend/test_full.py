@@ -73,9 +73,9 @@ def objectives(backend: Backend, of: Optimization, seen_by: Optimization) -> tup
 
     The few points that have lost their place since are left out of both, and keyframes that are not in ``seen_by``.
     """
-    scene, selection = backend.scene, of.snapshot.selection
-    keyframes = scene.find_keyframes(of.snapshot.keyframe_id)
-    landmarks = scene.find_landmarks(of.snapshot.track_id)
+    scene, selection = backend.scene, of.selection
+    keyframes = scene.find_keyframes(of.keyframe_id)
+    landmarks = scene.find_landmarks(of.track_id)
     placed = scene.landmarks.has_position[landmarks]
     assert placed.mean() > 0.97, f"{np.count_nonzero(~placed)} points of {len(placed)} have lost their place"
     poses = geometry.inverse(
@@ -83,7 +83,7 @@ def objectives(backend: Backend, of: Optimization, seen_by: Optimization) -> tup
     )
     points = np.nan_to_num(scene.landmarks.position[landmarks] - selection.origin)
     observations = selection.problem.observations
-    counted = np.isin(of.snapshot.keyframe_id, seen_by.snapshot.keyframe_id)[observations.keyframe]
+    counted = np.isin(of.keyframe_id, seen_by.keyframe_id)[observations.keyframe]
     problem = some_observations(selection.problem, np.flatnonzero(counted & placed[observations.point]))
     now = dataclasses.replace(problem.start, rotation=poses[0], translation=poses[1], points=points)
     chosen = full.options(backend.config.solver, max_iterations=1)
@@ -135,7 +135,7 @@ def test_a_floating_scale_does_not_shrink_the_map() -> None:
     data, backend = recording(baseline_m=0.0), Backend(CONFIG)
     feed(backend, (m for _, _, m in data.timeline()))
     taken = optimised(backend, [])
-    start, state = taken.snapshot.selection.problem.start, taken.result.state
+    start, state = taken.selection.problem.start, taken.result.state
     before, after = (
         np.linalg.norm(np.diff(geometry.inverse(s.rotation, s.translation)[1], axis=0), axis=1).sum()
         for s in (start, state)
@@ -173,7 +173,7 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     def moved(positions: np.ndarray) -> np.ndarray:
         return np.asarray(scale * positions @ turn.T + shift)
 
-    snapshot, scene = taken.snapshot, backend.scene
+    snapshot, scene = taken, backend.scene
     chosen = snapshot.selection
     rotation, position = scene.keyframes.rotation[chosen.keyframes], scene.keyframes.position[chosen.keyframes]
     state = dataclasses.replace(
@@ -223,7 +223,7 @@ def test_forgotten_keyframes_are_passed_over() -> None:
     late = late[: len(late) * 2 // 3]
     feed(backend, early)
     taken = optimised(backend, late)
-    known = backend.scene.find_keyframes(taken.snapshot.keyframe_id)
+    known = backend.scene.find_keyframes(taken.keyframe_id)
     assert (known < 0).any()
     assert (known >= 0).any()
     reference = everything(backend)
@@ -238,7 +238,7 @@ def test_when_nothing_of_it_is_left_nothing_changes() -> None:
     early, late = cut(data, 10)
     feed(backend, early)
     taken = optimised(backend, late)
-    assert (backend.scene.find_keyframes(taken.snapshot.keyframe_id) < 0).all()
+    assert (backend.scene.find_keyframes(taken.keyframe_id) < 0).all()
     before = backend.estimate().trajectory.position
     assert backend.merge(taken) is None
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before)

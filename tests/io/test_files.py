@@ -18,8 +18,7 @@ from pathlib import Path
 import pytest
 
 from ba_node.io import files
-from ba_node.io.files import FileKindError, FolderInUseError, locked_folder, open_regular, whole_file
-from ba_node.io.json_file import write_json
+from ba_node.io.files import FileKindError, FolderInUseError, locked_folder, open_regular, whole_file, write_json
 
 
 def names(folder: Path) -> list[str]:

@@ -16,7 +16,7 @@ from ba_node.ros import qos
 from ba_node.ros.components import publishing
 from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
-from ba_node.window import extras
+from ba_node.window import view
 
 pytestmark = pytest.mark.dds
 
@@ -28,7 +28,7 @@ def tell_of_work() -> None:
     """Have the node say what it works out and what it builds."""
 
     def telling(name: str) -> Callable[..., Any]:
-        work = getattr(extras, name)
+        work = getattr(view, name)
 
         def tell(*arguments: Any) -> Any:
             print("works out", name, flush=True)
@@ -37,7 +37,7 @@ def tell_of_work() -> None:
         return tell
 
     for name in ("covariances", "view"):
-        setattr(extras, name, telling(name))
+        setattr(view, name, telling(name))
     build = output_messages
 
     def tell_topics(*arguments: Any) -> Any:
