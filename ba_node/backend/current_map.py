@@ -241,6 +241,7 @@ class CurrentMap:
         if self._trust.lost and self._young():
             self.scene.forget_solutions()
             self.correction = MapCorrection()
+            self.correct(int(self.scene.order[-1]))
             text = f"solutions are held, and what was taken before is given up: {reason}"
         self.scene.log.warn("held", text)
 

@@ -36,6 +36,13 @@ MAX_WAITING_BYTES = 2**29
 _HEAD = struct.Struct("<BQ")
 # channel, number, log time, publish time in front of a message's bytes
 _MESSAGE = struct.Struct("<HIQQ")
+# How files begin that are taken for a recording -> what to do with them.
+_OTHERS = {
+    b"\x28\xb5\x2f\xfd": "; it is packed with zstd: unpack it, or name it .mcap.zstd",
+    b"\x1f\x8b": "; it is packed with gzip: unpack it",
+    b"PK\x03\x04": "; it is a zip archive: unpack it",
+    b"#ROSBAG": "; it is a recording of ROS 1: convert it, with rosbags-convert for one",
+}
 _COMPRESSIONS = ("", "lz4", "zstd")
 
 
@@ -101,8 +108,10 @@ def read_index(stream: IO[bytes], size: int) -> BagIndex:
     """
     if size == 0:
         raise BagError("the file is empty (0 bytes)")
-    if stream.read(len(MAGIC)) != MAGIC:
-        raise BagError("not an MCAP file: it does not begin with the MCAP magic bytes")
+    begin = stream.read(len(MAGIC))
+    if begin != MAGIC:
+        other = next((what for magic, what in _OTHERS.items() if begin.startswith(magic)), "")
+        raise BagError(f"not an MCAP file: it does not begin with the MCAP magic bytes{other}")
     index = _from_summary(stream, size) or _from_records(stream, size)
     if index.message_count == 0:
         if not index.problems:

@@ -63,7 +63,7 @@ class Explained:
     """How well two sets of poses explain the tracks: of all cameras together, then of each alone.
 
     Attributes:
-        held_out: (2,) median of the residuals of the tracks that took no part, sigmas; 0 without any.
+        held_out: (2,) median of the residuals of the tracks that took no part, sigmas; 0 without parallax.
         mean: (2, 1 + n_cam) of the residuals of all, each bounded, sigmas; NaN where there are too few.
         parallax_rad: median over the tracks of the largest angle between two rays, by the second set of poses.
         points: (n_out, 3) those that took no part, by the second set of poses, m.
@@ -147,7 +147,7 @@ class Trial:
         count = np.bincount(self._of[rows], minlength=n)
         sums = [np.bincount(self._of[rows], np.minimum(norm[rows], _BOUND), n) for norm in norms]
         mean = np.where(count >= _MIN_RESIDUALS, np.array(sums) / np.maximum(count, 1), np.nan)
-        out = np.flatnonzero(self._counts.take(self._group) & (self._group < self._n_out))
+        out = rows[self._group[rows] < self._n_out]
         return Explained(
             np.array([min(median(norm[out]), _BEHIND) if len(out) else 0.0 for norm in norms]),
             mean,

@@ -141,6 +141,22 @@ def test_a_recording_without_messages_is_an_error(tmp_path: Path) -> None:
         read(tmp_path / "t.mcap", stream.getvalue())
 
 
+@pytest.mark.parametrize(
+    ("begin", "words"),
+    [
+        (b"\x28\xb5\x2f\xfd", "packed with zstd: unpack it, or name it .mcap.zstd"),
+        (b"\x1f\x8b\x08", "packed with gzip"),
+        (b"PK\x03\x04", "a zip archive"),
+        (b"#ROSBAG V2.0\n", "a recording of ROS 1: convert it"),
+        (b"something else", "magic bytes$"),
+    ],
+)
+def test_what_a_file_is_instead_is_named(begin: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "other.mcap").write_bytes(begin + bytes(100))
+    with pytest.raises(BagError, match=words), BagReader(tmp_path / "other.mcap"):
+        pass
+
+
 def test_unknown_compression_is_named(tmp_path: Path) -> None:
     builder = RecordBuilder()
     Chunk("brotli", b"abc", 1, 0, 0, 3).write(builder)
