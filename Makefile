@@ -7,8 +7,8 @@ PYTHON ?=
 ARGS ?=
 
 RUN := .venv/bin/python
-# Two at a time; each file stays in one process, so that what its tests share is made once.
-PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadfile
+# Two at a time, grouped by tests/conftest.py.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadgroup
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 STYLED := $(CHECKED) examples
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')

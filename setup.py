@@ -9,8 +9,10 @@ BA_NODE_TARGETS=baseline,avx2 builds some of them, BA_NODE_WERROR=1 makes the co
 
 import os
 import platform
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +21,6 @@ from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 from setuptools.command.develop import develop
 from setuptools.command.install import install
-from setuptools.modified import newer_group
 
 NAME, MESSAGES = "ba_node", "ba_msgs"
 SOURCES = Path(NAME) / "native" / "src"
@@ -71,20 +72,25 @@ def units() -> list[Unit]:
     return listed
 
 
+def is_out_of_date(made: Path, sources: Iterable[str]) -> bool:
+    """Return True if a file is missing or older than one that it is made of."""
+    return not made.exists() or any(Path(source).stat().st_mtime > made.stat().st_mtime for source in sources)
+
+
 class BuildKernels(build_ext):
     """Compiles each unit with flags of its own, on all cores."""
 
     def build_extension(self, ext: Extension) -> None:
         """Compile and link the kernels."""
-        # Python's own flags ask for debug information, which is most of the size.
-        debug = [] if "-g" in os.environ.get("CXXFLAGS", "") else ["-g0"]
+        # Python's own flags ask for debug information, which is most of the size. Those that are given come last.
+        given = shlex.split(os.environ.get("CXXFLAGS", ""))
         strict = ["-Werror"] if os.environ.get("BA_NODE_WERROR", "0") not in ("", "0") else []
 
         def compiled(unit: Unit) -> str:
             source, folder = str(SOURCES / unit.source), str(Path(self.build_temp) / unit.folder)
             (result,) = self.compiler.object_filenames([source], output_dir=folder)
-            if self.force or newer_group([source, __file__, *ext.depends], result):
-                flags = [*debug, *flags_of("common"), *unit.flags, *strict]
+            if self.force or is_out_of_date(Path(result), [source, __file__, *ext.depends]):
+                flags = ["-g0", *flags_of("common"), *unit.flags, *strict, *given]
                 self.compiler.compile([source], folder, include_dirs=ext.include_dirs, extra_postargs=flags)
             return str(result)
 
@@ -173,7 +179,7 @@ class Develop(develop):
 setup(
     name=NAME,
     cmdclass={"build_ext": BuildKernels, "develop": Develop, "install": Install},
-    version="0.1.0",
+    version="0.2.0",
     description="Bundle-adjustment back-end for ROS 2",
     maintainer="The ba_node Authors",
     maintainer_email="maintainers@example.com",

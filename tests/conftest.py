@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from ba_node.cli import checkout
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.io.mcap import BagReader
 from ba_node.io.trajectory import read_tum
@@ -20,9 +21,24 @@ from ba_node.messages.report import LatencyReport, QueueReport, Report
 
 _ROOT = Path(__file__).resolve().parent.parent
 
+# Of a package that was installed elsewhere the experiments are those beside its tests.
+checkout.ROOT = _ROOT
+
 # The same examples in every run, and no verdict by the clock: a loaded machine is not a fault.
 settings.register_profile("ba_node", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("ba_node")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Group tests for pytest-xdist: a process runs all that talk over DDS, and each other file as a whole.
+
+    Two nodes that start at the same time are slow to find each other; what the tests of a file share is made once.
+    """
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
+    for item in items:
+        talks = item.get_closest_marker("dds") is not None or _ROOT / "tests" / "ros" in item.path.parents
+        item.add_marker(pytest.mark.xdist_group("dds" if talks else str(item.path)))
 
 
 @pytest.fixture(scope="session")

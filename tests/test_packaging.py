@@ -67,6 +67,17 @@ def test_versions_agree() -> None:
     assert len(versions) == 1, f"package.xml, msg_defs/package.xml, setup.py and ba_node differ: {versions}"
 
 
+@pytest.mark.filterwarnings("ignore:nodes.Node.traverse:DeprecationWarning")  # catkin_pkg's call of docutils
+@pytest.mark.parametrize("folder", [".", "msg_defs"])
+def test_changelog_ends_with_this_version(folder: str) -> None:
+    changelog = pytest.importorskip("catkin_pkg.changelog")
+    read = changelog.get_changelog_from_path(ROOT / folder / "CHANGELOG.rst")
+    # Newest first; what comes next is gathered under Forthcoming, which is no version.
+    assert "\nForthcoming\n" in (ROOT / folder / "CHANGELOG.rst").read_text()
+    version, date, items = next(iter(read.foreach_version()))
+    assert (version, date is None, bool(items)) == (ba_node.__version__, False, True)
+
+
 @pytest.mark.parametrize("script", console_scripts())
 def test_console_script_exists(script: str) -> None:
     module, function = script.split(" = ")[1].split(":")

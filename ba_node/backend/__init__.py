@@ -5,8 +5,7 @@
 from ba_node.backend.archive import MapState
 from ba_node.backend.backend import FINISHED_KEPT, Admitted, Backend, Check
 from ba_node.backend.current_map import CurrentMap, can_examine
-from ba_node.backend.replay import MapEnded
-from ba_node.backend.summary import MapSummary
+from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.window.full import Optimization

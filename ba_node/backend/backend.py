@@ -34,7 +34,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
-from ba_node.backend.replay import MapEnded, replay
+from ba_node.backend.summary import MapEnded
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
 from ba_node.core.problem import Cameras
@@ -129,6 +129,11 @@ class Backend:
     def rejection_notes(self) -> deque[str]:
         """Return the last rejections in words, oldest first."""
         return self.scene.log.notes
+
+    @property
+    def rejection_cause(self) -> str:
+        """Return the first case of what was turned away by itself, in words; empty if nothing was."""
+        return self.scene.log.cause()
 
     @property
     def ready(self) -> bool:
@@ -237,7 +242,30 @@ class Backend:
             Every estimate; every keyframe that the map has now, as it came; and what became of a map when another one
             took its place, before the first keyframe of that.
         """
-        return replay(self, stream)
+        for measurement in stream:
+            for admitted in self.admit(measurement):
+                yield from self._taken(admitted)
+        for admitted in self.admit_rest():
+            yield from self._taken(admitted)
+        self.flush(final=True)
+        while self.ready:
+            yield from self._solved()
+
+    def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
+        if self.completes(admitted):
+            yield from self._solved()
+        before = self.map
+        self.take(admitted)
+        if self.map is not before:
+            yield MapEnded(before.summary(), admitted.begins is not None and admitted.begins.replaces)
+        one = admitted.measurement
+        if isinstance(one, Keyframe) and self.scene.find_keyframe(one.keyframe_id) is not None:
+            yield one
+
+    def _solved(self) -> Iterator[Estimate]:
+        estimate = self.solve()
+        if estimate is not None:
+            yield estimate
 
     def take_check(self, check: Check) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""

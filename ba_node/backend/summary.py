@@ -50,6 +50,19 @@ class MapSummary:
     warnings: dict[str, str]
 
 
+@dataclass(frozen=True)
+class MapEnded:
+    """Another map has taken the place of the one before.
+
+    Attributes:
+        summary: of the map before.
+        replaced: True if it held nothing but a keyframe with a wrong stamp, and counts as never begun.
+    """
+
+    summary: MapSummary
+    replaced: bool
+
+
 def summary_of(scene: Scene, config: Config) -> MapSummary:
     """Return the summary of a scene."""
     return MapSummary(

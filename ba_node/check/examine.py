@@ -14,6 +14,8 @@ from ba_node.check.tracks import Tracks
 
 _RELATIONS = frozenset({"cameras", "poses"})
 _BUILD_ON_THESE = ("intrinsics", "lengths")
+# What nothing can be told without.
+_PIXELS = "pixels"
 
 
 def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
@@ -31,6 +33,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         return pairs
 
     tests: dict[str, Callable[[], Diagnosis]] = {
+        _PIXELS: lambda: units.check_pixels(tracks),
         "stamps": lambda: units.check_stamps(tracks),
         "ids": lambda: units.check_ids(tracks),
         "cameras": lambda: relations.check_cameras(tracks),
@@ -49,6 +52,8 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         outcome.add(found)
         if not found.untold:
             outcome.told |= {name}
+        if name == _PIXELS and found.findings:
+            outcome.told |= tests.keys()
         if name == "ids" and found.findings:
             # Their tracks are of several points, and tell nothing else.
             outcome.told |= set(_BUILD_ON_THESE)
@@ -67,9 +72,10 @@ def _run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
 
 def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:
     motion = relations.check_motion(tracks, pairs)
-    if any(not finding.usual for finding in motion.findings):
+    if not motion.sound and all(not finding.usual for finding in motion.findings):
         size = _of_size(tracks, motion)
-        motion.findings = motion.findings if size is None else [size]
+        if size is not None:
+            motion.findings, motion.untold = [size], []
     return motion
 
 
@@ -82,6 +88,7 @@ def _of_size(tracks: Tracks, motion: Diagnosis) -> Finding | None:
         outcome = relations.check_motion(other, pairs)
         if outcome.sound:
             motion.rows.append(dataclasses.replace(outcome.rows[0], hypothesis=model.cause))
-            finding = Finding((model.cause,), motion.findings[0].evidence, (model.change,), usual=True)
+            evidence = motion.findings[0].evidence if motion.findings else "the poses fit the tracks with that undone"
+            finding = Finding((model.cause,), evidence, (model.change,), usual=True)
             found.append((intrinsics.loss_of(other, pairs), finding))
     return min(found, key=lambda one: one[0])[1] if found else None

@@ -60,6 +60,8 @@ _LARGE = 1.5
 _BARREL = (-0.1, -0.2, -0.3, -0.4)
 # Share of the tracks' extent by which a principal point is off their middle where other sizes of the image are tried.
 _OFF_CENTRE = 0.2
+# Pixels of cameras are square to better than this.
+_SQUARE = 1.05
 # Another model is better if its sum of residuals is lower by this share, and by so many times its mean.
 _LOWER = 0.03
 _SURE = 25.0
@@ -71,11 +73,19 @@ _INFO = "camera_info in camera_rig"
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model in question: what it would mean, what to change, and the parameters (n_cam, 12)."""
+    """A camera model in question.
+
+    Attributes:
+        cause: what it would mean.
+        change: what to change.
+        params: (n_cam, 12).
+        lens: the model of all cameras; None for those given.
+    """
 
     cause: str
     change: str
     params: FloatArray
+    lens: cameras.Model | None = None
 
     def confirms(self, other: Model) -> bool:
         """Return True if it says the same, whatever the precise numbers."""
@@ -108,7 +118,7 @@ def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diag
     n = len(measure)
     least = min(measure(adjusted[1.0 / _BRACKET]), measure(adjusted[_BRACKET]))
     flat = n * (least / now - 1.0) < _SURE
-    tried = [(model, _Adjusted(problem, model.params)) for model in other_models(tracks)]
+    tried = [(model, _Adjusted(problem, model.params, model.lens)) for model in other_models(tracks)]
     if least < now or measure.noise > _LARGE:
         for factor in (*_SMALLER, *_LARGER):
             adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
@@ -199,7 +209,7 @@ def _lowest(cost: dict[float, float]) -> float:
 def other_models(tracks: Tracks) -> list[Model]:
     """Return the camera models that are usual mistakes: of the other kind of image, of another size of it."""
     given = tracks.cameras.params
-    models = other_sizes(tracks)
+    models = [*other_sizes(tracks), *_square(given)]
     plain = given.copy()
     plain[:, DISTORTION] = 0.0
     rational = (tracks.cameras.model == cameras.Model.RATIONAL).all()
@@ -207,11 +217,31 @@ def other_models(tracks: Tracks) -> list[Model]:
         cause = "images rectified though a distortion is given"
         models.append(Model(cause, f"d of {_INFO} to zeros (and k to that of the rectified image)", plain))
     elif rational:
+        cause = "images not rectified though no distortion is given"
+        change = f"distortion_model and d of {_INFO}, or track in rectified images"
+        models.append(Model(cause, change, plain, cameras.Model.EQUIDISTANT))
         for k1 in _BARREL:
             barrel = plain.copy()
             barrel[:, DISTORTION.start] = k1
-            cause = "images not rectified though no distortion is given"
-            models.append(Model(cause, f"d of {_INFO}, or track in rectified images", barrel))
+            models.append(Model(cause, change, barrel))
+    elif (tracks.cameras.model == cameras.Model.EQUIDISTANT).all():
+        cause = "images rectified though the model of a fisheye lens is given"
+        change = f"distortion_model of {_INFO} to plumb_bob and d to zeros (and k to that of the rectified image)"
+        models.append(Model(cause, change, plain, cameras.Model.RATIONAL))
+    return models
+
+
+def _square(given: FloatArray) -> list[Model]:
+    """Return the cameras with square pixels, if those given are far from that."""
+    focal = given[0, FX : FY + 1]
+    if max(focal) < _SQUARE * min(focal):
+        return []
+    models = []
+    for name, other in ((FX, FY), (FY, FX)):
+        square = given.copy()
+        square[:, name] = square[:, other]
+        cause = f"fx and fy differ by a factor of {max(focal) / min(focal):.2f}, the tracks fit square pixels"
+        models.append(Model(cause, f"k of {_INFO}", square))
     return models
 
 
@@ -236,7 +266,11 @@ def other_sizes(tracks: Tracks) -> list[Model]:
             binned = given.copy()
             binned[:, FX : CY + 1] /= binning
             cause = f"binning not applied: k is that of an image {binning:g} times as large"
-            models.append(Model(cause, f"binning_x and binning_y in {_INFO}, or divide k by {binning:g}", binned))
+            change = f"binning_x and binning_y in {_INFO}, or divide k by {binning:g}"
+            if binning < 1.0:
+                cause = f"k is that of a smaller image: the tracks are in one {1.0 / binning:g} times as large"
+                change = f"binning_x and binning_y in {_INFO} to 1, or multiply k by {1.0 / binning:g}"
+            models.append(Model(cause, change, binned))
     return models
 
 
@@ -320,8 +354,10 @@ class _Adjusted:
         norms: sizes of the residuals there, sigmas.
     """
 
-    def __init__(self, problem: Problem, params: FloatArray) -> None:
-        self._problem = dataclasses.replace(problem, cameras=dataclasses.replace(problem.cameras, params=params))
+    def __init__(self, problem: Problem, params: FloatArray, lens: cameras.Model | None = None) -> None:
+        model = problem.cameras.model if lens is None else np.full_like(problem.cameras.model, lens)
+        rig = dataclasses.replace(problem.cameras, params=params, model=model)
+        self._problem = dataclasses.replace(problem, cameras=rig)
         self.state = solver.solve(_placed(self._problem), _WIDE).state
         self._finish(_NARROW)
 

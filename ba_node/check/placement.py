@@ -209,6 +209,11 @@ IN_MOTION = (
         f"{_EXTRINSICS}, expected metres",
         _cameras(lambda placed: Placed(placed.rotation, 0.001 * placed.translation)),
     ),
+    Mistake(
+        "positions of body_from_camera in centimetres",
+        f"{_EXTRINSICS}, expected metres",
+        _cameras(lambda placed: Placed(placed.rotation, 0.01 * placed.translation)),
+    ),
     Mistake("quaternions of the poses with w first", _POSES, _poses(_w_first)),
     Mistake("quaternions of body_from_camera with w first", _EXTRINSICS, _cameras(_w_first)),
 )

@@ -30,6 +30,8 @@ _KEYFRAMES_TO_MEASURE = 10
 _MAX_CAMERAS = 8
 # The given relation fits if it explains this share of what the best does.
 _FITS = 0.9
+# Where the best relation explains less than this, the tracks of two images contradict each other.
+_CONTRADICT = 0.2
 # Another relation is named if it explains this share.
 _NAMED = 0.95
 # Angles below which nothing is named, whatever the residuals: calibration is no better.
@@ -48,6 +50,8 @@ _VOTES = 0.8
 # Usual angle beyond which poses are said to be wrong where a known mistake explains them, and where none does.
 _DOUBTFUL_DEG = 15.0
 _ABSURD_DEG = 50.0
+# Angle by which cameras must be turned for all steps to point where the front-end's do.
+_BESIDE_DEG = 5.0
 # A hypothesis takes the place of what was given if it halves the angle.
 _BETTER = 0.5
 # Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
@@ -165,6 +169,8 @@ def check_cameras(tracks: Tracks) -> Diagnosis:
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             continue
         found = _check_camera(given, camera, relation)
+        if found.rows[1].share < _CONTRADICT and _agree_alone(tracks, camera):
+            found = Diagnosis([_ids_differ(camera, found.rows[1].share)], rows=found.rows)
         unclear = relation.share < AGREED and found.rows[0].share > _CLEAR * relation.share
         why = "too many outliers" if unclear else "too few keyframes"
         if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
@@ -182,13 +188,17 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
 
     now = given.between_cameras(0, camera)
     rows = [row("as given", now), row("free", relation.pose)]
-    if rows[0].share >= _FITS * rows[1].share or rows[1].share < 0.2:
-        if rows[1].share < 0.2:
+    if not np.linalg.norm(now.translation) > 0.0:
+        return _same_place(camera, relation, rows)
+    if rows[0].share >= _FITS * rows[1].share or rows[1].share < _CONTRADICT:
+        if rows[1].share < _CONTRADICT:
             return Diagnosis(untold=[f"the tracks of cameras 0 and {camera} contradict each other"], rows=rows)
         return Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
     others = {one: one.undo(given, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS}
     # Where points are far, consensus finds one of many relations; a usual mistake may be the way to a better one.
-    relation = max((relation, *(relation.at(two_view.refined(pair, pose)) for pose in others.values())), key=_share)
+    relation = max(
+        (relation, *(relation.at(two_view.refined(pair, pose)) for pose in others.values())), key=lambda one: one.share
+    )
     rows = [row("as given", now), row("free", relation.pose)]
     tried = {one: row(one.name.format(camera=camera), pose) for one, pose in others.items()}
     rows += tried.values()
@@ -210,8 +220,33 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
     return Diagnosis([_finding(named, evidence, camera)], rows=rows)
 
 
-def _share(relation: Relation) -> float:
-    return relation.share
+def _agree_alone(tracks: Tracks, camera: int) -> bool:
+    """Return True if the tracks of each of two cameras agree with those of its next images."""
+    found = []
+    for own in (0, camera):
+        for k in spread(len(tracks) - 1, _PAIRS_NEEDED):
+            a, b = (int(k), own), (int(k) + 1, own)
+            found.append(relate(tracks, a, b, tracks.match(a, b)))
+    return len(found) >= 2 * _PAIRS_NEEDED and all(one is not None and one.share > AGREED for one in found)
+
+
+def _ids_differ(camera: int, share: float) -> Finding:
+    cause = f"track ids of cameras 0 and {camera} do not name the same points"
+    evidence = f"{share:.0%} of those that both see agree, although the tracks of each camera alone do"
+    change = f"track_id in the feature_tracks of camera {camera}: one id for one point, whichever camera sees it"
+    return Finding((cause,), evidence, (change,), usual=True)
+
+
+def _same_place(camera: int, relation: Relation, rows: list[Row]) -> Diagnosis:
+    """Tell of two cameras that are given at one place; where points are far that may be as well."""
+    if not relation.has_direction or rows[1].share < AGREED:
+        return Diagnosis(
+            untold=[f"too little parallax between cameras 0 and {camera} to tell how they stand"], rows=rows
+        )
+    cause = f"baseline of camera {camera} missing: it is given at the same place as camera 0"
+    evidence = f"{rows[1].share:.0%} of the tracks of cameras 0 and {camera} meet if they are apart"
+    change = f"the position in body_from_camera of camera {camera} in camera_rig (or tf_static)"
+    return Diagnosis([Finding((cause,), evidence, (change,), usual=True)], rows=rows)
 
 
 def _differ(one: Pose, other: Pose) -> bool:
@@ -273,7 +308,7 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     rows = [now.row(test, "as given"), Row(test, "free", float(np.mean([one.share for one in usable])))]
     tell = f"the poses fit the tracks (directions to {np.median(now.direction):.1f} degrees)"
     if np.median(now.off) <= _DOUBTFUL_DEG:
-        return Diagnosis(sound=[tell], rows=rows)
+        return _turned(given, usable, now, rows) or Diagnosis(sound=[tell], rows=rows)
     tried = {one: compare(one.undo(given, 0), usable) for one in IN_MOTION}
     rows += [other.row(test, one.name) for one, other in tried.items()]
     best = min(float(np.median(other.off)) for other in tried.values())
@@ -290,25 +325,30 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
 
 def _unnamed(given: SetUp, usable: list[Relation], now: Steps, rows: list[Row], tell: str) -> Diagnosis:
     """Tell of a camera that is turned against the body, or of poses that contradict the tracks."""
-    turn = _turn(given, usable)
-    degrees = float(np.degrees(np.linalg.norm(geometry.so3_log(turn))))
-    turned = compare(given, usable, turn)
-    rows.append(turned.row(rows[0].test, f"cameras turned by {degrees:.0f} degrees"))
-    if len(usable) >= 2 * _PAIRS_NEEDED and degrees > _DOUBTFUL_DEG and now.loses_to(turned):
-        cause = f"camera 0 does not fit its place on the body by about {degrees:.0f} degrees"
-        evidence = (
-            f"its steps are {np.median(now.off):.0f} degrees off the front-end's, turned {np.median(turned.off):.0f}"
-        )
-        change = (
-            "body_from_camera in camera_rig (or tf_static), or the principal point in camera_info (region of interest)"
-        )
-        return Diagnosis([Finding((cause,), evidence, (change,))], rows=rows)
+    turned = _turned(given, usable, now, rows)
+    if turned is not None:
+        return turned
     if len(usable) >= 2 * _PAIRS_NEEDED and np.median(now.direction) > _ABSURD_DEG:
         evidence = f"the steps of the camera are {np.median(now.direction):.0f} degrees off the front-end's"
         return Diagnosis(
             [Finding(("the poses contradict the tracks",), evidence, ("the pose in the keyframes",))], rows=rows
         )
     return Diagnosis(sound=[tell], rows=rows)
+
+
+def _turned(given: SetUp, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis | None:
+    """Tell of a camera that is turned against the body, or its principal point off; None if steps do not say so."""
+    turn = _turn(given, usable)
+    degrees = float(np.degrees(np.linalg.norm(geometry.so3_log(turn))))
+    turned = compare(given, usable, turn)
+    least = _BESIDE_DEG if agreed(usable) else _DOUBTFUL_DEG
+    if len(usable) < 2 * _PAIRS_NEEDED or degrees < least or not now.loses_to(turned):
+        return None
+    rows.append(turned.row(rows[0].test, f"cameras turned by {degrees:.0f} degrees"))
+    cause = f"camera 0 does not fit its place on the body by about {degrees:.0f} degrees"
+    evidence = f"its steps are {np.median(now.off):.0f} degrees off the front-end's, turned {np.median(turned.off):.0f}"
+    change = "body_from_camera in camera_rig (or tf_static), or the principal point in camera_info (region of interest)"
+    return Diagnosis([Finding((cause,), evidence, (change,))], rows=rows)
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,9 @@ _UNITS = (
 _CLEARLY = 3.0
 # A factor is named unless a shift leaves so much less.
 _SURELY = 0.7
+# Image coordinates no larger than this are no pixels, where the focal length is at least this.
+_NO_PIXEL = 3.0
+_FOCAL = 30.0
 # Sensible distances between keyframes, s; and units that stamps may have been taken for.
 _SPACING_S = (5e-4, 600.0)
 _STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
@@ -49,6 +52,16 @@ _LOST = 0.9
 # Keyframes that are needed to judge ids and lengths; share of the ids of the last quarter that the first one had.
 _KEYFRAMES = 10
 _PERSIST = 0.85
+
+
+def check_pixels(tracks: Tracks) -> Diagnosis:
+    """Look whether image coordinates are in the unit of the focal length."""
+    reach, focal = float(np.percentile(np.abs(tracks.uv), 95.0)), float(np.median(tracks.cameras.params[:, 0]))
+    if reach > _NO_PIXEL or focal < _FOCAL:
+        return Diagnosis()
+    cause = f"image coordinates are not in pixels: nearly all of them are below {reach:.2g}"
+    change = "u and v in the feature_tracks, expected pixels of the image, not normalised coordinates"
+    return Diagnosis([Finding((cause,), f"the focal length is {focal:.0f} px", (change,), usual=True)])
 
 
 def check_stamps(tracks: Tracks) -> Diagnosis:
@@ -161,20 +174,15 @@ def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: boo
     if len(given.cameras.rotation) > 1 and len(tracks) < _KEYFRAMES:
         return Diagnosis(untold=["too few keyframes to compare a baseline with steps"])
     for camera in range(1, min(len(given.cameras.rotation), 3)):
-        depth = np.full(len(tracks.keyframe), np.nan)
-        baseline, shared = given.between_cameras(0, camera), False
-        for k in sorted({one.b[0] for one in relations if one.b[1] == 0}):
-            rows = tracks.match((k, 0), (k, camera))
-            shared = shared or len(rows[0]) > 0
-            if not len(rows[0]):
-                continue
-            pair = rays(tracks, rows)
-            in_a, _, parallax = two_view.depths(pair, baseline)
-            good = two_view.explained(pair, baseline) & (parallax > _PARALLAX * pair.gate) & (in_a > 0.0)
-            depth[rows[0][good]] = in_a[good]
-        pairs = _depth_pairs(tracks, relations, depth)
-        if not shared:
+        baseline = given.between_cameras(0, camera)
+        keyframes = sorted({one.b[0] for one in relations if one.b[1] == 0})
+        if not any(len(tracks.match((k, 0), (k, camera))[0]) for k in keyframes):
             continue
+        pairs = _depth_pairs(tracks, relations, _stereo_depths(tracks, keyframes, camera, baseline, _PARALLAX))
+        if len(pairs) < _PAIRS:
+            # Points that are far tell no more than whether it is of the right size at all.
+            far = _depth_pairs(tracks, relations, _stereo_depths(tracks, keyframes, camera, baseline, 1.0))
+            pairs = far if len(far) >= _PAIRS and abs(_log_factor(far)) > np.log(_GROSS) else pairs
         if len(pairs) < _PAIRS:
             outcome.untold.append(f"too little parallax to compare the baseline of camera {camera} with steps")
             continue
@@ -188,10 +196,27 @@ def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: boo
     return outcome
 
 
+def _stereo_depths(tracks: Tracks, keyframes: list[int], camera: int, baseline: Pose, least: float) -> FloatArray:
+    """Return the depth of each observation by two cameras, (n_obs,) m; NaN below a parallax, in gates, or for none."""
+    depth = np.full(len(tracks.keyframe), np.nan)
+    for k in keyframes:
+        rows = tracks.match((k, 0), (k, camera))
+        if not len(rows[0]):
+            continue
+        pair = rays(tracks, rows)
+        in_a, _, parallax = two_view.depths(pair, baseline)
+        good = two_view.explained(pair, baseline) & (parallax > least * pair.gate) & (in_a > 0.0)
+        depth[rows[0][good]] = in_a[good]
+    return depth
+
+
+def _log_factor(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
+    return float(np.median([np.median(np.log(one / other)) for one, other in pairs]))
+
+
 def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[FloatArray, FloatArray]]) -> Diagnosis:
     stereo, steps = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    ratio = [float(np.median(np.log(one / other))) for one, other in pairs]
-    factor = float(np.exp(np.median(ratio)))
+    factor = float(np.exp(_log_factor(pairs)))
     rows = [Row("lengths", f"baseline of camera {camera} over the front-end's steps: {factor:.3g}", 1.0)]
     if 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
         tell = f"the baseline of camera {camera} fits the steps (to {abs(factor - 1.0):.0%})"
@@ -204,9 +229,9 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
     if min(shifted, scaled) > _AGREE:
         return Diagnosis(untold=[f"depths of cameras 0 and {camera} contradict the front-end's steps"], rows=rows)
     causes: dict[str, str] = {}
-    if shifted < _CLEARLY * scaled:
+    if shifted < _CLEARLY * scaled and 1.0 / _GROSS < factor < _GROSS:
         causes |= _of_shift(tracks, camera, abs(shift) * baseline)
-    if scaled < shifted / _SURELY:
+    if not causes or scaled < shifted / _SURELY:
         causes |= _of_factor(camera, baseline, factor)
     return Diagnosis([Finding(tuple(causes), evidence, tuple(causes.values()))], rows=rows)
 
@@ -227,10 +252,9 @@ def _of_shift(tracks: Tracks, camera: int, turn: float) -> dict[str, str]:
 def _of_factor(camera: int, baseline: float, factor: float) -> dict[str, str]:
     """Return what stretches all depths by a factor, and what to change."""
     fitting = f"({baseline:.3g} m; tracks fit {baseline / factor:.3g} m)"
+    size = _unit(factor) or f"is {_times(factor)} what the front-end's steps tell"
     return {
-        f"baseline of camera {camera} {_unit(factor) or f'{_times(factor)} too long'} for the front-end's steps": (
-            f"body_from_camera of camera {camera} in camera_rig {fitting}"
-        ),
+        f"baseline of camera {camera} {size}": (f"body_from_camera of camera {camera} in camera_rig {fitting}"),
         f"poses {_unit(1.0 / factor) or 'in another unit'}": "the position in the keyframes, expected metres",
     }
 

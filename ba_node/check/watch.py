@@ -20,6 +20,11 @@ from ba_node.scene.scene import Scene
 
 # Keyframes at which a session is checked. A robot may stand for long before there is anything to tell.
 _AT = (3, 6, 10, 15, 25, 40, 60, 90, 130, 200, 300, 450, 700, 1000)
+# Poses that fit on a straight way, or seem to over a few keyframes, are looked at once more here.
+_AGAIN = (15, 40)
+_POSES = frozenset({"poses"})
+# What solves say of tracks and poses while the set-up is wrong.
+_CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
 # The newest of them are looked at.
 _NEWEST = 60
 
@@ -66,20 +71,21 @@ class SetUpWatch:
             self._scene, self._told, self._next, self._busy, self._reason = scene, frozenset(), 0, False, ""
         count = len(scene.keyframes)
         if not (self._reason or self._busy or self._next >= len(_AT) or count < _AT[self._next]):
+            again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
-            self._check(scene)
+            self._check(scene, self._told - _POSES if again else self._told)
         return self._reason
 
     def reason(self, scene: Scene) -> str:
         """Return why the solves of a scene are held, empty if they are not."""
         return self._reason if scene is self._scene else ""
 
-    def _check(self, scene: Scene) -> None:
+    def _check(self, scene: Scene, told: frozenset[str]) -> None:
         if not two_view.available():
             scene.log.notice("setup_unchecked")
             self._next = len(_AT)
             return
-        tracks, told = tracks_of(scene, _NEWEST), self._told
+        tracks = tracks_of(scene, _NEWEST)
         if tracks is None:
             return
         check = Check(scene, lambda: examine(tracks, told))
@@ -103,9 +109,10 @@ class SetUpWatch:
             scene.log.warn(kind="setup", text=found.summary())
         if not found.harmful:
             if found.settled:
-                self._next = len(_AT)
+                self._next = next((i for i, at in enumerate(_AT) if i >= self._next and at in _AGAIN), len(_AT))
             return False
         self._reason = f"the set-up contradicts the tracks: {found.causes()}"
         scene.forget_solutions()
-        scene.log.warnings.pop("held", None)
+        for kind in _CONSEQUENCES:
+            scene.log.warnings.pop(kind, None)
         return True

@@ -27,48 +27,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 import scipy
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry, loss
-from ba_node.core.problem import ProblemError, State
+from ba_node.core.problem import KeyframeFactors, ProblemError, State
 
 # A measured rotation may differ from an orthonormal one by this much.
 _ORTHONORMAL = 1e-6
-
-
-class KeyframeFactors(Protocol):
-    """Factors of one kind: n of them, each with m residuals on k keyframes.
-
-    Attributes:
-        keyframes: (n, k) indices of the keyframes of each.
-        loss: robust loss, one of loss.LOSSES, on the norm of the whitened residual.
-        loss_scale: where it leaves the square.
-    """
-
-    @property
-    def keyframes(self) -> IntArray:
-        """Return (n, k) indices of the keyframes of each."""
-
-    @property
-    def loss(self) -> str:
-        """Return the robust loss."""
-
-    @property
-    def loss_scale(self) -> float:
-        """Return where the loss leaves the square."""
-
-    def residuals(self, state: State) -> FloatArray:
-        """Return the whitened residuals, (n, m)."""
-
-    def jacobians(self, state: State) -> FloatArray:
-        """Return their derivatives by the local steps of the keyframes, (n, k, m, 6): rotation, then translation."""
-
-    def check(self, n_keyframes: int) -> None:
-        """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
 
 
 @dataclass(frozen=True)

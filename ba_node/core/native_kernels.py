@@ -14,13 +14,13 @@ from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
-from ba_node.core.factors import FactorSum, FactorTerms, KeyframeFactors, RelativePoses
+from ba_node.core.factors import FactorSum, FactorTerms, RelativePoses
 from ba_node.core.kernels import Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
-from ba_node.core.problem import Problem, State
+from ba_node.core.problem import KeyframeFactors, Problem, State
 from ba_node.native._kernels import Kernel
 from ba_node.native._kernels import RelativePoses as CompiledPoses
 

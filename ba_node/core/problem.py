@@ -16,15 +16,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from ba_node.core.factors import KeyframeFactors
 
 
 class ProblemError(ValueError):
@@ -94,6 +91,37 @@ class Observations:
     def __len__(self) -> int:
         """Return the number of observations."""
         return len(self.keyframe)
+
+
+class KeyframeFactors(Protocol):
+    """Factors of one kind: n of them, each with m residuals on k keyframes.
+
+    Attributes:
+        keyframes: (n, k) indices of the keyframes of each.
+        loss: robust loss, one of loss.LOSSES, on the norm of the whitened residual.
+        loss_scale: where it leaves the square.
+    """
+
+    @property
+    def keyframes(self) -> IntArray:
+        """Return (n, k) indices of the keyframes of each."""
+
+    @property
+    def loss(self) -> str:
+        """Return the robust loss."""
+
+    @property
+    def loss_scale(self) -> float:
+        """Return where the loss leaves the square."""
+
+    def residuals(self, state: State) -> FloatArray:
+        """Return the whitened residuals, (n, m)."""
+
+    def jacobians(self, state: State) -> FloatArray:
+        """Return their derivatives by the local steps of the keyframes, (n, k, m, 6): rotation, then translation."""
+
+    def check(self, n_keyframes: int) -> None:
+        """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
 
 
 @dataclass(frozen=True)

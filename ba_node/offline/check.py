@@ -62,10 +62,10 @@ def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
                 maps.append(backend.map)
         backend.flush(final=True)
         maps += [backend.map] if backend.map is not maps[-1] else []
-        notes = [*reader.rejection_notes, *backend.rejection_notes]
+        reason = reader.rejection_notes[-1] if reader.rejection_notes else backend.rejection_cause
     found = [checked for one in maps if (checked := _checked(one)) is not None]
     if not found:
-        raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + notes[-1] if notes else ''}")
+        raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + reason if reason else ''}")
     return found
 
 

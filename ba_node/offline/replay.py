@@ -285,5 +285,5 @@ def _nothing_to_use(run: _Run) -> str:
 
 
 def _why(reader: BagReader, run: _Run) -> str:
-    notes = [*run.backend.rejection_notes, *reader.rejection_notes]
-    return f": {notes[-1]}" if notes else ""
+    reason = reader.rejection_notes[-1] if reader.rejection_notes else run.backend.rejection_cause
+    return f": {reason}" if reason else ""

@@ -42,13 +42,13 @@ def objection(arguments: Sequence[str]) -> str:
 def idle_files(arguments: Sequence[str], node_name: str) -> list[str]:
     """Say of each parameter file in which nothing is for the node of that full name whom it is for."""
     named = [after for word, after in itertools.pairwise(arguments) if word == _FILE_OPTION]
-    told = []
+    lines = []
     for name in named:
         sections = list(_sections(yaml.safe_load(Path(name).read_text())))
         if not any(re.fullmatch(_pattern(section), node_name) for section in sections):
             others = ", ".join(sections) or "nobody"
-            told.append(f"{name} has parameters for {others} and none for {node_name}: nothing of it is used")
-    return told
+            lines.append(f"{name} has parameters for {others} and none for {node_name}: nothing of it is used")
+    return lines
 
 
 def _sections(tree: object, above: str = "") -> Iterator[str]:

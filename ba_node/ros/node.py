@@ -36,7 +36,7 @@ from ba_node.ros.components.silence import Silence, SimulatedTime
 from ba_node.ros.components.static_frames import StaticFrames
 from ba_node.ros.log import Severity, Throttle, fault, log
 from ba_node.ros.parameters import Parameters
-from ba_node.ros.rclpy_compat.deferred import Relay
+from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.worker import Notice, Outcome, Worker
@@ -101,7 +101,7 @@ class BaNode(ManagedNode):
         """End the worker, during a solve after its current iteration."""
         host = self._host
         self.cleanup()
-        if host is not None and host.relay.left_waiting:
+        if host is not None and host.deferred.left_waiting:
             time.sleep(_LINGER_S)
         if not all(worker.stop() for worker in self._leaving):
             log(self, Severity.ERROR, "the solver did not stop in time, leaving it")
@@ -115,9 +115,9 @@ class BaNode(ManagedNode):
         backend = Backend(config, clock=time.perf_counter)
         worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
         backend.setup.elsewhere = worker.check_elsewhere
-        relay = Relay(self, lambda: worker.alive)
-        self._host = host = Host(self, config, inbox, worker, relay, self._log)
-        host.at_cleanup.callback(relay.close)
+        deferred = DeferredAnswers(self, lambda: worker.alive)
+        self._host = host = Host(self, config, inbox, worker, deferred, self._log)
+        host.at_cleanup.callback(deferred.close)
         worker.start()
         for kind in COMPONENTS:
             self._components.append(kind(host))

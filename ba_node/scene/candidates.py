@@ -12,7 +12,7 @@ import numpy as np
 from ba_node.core import geometry
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.scene.ingest import plain_name
-from ba_node.scene.rejections import RejectionLog
+from ba_node.scene.rejections import Refusal, RejectionLog
 from ba_node.scene.scene import Scene
 
 NS = 1e-9
@@ -121,15 +121,6 @@ class State:
     lower: tuple[int, int] = (-1, 0)
     distrust: int = 0
     calm: int = 0
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A measurement that is turned away: reason from ``REASONS``, and why in words."""
-
-    measurement: Measurement
-    reason: str
-    text: str
 
 
 @dataclass(frozen=True)

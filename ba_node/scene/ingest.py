@@ -75,7 +75,9 @@ def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -
         return
     where = f"keyframe {keyframe.keyframe_id}: header.frame_id = {keyframe.frame_id!r}"
     if name:
-        log.warn("frame_name", f"{where} is no name for tf2, taken as {name!r}: leave out the slash")
+        log.warn(
+            "frame_name", f"{where} is no name for tf2, taken as {name!r}: leave out spaces and the slash in front"
+        )
     elif not named:
         log.warn("frame_name", f"{where} names no frame, taken as {taken!r}: name the fixed frame of the poses")
 
@@ -86,7 +88,7 @@ def _check_distance(name: str, frame_id: str, position: FloatArray, log: Rejecti
     if step_m > COARSE_M:
         text = (
             f"{name} is {np.linalg.norm(position):.0f} m from the origin of {frame_id!r}: points on ~/points are"
-            f" float32, with steps of {1e3 * step_m:.2g} mm there; give poses relative to a place near the site (poses"
+            f" float32, with steps of {step_m:.2g} m there; give poses relative to a place near the site (poses"
             " and points.ply keep all digits)"
         )
         log.warn("far_from_origin", text=text)

@@ -5,6 +5,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from dataclasses import dataclass
+
+from ba_node.measurements import Measurement
 
 # Reason -> what was turned away and why. The keys are published in ba_msgs/SolverReport.
 REASONS: dict[str, str] = {
@@ -63,6 +66,17 @@ WARNINGS: dict[str, str] = {
 }
 
 NOTES_KEPT = 50
+# What follows from something else that was turned away.
+_FOLLOWS = ("unknown_keyframe", "pending_overflow")
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A measurement that is turned away: reason from ``REASONS``, and why in words."""
+
+    measurement: Measurement
+    reason: str
+    text: str
 
 
 class RejectionLog:
@@ -72,6 +86,7 @@ class RejectionLog:
         rejected: what was turned away; keys from REASONS. Whole messages count as one, observations one by one.
         notices: what was unusual but used; keys from NOTICES.
         notes: the last cases in words, oldest first.
+        firsts: the first case of each reason in words.
         warnings: the newest case of each kind in words; keys from WARNINGS.
     """
 
@@ -80,6 +95,7 @@ class RejectionLog:
         self.rejected: Counter[str] = Counter()
         self.notices: Counter[str] = Counter()
         self.notes: deque[str] = deque(maxlen=NOTES_KEPT)
+        self.firsts: dict[str, str] = {}
         self.warnings: dict[str, str] = {}
 
     def reject(self, reason: str, what: str, count: int = 1) -> None:
@@ -88,6 +104,12 @@ class RejectionLog:
         self.rejected[reason] += count
         more = f" and {count - 1} more" if count > 1 else ""
         self.notes.append(f"{what}{more}; dropped ({reason} = {self.rejected[reason]})")
+        self.firsts.setdefault(reason, self.notes[-1])
+
+    def cause(self) -> str:
+        """Return the first case of what was turned away by itself, not as its keyframe was; empty if nothing was."""
+        reasons = sorted(self.firsts, key=lambda reason: reason in _FOLLOWS)
+        return self.firsts[reasons[0]] if reasons else ""
 
     def notice(self, kind: str, count: int = 1) -> None:
         """Count something that was unusual but used."""

@@ -8,8 +8,6 @@ What contradicts or cannot be used is counted in ``log`` and leaves the scene as
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ba_node.arrays import BoolArray, IntArray
@@ -19,10 +17,7 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGue
 from ba_node.scene import ingest
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
-from ba_node.scene.rejections import WARNINGS, RejectionLog
-
-if TYPE_CHECKING:
-    from ba_node.scene.candidates import Refusal
+from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
 
 
 class Scene(MapTables):

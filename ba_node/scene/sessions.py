@@ -27,7 +27,6 @@ from ba_node.scene.candidates import (
     Candidate,
     Decision,
     Kind,
-    Refusal,
     State,
     agree,
     begin_of,
@@ -39,6 +38,7 @@ from ba_node.scene.candidates import (
     same_pose,
     unusual_s,
 )
+from ba_node.scene.rejections import Refusal
 from ba_node.scene.scene import Scene
 
 # Keyframes in a row that confirm each other. Messages come twice, late, or under a wrong id now and then, which is no
@@ -72,7 +72,7 @@ class Sessions:
         return self.state.candidate.keyframes if self.state.candidate else []
 
     def reset(self, loaded: set[int] | None = None) -> None:
-        """Forget what is held; that keyframes ``loaded`` from a file come again does not begin a recording anew."""
+        """Forget what is held; keyframes ``loaded`` from a file may come again without a recording beginning anew."""
         self.state = State()
         self._loaded = loaded or set()
 

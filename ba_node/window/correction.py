@@ -58,7 +58,7 @@ class MapCorrection:
         return tuple(one for one in known if one is not None), self._agreeing, self._stamp_ns
 
     def update(self, config: FramesConfig, found: Transform, body: Transform, stamp_ns: int) -> Move:
-        """Take in the correction found at the newest keyframe; ``body`` is that of the front-end, odom from body."""
+        """Take in the correction found at the newest keyframe, and the front-end's pose of it, odom from body."""
         if self._target is None or self.published is None:
             self._target = self.published = found
             self._stamp_ns = stamp_ns

@@ -20,7 +20,7 @@ PENDING = {("outliers_moving", "mono"), ("pure_rotation", "mono")}
 
 def siblings() -> list[Any]:
     """Return fault, rig, amount and seed of each fault, by turns; `ba robustness` takes all rigs and amounts."""
-    pending = pytest.mark.xfail(strict=False, reason="not mended yet")
+    pending = pytest.mark.xfail(strict=True, reason="not mended yet")
     return [
         pytest.param(
             name,

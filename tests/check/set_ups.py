@@ -172,11 +172,14 @@ WRONG: dict[str, Wrong] = {
     "axes missing": rig(lambda r, p: (r @ _OPTICAL.T, p)),
     "axes twice": rig(lambda r, p: (r @ _OPTICAL, p)),
     "extrinsics in mm": rig(lambda r, p: (r, 1000.0 * p)),
+    "extrinsics in cm": rig(lambda r, p: (r, 100.0 * p)),
+    "no baseline": rig(lambda r, p: (r, p[[0, 0]])),
     "poses inverted": poses(lambda r, p, _: geometry.inverse(r, p)),
     "poses of camera": poses(lambda r, p, data: geometry.compose(r, p, *_camera_0(data))),
     "camera from world": poses(lambda r, p, data: geometry.inverse(*geometry.compose(r, p, *_camera_0(data)))),
     "poses of optical body": poses(lambda r, p, _: (r @ _OPTICAL, p)),
     "poses in mm": poses(lambda r, p, _: (r, 1000.0 * p)),
+    "poses in cm": poses(lambda r, p, _: (r, 100.0 * p)),
     "poses with w first": poses(
         lambda r, p, _: (
             geometry.matrix_from_quaternion(geometry.quaternion_from_matrix(r)[:, [3, 0, 1, 2]]),
@@ -190,18 +193,30 @@ WRONG: dict[str, Wrong] = {
     "focal 1.2": intrinsics(lambda k: k * [1.2, 1.2, 1.0, 1.0]),
     "focal 0.8": intrinsics(lambda k: k * [0.8, 0.8, 1.0, 1.0]),
     "focal 0.5": intrinsics(lambda k: k * [0.5, 0.5, 1.0, 1.0]),
+    "fx alone": intrinsics(lambda k: k * [1.3, 1.0, 1.0, 1.0]),
     "focal of camera 1": _second(factor=1.2),
     "principal point of camera 1, v": _second(shift=(0.0, 20.0)),
     "principal point of camera 1, u": _second(shift=(30.0, 0.0)),
     "region": intrinsics(lambda k: k + np.array([0.0, 0.0, 320.0, 200.0])),
     "binning": intrinsics(lambda k: 2.0 * k),
+    "k of a smaller image": intrinsics(lambda k: 0.5 * k),
     "not rectified": distortion(np.zeros(5)),
     "rectified": distortion(_LENS),
+    "fisheye given": lambda data: dataclasses.replace(
+        data,
+        rig=dataclasses.replace(
+            data.rig, models=("equidistant",) * len(data.rig), distortion=(np.zeros(4),) * len(data.rig)
+        ),
+    ),
     "depth in mm": images(lambda one: dataclasses.replace(one, depth_m=1000.0 * one.depth_m)),
     "depth in cm": images(lambda one: dataclasses.replace(one, depth_m=100.0 * one.depth_m)),
     "depth in km": images(lambda one: dataclasses.replace(one, depth_m=0.001 * one.depth_m)),
     "inverse depth": images(lambda one: dataclasses.replace(one, depth_m=1.0 / one.depth_m)),
+    "normalised": images(lambda one: dataclasses.replace(one, uv=(one.uv - [320.0, 240.0]) / 349.0)),
     "slots": _slots,
+    "ids of each camera": images(
+        lambda one: dataclasses.replace(one, track_id=one.track_id + np.uint64(37 * one.camera_index))
+    ),
     "stamps in us": _stamps(1e-3),
     "stamps in ms": _stamps(1e-6),
 }

@@ -26,11 +26,14 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "axes missing": (("stereo", "mono"), "axes confused: body_from_camera is that of a frame that looks along x"),
     "axes twice": (("stereo", "mono"), "axes confused: body_from_camera turns into the optical frame twice"),
     "extrinsics in mm": (("stereo",), "body_from_camera in millimetres"),
+    "extrinsics in cm": (("stereo",), "body_from_camera in centimetres|baseline of camera 1 in centimetres"),
+    "no baseline": (("stereo",), "baseline of camera 1 missing"),
     "poses inverted": (("stereo", "mono"), "^poses inverted: they hold body-from-world"),
     "poses of camera": (("stereo", "mono"), "^poses are of the camera, given as of the body"),
     "camera from world": (("stereo", "mono"), "^poses inverted and of the camera"),
     "poses of optical body": (("stereo", "mono"), "the poses are of a body whose z looks forward"),
     "poses in mm": (("stereo",), "poses in millimetres"),
+    "poses in cm": (("stereo",), "poses in centimetres"),
     "poses with w first": (("stereo", "mono"), "quaternions of the poses with w first"),
     "turned 1 about y": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
     "turned 1 about x": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
@@ -39,17 +42,22 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "focal 1.2": (("stereo", "mono"), r"focal length off by a factor of about 1\.(1[6-9]|2[0-4])"),
     "focal 0.8": (("stereo", "mono"), r"focal length off by a factor of about 0\.(7[7-9]|8[0-3])"),
     "focal 0.5": (("stereo", "mono"), r"focal length off by a factor of about 0\.(4[7-9]|5[0-3])"),
+    "fx alone": (("stereo", "mono"), "fx and fy differ by a factor of 1.30"),
     "focal of camera 1": (("stereo",), "focal length of camera 1 off by a factor of about 1.2"),
     "principal point of camera 1, v": (("stereo",), "principal point of camera 1"),
     "principal point of camera 1, u": (("stereo",), "principal point of camera 1 off by about (29|30|31) px"),
     "region": (("stereo", "mono"), "region of interest not applied"),
     "binning": (("stereo", "mono"), "binning not applied: k is that of an image 2 times as large"),
+    "k of a smaller image": (("stereo", "mono"), "k is that of a smaller image"),
     "not rectified": (("stereo", "mono"), "images not rectified though no distortion is given"),
     "rectified": (("stereo", "mono"), "images rectified though a distortion is given"),
+    "fisheye given": (("stereo", "mono"), "images rectified though the model of a fisheye lens is given"),
     "depth in mm": (("rgbd",), "depth_m in millimetres"),
     "depth in cm": (("rgbd",), "depth_m in centimetres"),
     "depth in km": (("rgbd",), "depth_m in kilometres"),
     "inverse depth": (("rgbd",), "depth_m holds inverse depths"),
+    "normalised": (("stereo", "mono"), "image coordinates are not in pixels"),
+    "ids of each camera": (("stereo",), "track ids of cameras 0 and 1 do not name the same points"),
     "slots": (("stereo", "mono"), "ids reused"),
     "stamps in us": (("mono",), "stamps in another unit.*microseconds"),
     "stamps in ms": (("mono",), "stamps in another unit.*milliseconds"),
@@ -144,6 +152,17 @@ def test_tracks_without_rays_are_left_out() -> None:
     for rows in tracks.images.values():
         assert np.isfinite(tracks.ray[rows]).all()
         assert (np.diff(tracks.track[rows]) > 0).all()
+
+
+@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
+def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
+    """By 60 and 36 px: steps point 10 degrees beside the front-end's, all to the same side."""
+    scene = Scene(Config().scene)
+    for measurement in spoiled("roi_ignored", rig, 60.0, seed=613).measurements:
+        scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    assert re.search("region of interest", examine(tracks).summary())
 
 
 @pytest.mark.parametrize(

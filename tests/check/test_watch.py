@@ -15,7 +15,7 @@ from ba_node.check import two_view
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Status
 from ba_node.synthetic import SyntheticData
-from tests.check.set_ups import WRONG, recording
+from tests.check.set_ups import WRONG, recording, rig
 
 
 def play(backend: Backend, data: SyntheticData, keyframes: int | None = None) -> list[Estimate]:
@@ -121,6 +121,22 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     play(backend, recording(), keyframes=12)
     assert backend.notices["setup_unchecked"] == 1
     assert "setup" not in backend.scene.log.warnings
+
+
+def test_poses_are_looked_at_again_after_a_turn() -> None:
+    """A camera that looks to the side is given looking to the other one: on a straight way its steps nearly fit."""
+    data = recording(701, mode="mono", path="line", look_deg=90.0, keyframes=60)
+    wrong = rig(lambda rotation, position: (rotation.transpose(0, 2, 1), position))(data)
+    backend = Backend(Config())
+    last = play(backend, wrong)[-1]
+    assert re.search("extrinsics inverted", last.report.reason)
+    same_as_input(last, wrong)
+
+
+def test_warnings_that_follow_from_the_set_up_go() -> None:
+    backend = Backend(Config())
+    play(backend, recording(wrong="no baseline", path="line"))
+    assert set(backend.scene.log.warnings) == {"setup"}
 
 
 def test_elsewhere() -> None:

@@ -146,7 +146,10 @@ def test_what_cannot_be_refined_is_written_as_it_came_and_said(
         (without(timeline(), Keyframe), "no topic of type ba_msgs/msg/Keyframe"),
         (without(timeline(), Keyframe, FeatureTracks), "no topic of type ba_msgs/msg/Keyframe"),
         (without(timeline(), FeatureTracks), "no topic of type ba_msgs/msg/FeatureTracks"),
-        (without_poses(timeline()), "none of 10 keyframes can be used (tracks messages: 20, camera rigs: 1)"),
+        (
+            without_poses(timeline()),
+            "none of 10 keyframes can be used (tracks messages: 20, camera rigs: 1): keyframe 0",
+        ),
     ],
     ids=["no keyframes", "a rig alone", "no tracks", "no poses"],
 )

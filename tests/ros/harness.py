@@ -25,7 +25,8 @@ from typing import Any
 
 import pytest
 import rclpy
-from lifecycle_msgs.srv import GetState
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -230,6 +231,28 @@ class Peer:
                 self.publish(dataclasses.replace(image, session_id=session_id), keyframe.stamp_ns)
             self.await_report(session_id, keyframe.keyframe_id)
 
+    def publish_keyframes(self, data: SyntheticData, *rows: int) -> None:
+        """Publish the rig and some keyframes of a recording at once."""
+        self.publish(data.rig)
+        for row in rows:
+            self.publish(data.keyframes[row])
+            for image in data.tracks[row]:
+                self.publish(image, data.keyframes[row].stamp_ns)
+
+    def play_keyframes(self, data: SyntheticData, *rows: int) -> None:
+        """Publish the rig and some keyframes of a recording, each when the one before was reported."""
+        reports = self.received["report"]
+        for row in rows:
+            self.publish_keyframes(data, row)
+            self._await_any(reports, data.keyframes[row].keyframe_id)
+
+    def _await_any(self, reports: list[Any], key: int) -> None:
+        self.until(lambda: any(report.newest_keyframe_id == key for report in reports), f"a report on {key}")
+
+    def refined_ids(self) -> set[int]:
+        """Return the keyframes that have come back so far."""
+        return {int(key) for message in self.received["refined_keyframes"] for key in message.keyframe_id}
+
     def await_report(self, session_id: int, keyframe_id: int) -> None:
         """Wait until the last report is that of a keyframe."""
         reports, wanted = self.received["report"], (session_id, keyframe_id)
@@ -269,6 +292,11 @@ class Peer:
         parameter = RclpyParameter(name, value=value).to_parameter_msg()
         request = SetParameters.Request(parameters=[parameter])
         return self.call(SetParameters, "ba_node/set_parameters", request).results[0]
+
+    def change_state(self, label: str = "", number: int = 0) -> bool:
+        """Ask for a transition; return whether it was made."""
+        request = ChangeState.Request(transition=Transition(id=number, label=label))
+        return bool(self.call(ChangeState, "ba_node/change_state", request).success)
 
     def offers(self, service: str) -> bool:
         """Return True if the node has a service that was called before."""

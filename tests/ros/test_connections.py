@@ -18,6 +18,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, stamp_ns_from_message
+from ba_node.ros.components import silence
 from ba_node.ros.convert import message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
@@ -164,7 +165,7 @@ def test_keyframes_out_of_order_are_sorted_by_their_stamps(
             peer.publish(image, scene.keyframes[i].stamp_ns)
         wanted = scene.keyframes[i].keyframe_id
         # The first has nothing to be refined against.
-        peer.until(lambda i=i, wanted=wanted: i == 0 or wanted in _ids(peer), f"keyframe {wanted}, refined")
+        peer.until(lambda i=i, wanted=wanted: i == 0 or wanted in peer.refined_ids(), f"keyframe {wanted}, refined")
     stamps = [keyframe.stamp_ns for keyframe in scene.keyframes]
 
     def path_stamps() -> list[int]:
@@ -204,10 +205,6 @@ def _part(scene: SyntheticData, rows: slice) -> SyntheticData:
     return dataclasses.replace(scene, keyframes=scene.keyframes[rows], tracks=scene.tracks[rows])
 
 
-def _ids(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
-
-
 def _stamps(peer: Any) -> set[int]:
     return {int(stamp) for message in peer.received["refined_keyframes"] for stamp in message.stamp_ns}
 
@@ -229,9 +226,14 @@ def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(
     assert [node.stop() for node in nodes] == [0, 0]
 
 
+def lose_patience() -> None:
+    """Have the node say sooner that a clock stands still."""
+    vars(silence)["_CLOCK_PATIENCE_S"] = 0.6
+
+
 def test_simulated_time_without_a_clock_is_told(start_node: StartNode, make_peer: MakePeer) -> None:
     """By name, in the log and on /diagnostics; a clock that comes, or another parameter, ends it."""
-    node = start_node("--ros-args", "-p", "use_sim_time:=true")
+    node = start_node("--ros-args", "-p", "use_sim_time:=true", prepare=lose_patience)
     peer = make_peer()
     peer.node.create_subscription(DiagnosticArray, "/diagnostics", peer.received["/diagnostics"].append, 10)
 

@@ -55,10 +55,6 @@ def _of_camera(keyframe: Keyframe, rig: CameraRig) -> Keyframe:
     return dataclasses.replace(keyframe, position=at, orientation=geometry.quaternion_from_matrix(turn))
 
 
-def _refined_ids(peer: Any) -> set[int]:
-    return {int(key) for message in peer.received["refined_keyframes"] for key in message.keyframe_id}
-
-
 def _newest(peer: Any) -> int | None:
     """Return the keyframe of the last report."""
     reports = peer.received["report"]
@@ -80,7 +76,7 @@ def _play(peer: Any, scene: SyntheticData) -> None:
             peer.publish(image, keyframe.stamp_ns)
         peer.until(lambda key=keyframe.keyframe_id: _newest(peer) == key, f"a report on {keyframe.keyframe_id}")
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _burst(peer: Any, scene: SyntheticData) -> None:
@@ -88,7 +84,7 @@ def _burst(peer: Any, scene: SyntheticData) -> None:
     for _, stamp_ns, measurement in scene.timeline():
         peer.publish(measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in scene.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
 
 
 def _position_rms(positions: Any, truth: Any) -> float:
@@ -102,7 +98,7 @@ def _rejected(peer: Any) -> dict[str, int]:
     return dict(zip(last.rejected_reason, (int(n) for n in last.rejected_count), strict=True))
 
 
-@pytest.fixture(scope="module", params=[_play, _burst])
+@pytest.fixture(scope="class", params=[_play, _burst])
 def played(domain: int, request: pytest.FixtureRequest, scene: SyntheticData) -> Iterator[tuple[NodeProcess, Peer]]:  # noqa: ARG001
     """Return a node that has solved a scene, and who listens to it."""
     with contextlib.closing(NodeProcess()) as node, contextlib.closing(Peer()) as peer:
@@ -115,58 +111,59 @@ def played(domain: int, request: pytest.FixtureRequest, scene: SyntheticData) ->
         yield node, peer
 
 
-def test_keyframes_come_back_refined(played: tuple[NodeProcess, Peer], scene: SyntheticData) -> None:
-    last = played[1].received["refined_keyframes"][-1]
-    assert list(last.keyframe_id) == list(range(KEYFRAMES))
-    assert last.header.frame_id == "map"
-    position = np.asarray(last.position).reshape(-1, 3)
-    orientation = np.asarray(last.orientation).reshape(-1, 4)
-    np.testing.assert_allclose(np.linalg.norm(orientation, axis=1), 1.0, rtol=1e-9)
-    before = _position_rms(scene.odometry.position, scene.truth.position)
-    after = _position_rms(position, scene.truth.position)
-    assert after < before / 4, f"position error {after:.3f} m after, {before:.3f} m before"
+class TestPlayed:
+    """A node and a peer that go when these tests have seen them: others must not hear their cameras."""
 
+    def test_keyframes_come_back_refined(self, played: tuple[NodeProcess, Peer], scene: SyntheticData) -> None:
+        last = played[1].received["refined_keyframes"][-1]
+        assert list(last.keyframe_id) == list(range(KEYFRAMES))
+        assert last.header.frame_id == "map"
+        position = np.asarray(last.position).reshape(-1, 3)
+        orientation = np.asarray(last.orientation).reshape(-1, 4)
+        np.testing.assert_allclose(np.linalg.norm(orientation, axis=1), 1.0, rtol=1e-9)
+        before = _position_rms(scene.odometry.position, scene.truth.position)
+        after = _position_rms(position, scene.truth.position)
+        assert after < before / 4, f"position error {after:.3f} m after, {before:.3f} m before"
 
-def test_reports_account_for_every_keyframe(played: tuple[NodeProcess, Peer]) -> None:
-    reports = played[1].received["report"]
-    last = reports[-1]
-    assert Status(last.status).usable, last.reason
-    assert last.dropped == 0
-    assert last.rms_px_after < last.rms_px_before
-    assert (last.landmarks > 100, last.observations > 1000) == (True, True)
-    counts = [message.solve_count for message in reports]
-    assert counts == list(range(1, len(counts) + 1)), "no report is lost"
-    assert len(counts) + last.coalesced >= KEYFRAMES, "every keyframe is solved, alone or with others"
+    def test_reports_account_for_every_keyframe(self, played: tuple[NodeProcess, Peer]) -> None:
+        reports = played[1].received["report"]
+        last = reports[-1]
+        assert Status(last.status).usable, last.reason
+        assert last.dropped == 0
+        assert last.rms_px_after < last.rms_px_before
+        assert (last.landmarks > 100, last.observations > 1000) == (True, True)
+        counts = [message.solve_count for message in reports]
+        assert counts == list(range(1, len(counts) + 1)), "no report is lost"
+        assert len(counts) + last.coalesced >= KEYFRAMES, "every keyframe is solved, alone or with others"
 
+    def test_all_outputs_of_a_solve_belong_together(
+        self, played: tuple[NodeProcess, Peer], scene: SyntheticData
+    ) -> None:
+        peer, newest_ns = played[1], scene.keyframes[-1].stamp_ns
+        received = peer.received
 
-def test_all_outputs_of_a_solve_belong_together(played: tuple[NodeProcess, Peer], scene: SyntheticData) -> None:
-    peer, newest_ns = played[1], scene.keyframes[-1].stamp_ns
-    received = peer.received
+        def is_there(topic: str) -> bool:
+            return bool(received[topic]) and stamp_ns_from_message(received[topic][-1].header.stamp) == newest_ns
 
-    def is_there(topic: str) -> bool:
-        return bool(received[topic]) and stamp_ns_from_message(received[topic][-1].header.stamp) == newest_ns
+        peer.until(lambda: is_there("points") and is_there("path"), "the map after the last solve")
+        n_poses = sum(len(message.keyframe_id) for message in received["refined_keyframes"])
+        peer.until(lambda: len(received["pose"]) == n_poses, f"{n_poses} poses")
+        assert len(received["path"][-1].poses) == KEYFRAMES
+        points = received["points"][-1]
+        assert [field.name for field in points.fields] == ["x", "y", "z", "rms_px", "views"]
+        assert points.width > 100
+        assert np.isfinite(np.frombuffer(bytes(points.data), "<f4").reshape(-1, 5)[:, :3]).all()
 
-    peer.until(lambda: is_there("points") and is_there("path"), "the map after the last solve")
-    n_poses = sum(len(message.keyframe_id) for message in received["refined_keyframes"])
-    peer.until(lambda: len(received["pose"]) == n_poses, f"{n_poses} poses")
-    assert len(received["path"][-1].poses) == KEYFRAMES
-    points = received["points"][-1]
-    assert [field.name for field in points.fields] == ["x", "y", "z", "rms_px", "views"]
-    assert points.width > 100
-    assert np.isfinite(np.frombuffer(bytes(points.data), "<f4").reshape(-1, 5)[:, :3]).all()
+    def test_who_comes_late_still_gets_the_map(self, played: tuple[NodeProcess, Peer]) -> None:
+        with contextlib.closing(Peer()) as late:
+            late.listen("points", "path")
+            late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
+            assert late.received["points"][0].width == played[1].received["points"][-1].width
 
-
-def test_who_comes_late_still_gets_the_map(played: tuple[NodeProcess, Peer]) -> None:
-    with contextlib.closing(Peer()) as late:
-        late.listen("points", "path")
-        late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
-        assert late.received["points"][0].width == played[1].received["points"][-1].width
-
-
-def test_a_node_that_ends_says_what_it_has_done(played: tuple[NodeProcess, Peer]) -> None:
-    node, _ = played
-    assert node.stop() == 0, node.err
-    assert node.out == f"stopped: {KEYFRAMES} keyframes refined\n"
+    def test_a_node_that_ends_says_what_it_has_done(self, played: tuple[NodeProcess, Peer]) -> None:
+        node, _ = played
+        assert node.stop() == 0, node.err
+        assert node.out == f"stopped: {KEYFRAMES} keyframes refined\n"
 
 
 def test_bad_input_is_counted_and_nothing_is_lost(
@@ -253,7 +250,7 @@ def test_a_camera_driver_is_heard(
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
         peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
     wanted = {keyframe.keyframe_id for keyframe in mono.keyframes}
-    peer.until(lambda: _refined_ids(peer) >= wanted, f"keyframes {sorted(wanted)}")
+    peer.until(lambda: peer.refined_ids() >= wanted, f"keyframes {sorted(wanted)}")
     peer.node.destroy_timer(timer)
     assert "rig_changed" not in _rejected(peer)
 
@@ -306,9 +303,12 @@ def test_starts_with_a_file_and_a_namespace(
     peer.connect()
     _play(peer, scene)
     assert _in_solve(peer) == 4
-    types = dict(stranger.node.get_topic_names_and_types())
+    stranger.until(lambda: ("ba_node", "/car") in stranger.node.get_node_names_and_namespaces(), "the node's name")
+    types = dict(stranger.node.get_publisher_names_and_types_by_node("ba_node", "/car"))
+    types |= dict(stranger.node.get_subscriber_names_and_types_by_node("ba_node", "/car"))
     for topic, kind in OUTPUT_TYPES.items():
         assert types[f"/car/ba_node/{topic}"] == [kind], message_class(kind)
+    assert "/car/keyframes" in types
     assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
     assert node.stop(signal.SIGTERM) == 0
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ba_node.measurements import CameraRig
     from ba_node.messages.report import Report
     from ba_node.messages.topics import Topic
-    from ba_node.ros.rclpy_compat.deferred import Relay
+    from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
     from ba_node.ros.worker.inbox import Inbox
     from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
@@ -52,7 +52,7 @@ class Host:
         config: the parameters as they are now.
         inbox: where measurements and commands for the back-end go.
         worker: the solver's thread.
-        relay: brings work to the executor's thread, and knows what is owed to clients.
+        deferred: brings work to the executor's thread, and knows the answers that clients wait for.
         log: log a Notice, the same one not more often than every few seconds.
         active: True between activate and deactivate.
         ignoring: why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken.
@@ -70,7 +70,7 @@ class Host:
     config: Config
     inbox: Inbox
     worker: Worker
-    relay: Relay
+    deferred: DeferredAnswers
     log: Callable[[Notice], None]
     active: bool = False
     ignoring: set[str] = field(default_factory=lambda: {"inactive"})

@@ -70,7 +70,7 @@ class Inputs(Component):
         content = pickle.dumps(rig)
         known = self._rigs.get(topic) == content
         if topic == "camera_info" and "camera_rig" in self._rigs:
-            self.host.log(Notice("camera_info", "camera_info is ignored: camera_rig has told the cameras"))
+            self.host.log(Notice("camera_info", "camera_info is ignored: camera_rig gives the cameras"))
             return False
         if not rig.malformed:
             self._rigs[topic] = content

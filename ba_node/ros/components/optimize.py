@@ -24,8 +24,8 @@ from ba_node.messages.topics import ACTIONS
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
-from ba_node.ros.rclpy_compat.actions import LateAction
-from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Owed
+from ba_node.ros.rclpy_compat.actions import DeferredAction
+from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Answer
 
 if TYPE_CHECKING:
     from ba_node.backend import Backend, Optimization
@@ -42,7 +42,7 @@ class _Goal:
 
     handle: Any
     began_s: float
-    owed: Owed
+    answer: Answer
     stop: str = ""
     result: dict[str, Any] = field(default_factory=dict)
 
@@ -52,7 +52,7 @@ class _Goal:
 
     def end(self, status: Status, reason: str) -> None:
         """Answer, from any thread."""
-        self.owed.give_later(success=status.usable, message=reason, status=status, **self.result)
+        self.answer.send_later(success=status.usable, message=reason, status=status, **self.result)
 
 
 class Optimize(Component):
@@ -63,12 +63,12 @@ class Optimize(Component):
         super().__init__(host)
         self._goal: _Goal | None = None
         self._type = message_class(ACTIONS[_NAME].type_name)
-        self._server = LateAction(host.node, self._type, f"~/{_NAME}", self._answer, self._accept, self._cancel)
+        self._server = DeferredAction(host.node, self._type, f"~/{_NAME}", self._decide, self._accept, self._cancel)
         host.at_cleanup.callback(self._stop)
         # Who is answered at cleanup must still hear it.
         host.after_cleanup.callback(self._server.destroy)
 
-    def _answer(self, request: Any) -> Any:
+    def _decide(self, request: Any) -> Any:
         """Accept a goal, or reject it and say why in the log: the answer to a goal has no room for it."""
         try:
             reason = self._objection(request)
@@ -81,9 +81,9 @@ class Optimize(Component):
 
     def _objection(self, request: Any) -> str:
         reason = ""
-        if not self.host.relay.open:
+        if not self.host.deferred.open:
             reason = CLEANED_UP
-        elif self._goal is not None and not self._goal.owed.given:
+        elif self._goal is not None and not self._goal.answer.sent:
             reason = "another goal is at work: cancel it, or wait for its result"
         elif request.method and request.method not in _METHODS:
             reason = f"method = {request.method!r}: choose one of {', '.join(_METHODS)}"
@@ -97,10 +97,10 @@ class Optimize(Component):
         def send(success: bool, message: str, fields: dict[str, Any]) -> None:
             self._finish(goal, message, {"success": success} | fields)
 
-        owed = self.host.relay.owe(send)
-        self._goal = goal = _Goal(handle, time.monotonic(), owed)
+        answer = self.host.deferred.expect(send)
+        self._goal = goal = _Goal(handle, time.monotonic(), answer)
         try:
-            with owed.at_work():
+            with answer.guarded():
                 self._server.begin(handle)
                 self.host.inbox.post(lambda backend: self._copy(backend, goal))
         except Exception:
@@ -118,7 +118,7 @@ class Optimize(Component):
 
     def _copy(self, backend: Backend, goal: _Goal) -> None:
         """Copy the map, on the solver's thread."""
-        with goal.owed.at_work():
+        with goal.answer.guarded():
             taken = backend.begin_optimization()
             if isinstance(taken, str):
                 goal.end(Status.SKIPPED, taken)
@@ -128,7 +128,7 @@ class Optimize(Component):
 
     def _solve(self, backend: Backend, goal: _Goal, taken: Optimization) -> None:
         """Solve the copy, on a thread of its own."""
-        with goal.owed.at_work():
+        with goal.answer.guarded():
             taken = self._solved(backend, goal, taken)
             goal.result = taken.statistics()
             if goal.stop:
@@ -142,11 +142,11 @@ class Optimize(Component):
 
         def watch(row: Iteration) -> bool:
             nonlocal out_of_time
-            self.host.relay.call(lambda: self._tell(goal, row, goal.elapsed_s))
+            self.host.deferred.call(lambda: self._tell(goal, row, goal.elapsed_s))
             if not backend.is_current(taken):
                 goal.stop = goal.stop or _GONE
             out_of_time = 0.0 < request.time_budget_s <= goal.elapsed_s
-            return not (goal.stop or goal.owed.given or out_of_time)
+            return not (goal.stop or goal.answer.sent or out_of_time)
 
         choices = (self.host.config.solver, request.method, request.max_iterations)
         taken.solve(*choices, clock=time.perf_counter, on_iteration=watch)
@@ -156,8 +156,8 @@ class Optimize(Component):
 
     def _merge(self, backend: Backend, goal: _Goal, taken: Optimization) -> Estimate | None:
         """Put the result in, on the solver's thread; what it returns is published."""
-        with goal.owed.at_work():
-            merged = None if goal.stop or goal.owed.given else backend.merge(taken)
+        with goal.answer.guarded():
+            merged = None if goal.stop or goal.answer.sent else backend.merge(taken)
             if merged is None:
                 lost = taken.result.status.usable
                 reason = (goal.stop or backend.refusal or _GONE) if lost else taken.result.reason
@@ -170,7 +170,7 @@ class Optimize(Component):
 
     def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:
         """Publish feedback."""
-        if not goal.owed.given:
+        if not goal.answer.sent:
             feedback = self._type.Feedback(
                 iteration=row.iteration,
                 accepted=row.accepted,
@@ -184,7 +184,7 @@ class Optimize(Component):
     def _finish(self, goal: _Goal, reason: str, fields: dict[str, Any]) -> None:
         """Send the result of a goal; what raises before it has left may be tried again with fewer fields."""
         success = fields["success"]
-        status = fields.pop("status", Status.FAILED if self.host.relay.open else Status.SKIPPED)
+        status = fields.pop("status", Status.FAILED if self.host.deferred.open else Status.SKIPPED)
         result = self._type.Result(reason=reason, status=int(status), elapsed_s=goal.elapsed_s, **fields)
         self._server.finish(goal.handle, success=success, result=result)
         severity = Severity.INFO if success else Severity.WARNING

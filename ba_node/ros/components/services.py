@@ -17,7 +17,7 @@ from ba_node.io.map_folder import MapPathError, path_in_folder
 from ba_node.messages.topics import SERVICES
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
-from ba_node.ros.rclpy_compat.deferred import LateService, Owed
+from ba_node.ros.rclpy_compat.deferred import Answer, DeferredService
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,30 +34,30 @@ class Services(Component):
     def __init__(self, host: Host) -> None:
         """Advertise."""
         super().__init__(host)
-        self._busy: Owed | None = None
+        self._busy: Answer | None = None
         begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}
         for name, command in SERVICES.items():
-            LateService(self, message_class(command.type_name), f"~/{name}", begin[name])
+            DeferredService(self, message_class(command.type_name), f"~/{name}", begin[name])
 
-    def _reset(self, _request: Any, answer: Owed) -> None:
+    def _reset(self, _request: Any, answer: Answer) -> None:
         def reset(backend: Backend) -> Estimate:
             keyframes = backend.map.keyframe_count
             backend.reset()
             text = f"forgot {keyframes} keyframes; the next keyframe begins a new map"
-            answer.give_later(success=True, message=text)
+            answer.send_later(success=True, message=text)
             return backend.estimate()
 
         self._post(answer, reset)
 
-    def _pause(self, request: Any, answer: Owed) -> None:
+    def _pause(self, request: Any, answer: Answer) -> None:
         """Ignore data, or take it again. What a solver has begun with goes on."""
         ignoring = self.host.ignoring
         was = _PAUSED in ignoring
         (ignoring.add if request.data else ignoring.discard)(_PAUSED)
         text = "paused: keyframes and tracks are ignored and counted" if request.data else "running"
-        answer.give(success=True, message=f"{text}{' (as before)' if was == request.data else ''}")
+        answer.send(success=True, message=f"{text}{' (as before)' if was == request.data else ''}")
 
-    def _save(self, request: Any, answer: Owed) -> None:
+    def _save(self, request: Any, answer: Answer) -> None:
         path = self._begin_file(request.path, answer, to_write=True)
         if path is None:
             return
@@ -69,68 +69,68 @@ class Services(Component):
 
         self._post(answer, copy)
 
-    def _write(self, path: Path, content: MapContent, answer: Owed) -> None:
+    def _write(self, path: Path, content: MapContent, answer: Answer) -> None:
         try:
             write_map(path, content)
         except OSError as error:
             text = f"cannot write {path}: {error.strerror or error}; nothing was saved"
-            answer.give_later(success=False, message=text)
+            answer.send_later(success=False, message=text)
             return
         counts = content.sizes()
-        answer.give_later(success=True, message=f"{path}: {_told(counts)}", **counts)
+        answer.send_later(success=True, message=f"{path}: {_listed(counts)}", **counts)
 
-    def _load(self, request: Any, answer: Owed) -> None:
+    def _load(self, request: Any, answer: Answer) -> None:
         path = self._begin_file(request.path, answer, to_write=False)
         if path is not None:
             # Nothing is lost with a read that does not come to its end.
             self._in_thread(answer, lambda: self._read(path, answer), daemon=True)
 
-    def _read(self, path: Path, answer: Owed) -> None:
+    def _read(self, path: Path, answer: Answer) -> None:
         try:
             known = load_map(path, self.host.config.scene)
         except MapFileError as error:
-            answer.give_later(success=False, message=f"{error}; the map is as before")
+            answer.send_later(success=False, message=f"{error}; the map is as before")
             return
 
         def take_over(backend: Backend) -> Estimate:
             backend.take_over(known)
             counts = known.sizes()
-            text = f"{path}: {_told(counts)} of session {backend.map.session_id}"
-            answer.give_later(success=True, message=text, **counts, session_id=backend.map.session_id)
+            text = f"{path}: {_listed(counts)} of session {backend.map.session_id}"
+            answer.send_later(success=True, message=text, **counts, session_id=backend.map.session_id)
             return backend.estimate()
 
         self._post(answer, take_over)
 
-    def _begin_file(self, name: str, answer: Owed, *, to_write: bool) -> Path | None:
+    def _begin_file(self, name: str, answer: Answer, *, to_write: bool) -> Path | None:
         """Return the path to work on, or None after saying why not."""
-        if self._busy is not None and not self._busy.given:
+        if self._busy is not None and not self._busy.sent:
             text = "another map is being saved or loaded: try again when that is done"
-            answer.give(success=False, message=text)
+            answer.send(success=False, message=text)
             return None
         try:
             path = path_in_folder(name, self.host.config.node.map_folder, to_write=to_write)
         except MapPathError as error:
-            answer.give(success=False, message=str(error))
+            answer.send(success=False, message=str(error))
             return None
         self._busy = answer
         return path
 
-    def _post(self, answer: Owed, command: Callable[[Backend], Estimate | None]) -> None:
+    def _post(self, answer: Answer, command: Callable[[Backend], Estimate | None]) -> None:
         """Have the solver's thread do something."""
 
         def guarded(backend: Backend) -> Estimate | None:
-            with answer.at_work():
+            with answer.guarded():
                 return command(backend)
 
         self.host.inbox.post(guarded)
 
-    def _in_thread(self, answer: Owed, action: Callable[[], None], *, daemon: bool) -> None:
+    def _in_thread(self, answer: Answer, action: Callable[[], None], *, daemon: bool) -> None:
         def guarded() -> None:
-            with answer.at_work():
+            with answer.guarded():
                 action()
 
         threading.Thread(target=guarded, name="map file", daemon=daemon).start()
 
 
-def _told(counts: dict[str, int]) -> str:
+def _listed(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())

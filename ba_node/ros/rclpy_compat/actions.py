@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 _FEEDBACK_DEPTH = 100
 
 
-class LateAction:
+class DeferredAction:
     """An action server; all its callbacks, and its methods, are for the executor's thread.
 
     Args:
         node: whose action it is.
         kind: type of the action.
         name: its name.
-        judge: called with each request; returns whether it becomes a goal.
+        decide: called with each request; returns whether it becomes a goal.
         accept: called with the handle of each goal, which it passes to :meth:`begin`, and later to :meth:`finish`.
         cancel: called with the handle of a goal that is to end.
     """
@@ -38,7 +38,7 @@ class LateAction:
         node: Any,
         kind: Any,
         name: str,
-        judge: Callable[[Any], Any],
+        decide: Callable[[Any], Any],
         accept: Callable[[Any], None],
         cancel: Callable[[Any], Any],
     ) -> None:
@@ -49,7 +49,7 @@ class LateAction:
             kind,
             name,
             execute_callback=self._wait,
-            goal_callback=judge,
+            goal_callback=decide,
             handle_accepted_callback=accept,
             cancel_callback=cancel,
             feedback_pub_qos_profile=QoSProfile(depth=_FEEDBACK_DEPTH),

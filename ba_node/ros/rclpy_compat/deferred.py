@@ -6,9 +6,9 @@ rclpy's way to answer later is a coroutine as callback. It keeps its callback gr
 callbacks of the group wait for it, and it is resumed by looking again each time the executor wakes up; when the service
 is destroyed meanwhile, the caller never hears. So here the callback returns at once, and what rclpy would send is kept.
 
-What a client waits for is an :class:`Owed`, and the relay knows all of them. Whoever works on one does so inside
-``with owed.at_work()``: what is raised there, in any thread, becomes the answer. What is owed when the solver's thread
-is found dead, or when the node is cleaned up, is answered then.
+What a client waits for is an :class:`Answer`; :class:`DeferredAnswers` knows all of them. Whoever works on one does so
+inside ``with answer.guarded()``: what is raised there, in any thread, becomes the answer. Who still waits when the
+solver's thread is found dead, or when the node is cleaned up, is answered then.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ DEAD = "the solver's thread has ended: start the node anew"
 _LOOK_S = 0.5
 
 
-class Relay:
-    """Runs things on the executor's thread, in order, and keeps what is owed to clients; until cleanup.
+class DeferredAnswers:
+    """Runs things on the executor's thread, in order, and keeps the answers that clients wait for; until cleanup.
 
     Attributes:
         left_waiting: clients that were answered because of a cleanup, when that was.
@@ -50,7 +50,7 @@ class Relay:
         self._node = node
         self._solver_lives = solver_lives
         self._actions: deque[Callable[[], None]] = deque()
-        self._owed: dict[Owed, None] = {}
+        self._expected: dict[Answer, None] = {}
         self._lock = threading.Lock()
         self._open = True
         self.left_waiting = 0
@@ -63,17 +63,17 @@ class Relay:
         """Return False once the node was cleaned up."""
         return self._open
 
-    def owe(self, send: Send) -> Owed:
-        """Return a new answer that is owed; at cleanup and after it is given at once."""
-        owed = Owed(self, self._node, send)
-        self._owed[owed] = None
+    def expect(self, send: Send) -> Answer:
+        """Return an answer that a client waits for; at cleanup and after it is sent at once."""
+        answer = Answer(self, self._node, send)
+        self._expected[answer] = None
         if not self._open:
-            owed.give(success=False, message=CLEANED_UP)
-        return owed
+            answer.send(success=False, message=CLEANED_UP)
+        return answer
 
-    def settled(self, owed: Owed) -> None:
-        """Forget what is owed no longer."""
-        self._owed.pop(owed, None)
+    def forget(self, answer: Answer) -> None:
+        """Forget an answer that nobody waits for any more."""
+        self._expected.pop(answer, None)
 
     def call(self, action: Callable[[], None]) -> None:
         """Have something run on the executor's thread. May be called from any; after cleanup it does nothing."""
@@ -89,7 +89,7 @@ class Relay:
         with self._lock:
             self._open = False
         self._run()
-        self.left_waiting = len(self._owed)
+        self.left_waiting = len(self._expected)
         self._give_up(CLEANED_UP)
         self._node.destroy_guard_condition(self._guard)
         self._node.destroy_timer(self._timer)
@@ -107,32 +107,32 @@ class Relay:
 
     def _look(self) -> None:
         self._run()
-        if self._owed and not self._solver_lives():
+        if self._expected and not self._solver_lives():
             self._give_up(DEAD)
 
     def _give_up(self, reason: str) -> None:
-        for owed in list(self._owed):
-            owed.give(success=False, message=reason)
+        for answer in list(self._expected):
+            answer.send(success=False, message=reason)
 
 
-class Owed:
-    """An answer that is owed to a client: given once, on the executor's thread."""
+class Answer:
+    """An answer that a client waits for: sent once, on the executor's thread."""
 
-    def __init__(self, relay: Relay, node: Any, send: Send) -> None:
-        self.given = False
-        self._relay = relay
+    def __init__(self, deferred: DeferredAnswers, node: Any, send: Send) -> None:
+        self.sent = False
+        self._answers = deferred
         self._node = node
         self._send = send
 
-    def give(self, *, success: bool, message: str, **fields: Any) -> None:
+    def send(self, *, success: bool, message: str, **fields: Any) -> None:
         """Send the answer. If it cannot be sent as it is, the client hears that; if it has gone, that is its business.
 
         Raises nothing. To be called on the executor's thread.
         """
-        if self.given:
+        if self.sent:
             return
-        self.given = True
-        self._relay.settled(self)
+        self.sent = True
+        self._answers.forget(self)
         try:
             self._send(success, printable(message), fields)
         except RCLError:
@@ -143,31 +143,31 @@ class Owed:
             with contextlib.suppress(Exception):
                 self._send(False, reason, {})
 
-    def give_later(self, *, success: bool, message: str, **fields: Any) -> None:
+    def send_later(self, *, success: bool, message: str, **fields: Any) -> None:
         """Send the answer, from any thread."""
-        self._relay.call(lambda: self.give(success=success, message=message, **fields))
+        self._answers.call(lambda: self.send(success=success, message=message, **fields))
 
     @contextlib.contextmanager
-    def at_work(self) -> Iterator[None]:
+    def guarded(self) -> Iterator[None]:
         """Work on the answer, in any thread: what is raised becomes the answer, and goes on."""
         try:
             yield
         except BaseException as error:
-            self.give_later(success=False, message=fault(error))
+            self.send_later(success=False, message=fault(error))
             raise
 
 
-class LateService:
+class DeferredService:
     """A service that answers later.
 
     Args:
         component: whose service it is.
         kind: type of the service; its response has ``success`` and ``message``.
         name: its name.
-        begin: called with each request and the answer that is owed for it; must not block.
+        begin: called with each request and the answer to it; must not block.
     """
 
-    def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Owed], None]) -> None:
+    def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Answer], None]) -> None:
         self._begin = begin
         self._kind = kind
         self._host: Host = component.host
@@ -183,11 +183,11 @@ class LateService:
             self._send(self._kind.Response(success=success, message=message, **fields), header)
             log(self._host.node, Severity.INFO if success else Severity.WARNING, message)
 
-        owed = self._host.relay.owe(send)
-        if owed.given:
+        answer = self._host.deferred.expect(send)
+        if answer.sent:
             return
         try:
-            with owed.at_work():
-                self._begin(request, owed)
+            with answer.guarded():
+                self._begin(request, answer)
         except Exception:
             log(self._host.node, Severity.ERROR, f"{self._service.srv_name}: {traceback.format_exc()}")

@@ -25,6 +25,22 @@ if TYPE_CHECKING:
 _SET = "rcl_interfaces/SetParametersResult"
 
 
+def _guarded(method: str, name: str = "") -> Callable[[ManagedNode, Any], Any]:
+    """Return what rclpy calls for a transition: runs a method of the node, and says how it went."""
+
+    def run(node: ManagedNode, _state: Any) -> Any:
+        try:
+            getattr(node, method)()
+        except Exception as error:
+            text = f"{name or method} failed: {type(error).__name__}: {error}"
+            log(node, Severity.ERROR, f"{text}\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.ERROR
+        log(node, Severity.INFO, f"{name or method}: done")
+        return TransitionCallbackReturn.SUCCESS
+
+    return run
+
+
 class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     """A lifecycle node whose transitions are the methods below; each may raise."""
 
@@ -68,39 +84,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
             self._tell(transition)
         return bool(done)
 
-    def on_configure(self, _state: Any) -> Any:
-        """Configure, for rclpy."""
-        return self._guarded("configure", self.configure)
-
-    def on_activate(self, _state: Any) -> Any:
-        """Activate, for rclpy."""
-        return self._guarded("activate", self.activate)
-
-    def on_deactivate(self, _state: Any) -> Any:
-        """Deactivate, for rclpy."""
-        return self._guarded("deactivate", self.deactivate)
-
-    def on_cleanup(self, _state: Any) -> Any:
-        """Clean up, for rclpy."""
-        return self._guarded("cleanup", self.cleanup)
-
-    def on_shutdown(self, _state: Any) -> Any:
-        """Shut down, for rclpy, from any state."""
-        return self._guarded("shutdown", self.cleanup)
-
-    def on_error(self, _state: Any) -> Any:
-        """Release everything after a transition that raised: rclpy then goes back to unconfigured."""
-        return self._guarded("cleanup after the error", self.cleanup)
-
-    def _guarded(self, name: str, action: Callable[[], None]) -> Any:
-        try:
-            action()
-        except Exception as error:
-            text = f"{name} failed: {type(error).__name__}: {error}"
-            log(self, Severity.ERROR, f"{text}\n{traceback.format_exc()}")
-            return TransitionCallbackReturn.ERROR
-        log(self, Severity.INFO, f"{name}: done")
-        return TransitionCallbackReturn.SUCCESS
+    on_configure, on_activate = _guarded("configure"), _guarded("activate")
+    on_deactivate, on_cleanup = _guarded("deactivate"), _guarded("cleanup")
+    on_shutdown = _guarded("cleanup", "shutdown")
+    # After a transition that raised: rclpy then goes back to unconfigured.
+    on_error = _guarded("cleanup", "cleanup after the error")
 
     def _on_request(self, request: Any, response: Any) -> Any:
         """Answer a request of `ros2 lifecycle set`."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,7 +39,7 @@ MAX_ID = 2**24
 MAX_CAMERA = 2**16
 _DEPTH = 100
 # Images that wait for their pose, and poses that wait for their image.
-_MAX_WAITING = 200
+MAX_WAITING = 200
 _LOG_PERIOD_S = 5.0
 
 
@@ -83,30 +83,6 @@ def keyframe_from_odometry(odometry: Any, session_id: int) -> Keyframe:
     return Keyframe(session_id, stamp_ns, stamp_ns, odometry.header.frame_id, position, orientation)
 
 
-class Waiting:
-    """Messages by stamp that wait for the other one of their pair, the newest ``size`` of them."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._messages: OrderedDict[int, Any] = OrderedDict()
-
-    def put(self, stamp_ns: int, message: Any) -> int:
-        """Add a message; return how many were dropped for it."""
-        self._messages[stamp_ns] = message
-        if len(self._messages) <= self._size:
-            return 0
-        self._messages.popitem(last=False)
-        return 1
-
-    def take(self, stamp_ns: int) -> Any | None:
-        """Return the message of a stamp and forget it; None if there is none."""
-        return self._messages.pop(stamp_ns, None)
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._messages.clear()
-
-
 class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
     """The converter node.
 
@@ -121,7 +97,9 @@ class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
         self.sent = 0
         self.counted: Counter[str] = Counter()
         self._session_id = 0
-        self._features, self._odometry = Waiting(_MAX_WAITING), Waiting(_MAX_WAITING)
+        # By stamp, ns; the newest of them.
+        self._features: dict[int, Any] = {}
+        self._odometry: dict[int, Any] = {}
         self._factory = RclpyFactory()
         self._throttle = Throttle(_LOG_PERIOD_S)
         self._out = {
@@ -137,19 +115,19 @@ class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
 
     def _on_features(self, cloud: Any) -> None:
         stamp_ns = stamp_ns_from_message(cloud.header.stamp)
-        odometry = self._odometry.take(stamp_ns)
+        odometry = self._odometry.pop(stamp_ns, None)
         if odometry is None:
-            self.counted["no_keyframe"] += self._features.put(stamp_ns, cloud)
+            self.counted["no_keyframe"] += keep(self._features, stamp_ns, cloud)
         else:
             self._send(odometry, cloud)
 
     def _on_odometry(self, odometry: Any) -> None:
         stamp_ns = stamp_ns_from_message(odometry.header.stamp)
-        cloud = self._features.take(stamp_ns)
+        cloud = self._features.pop(stamp_ns, None)
         if cloud is not None:
             self._send(odometry, cloud)
-        elif self._odometry.put(stamp_ns, odometry):
-            self._drop("no_features", f"{_MAX_WAITING} poses wait for features of the same stamp")
+        elif keep(self._odometry, stamp_ns, odometry):
+            self._drop("no_features", f"{MAX_WAITING} poses wait for features of the same stamp")
 
     def _on_restart(self, restart: Any) -> None:
         """Begin a new session: ids of features begin anew."""
@@ -176,6 +154,15 @@ class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
         self.counted[reason] += 1
         if self._throttle.passes(reason, time.monotonic()):
             self.get_logger().warning(f"{what}; dropped ({reason} = {self.counted[reason]})")
+
+
+def keep(waiting: dict[int, Any], stamp_ns: int, message: Any) -> int:
+    """Have a message wait for the other one of its pair; return how many were dropped for it."""
+    waiting[stamp_ns] = message
+    if len(waiting) <= MAX_WAITING:
+        return 0
+    del waiting[next(iter(waiting))]
+    return 1
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -55,7 +55,7 @@ class KeyframeAccounts:
         self._unrefined.discard((session_id, keyframe_id))
         self.rejected += 1
 
-    def settle(self, current: CurrentMap, refined: Collection[int], held: Collection[Key] = ()) -> None:
+    def close(self, current: CurrentMap, refined: Collection[int], held: Collection[Key] = ()) -> None:
         """Close the accounts of a solve.
 
         Args:

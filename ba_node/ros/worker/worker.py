@@ -231,7 +231,7 @@ class Worker:
         report = estimate.report
         refined = set(estimate.refined.keyframe_id.tolist()) if report.status.usable else set()
         held = {(one.session_id, one.keyframe_id) for one in self._backend.held}
-        self._keyframes.settle(self._backend.map, refined, held)
+        self._keyframes.close(self._backend.map, refined, held)
         if self._budget.spent and report.status is Status.MAX_ITERATIONS:
             budget_ms = self._backend.config.node.latency_budget_ms
             spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
@@ -270,20 +270,20 @@ class Worker:
             self._put(Outcome(self._backend.report, self._queue(), self._backend.stamp_ns))
 
     def _log_rejections(self) -> None:
-        rejected, told = Counter(self._backend.rejected), []
+        rejected, notices = Counter(self._backend.rejected), []
         if self._backend.map_index != self._logged_map:
             self._logged_map, self._logged, self._warned = self._backend.map_index, Counter(), set()
         for reason in sorted(rejected - self._logged):
             notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
-            told.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
+            notices.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
         self._logged = rejected
         # What is a rejection too has been told with its count.
-        heads = tuple(notice.text[:_HEAD] for notice in told)
+        heads = tuple(notice.text[:_HEAD] for notice in notices)
         warnings = self._backend.warnings
         news = [text for text in warnings if text not in self._warned]
         self._warned = set(warnings)
-        told += [Notice(f"warning {text[:_HEAD]}", text) for text in news if text[:_HEAD] not in heads]
-        for notice in told:
+        notices += [Notice(f"warning {text[:_HEAD]}", text) for text in news if text[:_HEAD] not in heads]
+        for notice in notices:
             self._put(notice)
 
     def _guard(self, action: Callable[..., None], *arguments: object) -> None:

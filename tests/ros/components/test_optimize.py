@@ -75,26 +75,12 @@ def client(peer: Any) -> Iterator[Client]:
     made.close()
 
 
-def _play(peer: Any, scene: SyntheticData, *keyframes: int) -> None:
-    """Publish some keyframes, each when the one before was solved."""
-    peer.publish(scene.rig)
-    for i in keyframes:
-        keyframe = scene.keyframes[i]
-        peer.publish(keyframe)
-        for image in scene.tracks[i]:
-            peer.publish(image, keyframe.stamp_ns)
-        key = keyframe.keyframe_id
-        peer.until(
-            lambda key=key: any(r.newest_keyframe_id == key for r in peer.received["report"]), f"report on {key}"
-        )
-
-
 def test_everything_is_refined_with_feedback(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData
 ) -> None:
     node = start_node(*SMALL_WINDOW)
     peer.connect()
-    _play(peer, scene, *range(KEYFRAMES))
+    peer.play_keyframes(scene, *range(KEYFRAMES))
     handle = client.send(method="lma_cd", max_iterations=8)
     assert handle.accepted
     response = client.result(handle.get_result_async())
@@ -125,7 +111,7 @@ def test_one_at_a_time_and_cancel(
 ) -> None:
     node = start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
-    _play(peer, scene, *range(6))
+    peer.play_keyframes(scene, *range(6))
     before = [p.pose.position.x for p in peer.received["path"][-1].poses]
     gates.shut("optimize")
     handle = client.send()
@@ -140,7 +126,7 @@ def test_one_at_a_time_and_cancel(
     assert response.status == GoalStatus.STATUS_CANCELED
     assert (response.result.success, response.result.status) == (False, Status.SKIPPED)
     assert response.result.reason == "cancelled; the map is as it was"
-    _play(peer, scene, 6)
+    peer.play_keyframes(scene, 6)
     after = [p.pose.position.x for p in peer.received["path"][-1].poses]
     np.testing.assert_array_equal(after[:2], before[:2])
     assert node.stop() == 0
@@ -152,11 +138,11 @@ def test_windows_go_on_and_follow(
 ) -> None:
     start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
-    _play(peer, scene, *range(8))
+    peer.play_keyframes(scene, *range(8))
     gates.shut("optimize")
     handle = client.send()
     peer.until(lambda: gates.waits("optimize"), "the solve")
-    _play(peer, scene, *range(8, KEYFRAMES))
+    peer.play_keyframes(scene, *range(8, KEYFRAMES))
     assert gates.waits("optimize"), "windows were solved during it"
     gates.open("optimize")
     result = client.result(handle.get_result_async()).result
@@ -171,7 +157,7 @@ def test_windows_go_on_and_follow(
 def test_reset_aborts_it(start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any) -> None:
     start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
-    _play(peer, scene, *range(6))
+    peer.play_keyframes(scene, *range(6))
     gates.shut("optimize")
     handle = client.send()
     peer.until(lambda: gates.waits("optimize"), "the solve")
@@ -185,7 +171,7 @@ def test_reset_aborts_it(start_node: StartNode, peer: Any, client: Client, scene
 def test_time_is_up(start_node: StartNode, peer: Any, client: Client, scene: SyntheticData) -> None:
     start_node(*SMALL_WINDOW)
     peer.connect()
-    _play(peer, scene, *range(6))
+    peer.play_keyframes(scene, *range(6))
     result = client.result(client.send(time_budget_s=1e-9).get_result_async()).result
     assert (result.success, result.status) == (True, Status.MAX_ITERATIONS)
     assert result.reason == "stopped after 1e-09 s"
@@ -215,7 +201,7 @@ def test_answers_that_warn_and_inform_in_turn(
     statuses = []
     for part in (None, range(6), range(0), range(6, KEYFRAMES)):
         if part:
-            _play(peer, scene, *part)
+            peer.play_keyframes(scene, *part)
         elif part is not None:
             assert peer.call(Trigger, "ba_node/reset", Trigger.Request()).success
         statuses.append(client.result(client.send(max_iterations=3).get_result_async()).status)
@@ -238,7 +224,7 @@ def test_the_node_ends_during_it(
 ) -> None:
     node = start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
-    _play(peer, scene, *range(5))
+    peer.play_keyframes(scene, *range(5))
     gates.shut("optimize")
     handle = client.send()
     peer.until(lambda: gates.waits("optimize"), "the solve")

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from ba_msgs.srv import LoadMap, SaveMap
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import SetBool, Trigger
 
@@ -55,25 +54,6 @@ def peer(make_peer: MakePeer) -> Any:
     return made
 
 
-def _send(peer: Any, scene: SyntheticData, *keyframes: int) -> None:
-    """Publish the rig and some keyframes."""
-    peer.publish(scene.rig)
-    for i in keyframes:
-        peer.publish(scene.keyframes[i])
-        for image in scene.tracks[i]:
-            peer.publish(image, scene.keyframes[i].stamp_ns)
-
-
-def _play(peer: Any, scene: SyntheticData, *keyframes: int) -> None:
-    """Publish some keyframes, and wait until the last of them was solved."""
-    for i in keyframes:
-        _send(peer, scene, i)
-        key = scene.keyframes[i].keyframe_id
-        peer.until(
-            lambda key=key: any(r.newest_keyframe_id == key for r in peer.received["report"]), f"report on {key}"
-        )
-
-
 def _forget(peer: Any) -> None:
     for messages in peer.received.values():
         messages.clear()
@@ -95,15 +75,10 @@ def _load(peer: Any, path: Path | str) -> Any:
     return peer.call(LoadMap, "ba_node/load_map", LoadMap.Request(path=str(path)))
 
 
-def _change(peer: Any, number: int) -> bool:
-    request = ChangeState.Request(transition=Transition(id=number))
-    return bool(peer.call(ChangeState, "ba_node/change_state", request).success)
-
-
 def test_reset_forgets_the_map_and_says_so(start_node: StartNode, peer: Any, scene: SyntheticData) -> None:
     node = start_node()
     peer.connect()
-    _play(peer, scene, *range(4))
+    peer.play_keyframes(scene, *range(4))
     peer.until(lambda: peer.received["path"] and len(peer.received["path"][-1].poses) == 4, "a path of 4")
     answer = _reset(peer)
     assert (answer.success, answer.message) == (True, "forgot 4 keyframes; the next keyframe begins a new map")
@@ -113,7 +88,7 @@ def test_reset_forgets_the_map_and_says_so(start_node: StartNode, peer: Any, sce
     assert peer.received["report"][-1].status == Status.SKIPPED
     _forget(peer)
     # The same keyframes of the same session are news again.
-    _play(peer, scene, *range(3))
+    peer.play_keyframes(scene, *range(3))
     peer.until(lambda: peer.received["path"] and len(peer.received["path"][-1].poses) == 3, "a path of 3")
     assert node.stop() == 0
 
@@ -121,13 +96,13 @@ def test_reset_forgets_the_map_and_says_so(start_node: StartNode, peer: Any, sce
 def test_data_is_ignored_and_counted_while_paused(start_node: StartNode, peer: Any, scene: SyntheticData) -> None:
     start_node()
     peer.connect()
-    _play(peer, scene, *range(3))
+    peer.play_keyframes(scene, *range(3))
     assert _pause(peer, True).message == "paused: keyframes and tracks are ignored and counted"
     assert _pause(peer, True).message.endswith("(as before)")
-    _send(peer, scene, 3, 4)
+    peer.publish_keyframes(scene, 3, 4)
     # What is asked for after data on another connection may overtake it: keyframes 5 and on end the pause.
     assert _pause(peer, False).message == "running"
-    _play(peer, scene, *range(5, KEYFRAMES))
+    peer.play_keyframes(scene, *range(5, KEYFRAMES))
     last = peer.received["report"][-1]
     rejected = dict(zip(last.rejected_reason, last.rejected_count, strict=True))
     assert rejected.get("paused", 0) > 0, rejected
@@ -140,7 +115,7 @@ def test_a_saved_map_goes_on_in_another_node(
 ) -> None:
     first = start_node()
     peer.connect()
-    _play(peer, scene, *range(5))
+    peer.play_keyframes(scene, *range(5))
     path = tmp_path / "site.npz"
     saved = _save(peer, path)
     assert saved.success, saved.message
@@ -160,7 +135,7 @@ def test_a_saved_map_goes_on_in_another_node(
     peer.until(lambda: peer.received["path"] and len(peer.received["path"][-1].poses) == 5, "the path of the map")
     shown = [(p.pose.position.x, p.pose.position.y, p.pose.position.z) for p in peer.received["path"][-1].poses]
     np.testing.assert_array_equal(shown, positions)
-    _play(peer, scene, *range(5, KEYFRAMES))
+    peer.play_keyframes(scene, *range(5, KEYFRAMES))
     assert Status(peer.received["report"][-1].status).usable
     peer.until(lambda: len(peer.received["path"][-1].poses) == KEYFRAMES, "the path of all")
     assert second.stop() == 0
@@ -171,7 +146,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
 ) -> None:
     node = start_node()
     peer.connect()
-    _play(peer, scene, *range(3))
+    peer.play_keyframes(scene, *range(3))
     (tmp_path / "text.npz").write_text("hello")
     (tmp_path / "folder.npz").mkdir()
     (tmp_path / "link.npz").symlink_to("/dev/zero")
@@ -215,7 +190,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
         assert (answer.success, answer.keyframes) == (False, 0)
         assert re.search(reason, answer.message), answer.message
     # The map is as it was.
-    _play(peer, scene, 3)
+    peer.play_keyframes(scene, 3)
     peer.until(lambda: len(peer.received["path"][-1].poses) == 4, "the path of the map and one more")
     assert node.stop() == 0
 
@@ -225,9 +200,9 @@ def test_an_answer_does_not_wait_for_a_solve(
 ) -> None:
     node = start_node(**gates.options)
     peer.connect()
-    _play(peer, scene, *range(3))
+    peer.play_keyframes(scene, *range(3))
     gates.shut("solver")
-    _send(peer, scene, 3)
+    peer.publish_keyframes(scene, 3)
     peer.until(lambda: gates.waits("solver"), "a solve")
     n_reports = len(peer.received["report"])
     saving = peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
@@ -254,17 +229,17 @@ def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: Syntheti
     def offered() -> set[str]:
         return names & {name for name, _ in peer.node.get_service_names_and_types()}
 
-    assert _change(peer, Transition.TRANSITION_CONFIGURE)
+    assert peer.change_state(number=Transition.TRANSITION_CONFIGURE)
     peer.until(lambda: offered() == names, "services of a configured node")
     assert _save(peer, tmp_path / "empty.npz").message.endswith("0 keyframes, 0 landmarks, 0 observations")
     assert _load(peer, tmp_path / "empty.npz").success
     assert _reset(peer).message.startswith("forgot 0 keyframes")
-    assert _change(peer, Transition.TRANSITION_ACTIVATE)
+    assert peer.change_state(number=Transition.TRANSITION_ACTIVATE)
     peer.connect()
-    _play(peer, scene, *range(3))
-    assert _change(peer, Transition.TRANSITION_DEACTIVATE)
+    peer.play_keyframes(scene, *range(3))
+    assert peer.change_state(number=Transition.TRANSITION_DEACTIVATE)
     assert _save(peer, tmp_path / "three.npz").keyframes == 3
-    assert _change(peer, Transition.TRANSITION_CLEANUP)
+    assert peer.change_state(number=Transition.TRANSITION_CLEANUP)
     # The clients of the peer count as such in the graph, so they are asked instead.
     peer.until(lambda: not any(peer.offers(f"ba_node/{name}") for name in SERVICES), "services to go")
     assert peer.offers("ba_node/change_state")
@@ -275,20 +250,20 @@ def test_who_waits_at_cleanup_is_answered(
 ) -> None:
     node = start_node(**gates.options)
     peer.connect()
-    _play(peer, scene, *range(3))
+    peer.play_keyframes(scene, *range(3))
     gates.shut("solver")
-    _send(peer, scene, 3)
+    peer.publish_keyframes(scene, 3)
     peer.until(lambda: gates.waits("solver"), "a solve")
     saving = peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
     # Requests of one client keep their order, those of two do not: so the node has the one before.
     assert _save(peer, tmp_path / "b.npz").message.startswith("another map is being saved")
-    assert _change(peer, Transition.TRANSITION_DEACTIVATE)
-    assert _change(peer, Transition.TRANSITION_CLEANUP)
+    assert peer.change_state(number=Transition.TRANSITION_DEACTIVATE)
+    assert peer.change_state(number=Transition.TRANSITION_CLEANUP)
     peer.until(saving.done, "an answer")
     assert saving.result().message == "the node was cleaned up meanwhile"
     # The service lingers so that the answer is heard; a configured node has one of its own.
     peer.until(lambda: not peer.offers("ba_node/save_map"), "the service to go")
-    assert _change(peer, Transition.TRANSITION_CONFIGURE)
+    assert peer.change_state(number=Transition.TRANSITION_CONFIGURE)
     assert _save(peer, tmp_path / "b.npz").message.endswith("0 keyframes, 0 landmarks, 0 observations")
     gates.open("solver")
     assert node.stop() == 0
@@ -300,7 +275,7 @@ def test_a_file_is_written_to_the_end(
 ) -> None:
     node = start_node(**gates.options)
     peer.connect()
-    _play(peer, scene, *range(3))
+    peer.play_keyframes(scene, *range(3))
     gates.shut("map file")
     peer.send(SaveMap, "ba_node/save_map", SaveMap.Request(path=str(tmp_path / "a.npz")))
     peer.until(lambda: gates.waits("map file"), "the file")

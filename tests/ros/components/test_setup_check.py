@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ba_node.estimate import Status
-from ba_node.synthetic import SyntheticData
 from tests.check.set_ups import recording
 
 pytestmark = pytest.mark.dds
@@ -26,19 +25,12 @@ def peer(make_peer: Callable[..., Any]) -> Any:
     return made
 
 
-def _send(peer: Any, data: SyntheticData, k: int) -> None:
-    peer.publish(data.rig)
-    peer.publish(data.keyframes[k])
-    for image in data.tracks[k]:
-        peer.publish(image, data.keyframes[k].stamp_ns)
-
-
 def test_wrong_baseline_is_said_and_held(start_node: Callable[..., Any], peer: Any) -> None:
     start_node()
     peer.connect()
     data = recording(wrong="baseline reversed", path="line", keyframes=KEYFRAMES, length_m=10.0)
     for k in range(KEYFRAMES):
-        _send(peer, data, k)
+        peer.publish_keyframes(data, k)
         peer.await_report(0, data.keyframes[k].keyframe_id)
 
     def held() -> bool:

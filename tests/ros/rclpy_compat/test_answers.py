@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 import functools
 import importlib
 from collections.abc import Callable, Iterator
@@ -47,12 +48,12 @@ FAULTS = {
     "counts": ("ba_node.scene.map_content", "MapContent.sizes", "IndexError"),
     "read": ("ba_node.ros.components.services", "load_map", "MemoryError"),
     "take_over": ("ba_node.backend", "Backend.take_over", "KeyError"),
-    "known": ("ba_node.backend.archive", "Known.sizes", "ValueError"),
+    "known": ("ba_node.backend.archive", "MapState.sizes", "ValueError"),
     "logger": ("rclpy.impl.rcutils_logger", "RcutilsLogger.log", "ValueError"),
-    "copy": ("ba_node.window.full", "copy", "IndexError"),
+    "copy": ("ba_node.window.full", "take_snapshot", "IndexError"),
     "options": ("ba_node.window.full", "options", "KeyError"),
-    "solve": ("ba_node.window.full", "Copy.solve", "FloatingPointError"),
-    "solve_exit": ("ba_node.window.full", "Copy.solve", "SystemExit"),
+    "solve": ("ba_node.window.full", "Optimization.solve", "FloatingPointError"),
+    "solve_exit": ("ba_node.window.full", "Optimization.solve", "SystemExit"),
     "figures": ("ba_node.window.full", "Optimization.statistics", "TypeError"),
     "merge": ("ba_node.backend", "Backend.merge", "AssertionError"),
     "state": ("rclpy.action.server", "ServerGoalHandle._update_state", "RuntimeError"),
@@ -71,6 +72,17 @@ PARTLY: dict[str, Callable[[Any, Any], bool]] = {
 }
 
 
+def _owner(module: str, place: str) -> tuple[Any, str]:
+    """Return what has the function at a place, and its name there."""
+    *path, last = place.split(".")
+    return functools.reduce(getattr, path, importlib.import_module(module)), last
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_fault_has_a_place(fault: str) -> None:
+    assert callable(getattr(*_owner(*FAULTS[fault][:2])))
+
+
 def put_faults(folder: str) -> None:
     """Put all faults in, to be armed by files."""
     for name, place in FAULTS.items():
@@ -78,8 +90,7 @@ def put_faults(folder: str) -> None:
 
 
 def _put(folder: Path, name: str, module: str, place: str, kind: str) -> None:
-    *path, last = place.split(".")
-    owner = functools.reduce(getattr, path, importlib.import_module(module))
+    owner, last = _owner(module, place)
     real = getattr(owner, last)
 
     @functools.wraps(real)
@@ -152,15 +163,16 @@ class Client:
 @pytest.fixture(scope="module")
 def shared(domain: int, folder: Path, scene: SyntheticData) -> Iterator[Client]:  # noqa: ARG001
     """Return a client of a node that outlives all faults of this module."""
-    node = NodeProcess("--ros-args", "-p", f"node.map_folder:={folder}", prepare=put_faults, folder=str(folder))
-    peer = Peer()
-    peer.advertise()
-    peer.play(scene)
-    client = Client(node, peer, folder)
-    assert client.peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path="kept")).success
-    yield client
-    peer.close()
-    node.close()
+    arguments = ("--ros-args", "-p", f"node.map_folder:={folder}")
+    with (
+        contextlib.closing(NodeProcess(*arguments, prepare=put_faults, folder=str(folder))) as node,
+        contextlib.closing(Peer()) as peer,
+    ):
+        peer.advertise()
+        peer.play(scene)
+        client = Client(node, peer, folder)
+        assert client.peer.call(SaveMap, "ba_node/save_map", SaveMap.Request(path="kept")).success
+        yield client
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import State, Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import GetState
 
 from ba_node.measurements import Keyframe
 from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
@@ -42,18 +42,6 @@ def _state(peer: Any) -> str:
     return str(peer.call(GetState, "ba_node/get_state", GetState.Request()).current_state.label)
 
 
-def _change(peer: Any, label: str = "", number: int = 0) -> bool:
-    request = ChangeState.Request(transition=Transition(id=number, label=label))
-    return bool(peer.call(ChangeState, "ba_node/change_state", request).success)
-
-
-def _send(peer: Any, scene: SyntheticData, rows: slice) -> None:
-    for keyframe, tracks in zip(scene.keyframes[rows], scene.tracks[rows], strict=True):
-        peer.publish(keyframe)
-        for image in tracks:
-            peer.publish(image, keyframe.stamp_ns)
-
-
 def _topics(peer: Any) -> set[str]:
     return {name for name, _ in peer.node.get_topic_names_and_types()}
 
@@ -79,11 +67,11 @@ def test_every_transition_from_every_state(start_node: StartNode, make_peer: Mak
     walk += ["deactivate", "cleanup", "configure", "activate", "shutdown", "configure", "activate", "shutdown"]
     for label in walk:
         leads_to = TRANSITIONS.get(label, {}).get(state)
-        assert _change(peer, label) == (leads_to is not None), f"{label} while {state}"
+        assert peer.change_state(label) == (leads_to is not None), f"{label} while {state}"
         state = leads_to or state
         for number in (numbers.get(label, Transition.TRANSITION_ACTIVE_SHUTDOWN), 99):
             if leads_to is None and label != "shutdown" and state != ACTIVE:
-                assert not _change(peer, number=number), f"transition {number} while {state}"
+                assert not peer.change_state(number=number), f"transition {number} while {state}"
         assert _state(peer) == state, label
     words = "refused or failed; the node is unconfigured, from where it can configure or shutdown"
     assert f"transition 'nonsense' was {words}" in node.err
@@ -101,31 +89,31 @@ def test_deactivate_holds_the_map_and_cleanup_drops_it(
     peer.connect()
     reports = peer.received["report"]
     peer.publish(scene.rig)
-    _send(peer, scene, slice(0, 4))
+    peer.publish_keyframes(scene, *range(4))
     peer.until(lambda: reports and reports[-1].newest_keyframe_id == 3, "keyframe 3")
 
-    assert _change(peer, "deactivate")
+    assert peer.change_state("deactivate")
     n_reports = len(reports)
-    _send(peer, scene, slice(4, 5))
+    peer.publish_keyframes(scene, *range(4, 5))
     peer.until(peer.all_acknowledged, "the node to have got what it ignores")
-    for _ in range(3):  # the executor takes one message of each topic between two answers
+    for _ in range(6):  # the executor takes one message of each topic between two answers
         assert _state(peer) == INACTIVE
-    assert _change(peer, "activate")
-    _send(peer, scene, slice(5, 6))
+    assert peer.change_state("activate")
+    peer.publish_keyframes(scene, *range(5, 6))
     peer.until(lambda: reports[-1].newest_keyframe_id == 5, "keyframe 5")
     assert 4 not in [report.newest_keyframe_id for report in reports[n_reports:]]
     ignored = dict(zip(reports[-1].rejected_reason, reports[-1].rejected_count, strict=True))
     assert ignored == {"inactive": 1 + len(scene.tracks[4])}
     peer.until(lambda: _refined(peer) == [0, 1, 2, 3, 5], "the map, which is still there")
 
-    assert _change(peer, "deactivate")
-    assert _change(peer, "cleanup")
+    assert peer.change_state("deactivate")
+    assert peer.change_state("cleanup")
     peer.until(lambda: "/ba_node/report" not in _node_topics(peer), "the outputs to go")
-    assert _change(peer, "configure")
-    assert _change(peer, "activate")
+    assert peer.change_state("configure")
+    assert peer.change_state("activate")
     peer.connect()
     peer.publish(scene.rig)
-    _send(peer, scene, slice(6, 8))
+    peer.publish_keyframes(scene, *range(6, 8))
     peer.until(lambda: reports[-1].newest_keyframe_id == 7, "keyframe 7")
     peer.until(lambda: _refined(peer) == [6, 7], "a map that was empty")
     assert node.stop() == 0
@@ -137,6 +125,8 @@ def _refined(peer: Any) -> list[int]:
 
 
 def _node_topics(peer: Any) -> set[str]:
+    # Its services may be found before its name is.
+    peer.until(lambda: "ba_node" in peer.node.get_node_names(), "the node's name")
     return {name for name, _ in peer.node.get_publisher_names_and_types_by_node("ba_node", "/")}
 
 
@@ -144,14 +134,14 @@ def test_cameras_are_taken_while_inactive(start_node: StartNode, make_peer: Make
     """A front-end latches its rig once, perhaps long before a manager activates the node."""
     start_node("--ros-args", "-p", "node.autostart:=false")
     peer = make_peer()
-    assert _change(peer, "configure")
+    assert peer.change_state("configure")
     peer.advertise()
     peer.listen("report")
     peer.connect()
     peer.publish(scene.rig)
     peer.until(peer.publishers["camera_rig"].wait_for_all_acked, "the rig to arrive")
-    assert _change(peer, "activate")
-    _send(peer, scene, slice(0, 3))
+    assert peer.change_state("activate")
+    peer.publish_keyframes(scene, *range(3))
     peer.until(lambda: peer.received["report"] and peer.received["report"][-1].landmarks > 0, "points")
 
 
@@ -163,8 +153,8 @@ def test_transitions_during_a_solve(start_node: StartNode, make_peer: MakePeer) 
         peer.publish(Keyframe(0, 1, 1, "odom", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
         peer.until(lambda count=count: node.out.count("solving") == count, "the solve to begin")
         for label in ("deactivate", "activate", "deactivate", "cleanup", "configure", "activate"):
-            assert _change(peer, label), label
-    assert _change(peer, "shutdown")
+            assert peer.change_state(label), label
+    assert peer.change_state("shutdown")
     assert _state(peer) == FINALIZED
     assert node.stop() == 0, node.err
     assert "Traceback" not in node.err
@@ -195,18 +185,18 @@ def test_a_transition_that_fails_is_logged_and_can_be_tried_again(
     assert _state(peer) == UNCONFIGURED, "the failed autostart leaves the node alive"
     peer.until(lambda: "configure failed: RuntimeError: no configure today" in node.err, "the reason")
     assert not {f"/ba_node/{topic}" for topic in OUTPUT_TYPES} & _node_topics(peer), "what was made is destroyed"
-    assert _change(peer, "configure")
-    assert not _change(peer, "activate")
+    assert peer.change_state("configure")
+    assert not peer.change_state("activate")
     peer.until(lambda: "activate failed: RuntimeError: no activate today" in node.err, "that reason")
     assert _state(peer) == UNCONFIGURED
     assert not {f"/{topic}" for topic in INPUT_TYPES} & _topics(peer)
-    assert _change(peer, "configure")
-    assert _change(peer, "activate")
+    assert peer.change_state("configure")
+    assert peer.change_state("activate")
     peer.advertise()
     peer.listen("report")
     peer.connect()
     peer.publish(scene.rig)
-    _send(peer, scene, slice(0, 3))
+    peer.publish_keyframes(scene, *range(3))
     peer.until(lambda: peer.received["report"] and peer.received["report"][-1].landmarks > 0, "points")
     assert node.stop() == 0
 
@@ -216,7 +206,7 @@ def test_states_as_numbers(start_node: StartNode, make_peer: MakePeer) -> None:
     peer = make_peer()
     answer = peer.call(GetState, "ba_node/get_state", GetState.Request()).current_state
     assert answer.id == State.PRIMARY_STATE_UNCONFIGURED
-    assert _change(peer, number=Transition.TRANSITION_CONFIGURE)
-    assert _change(peer, number=Transition.TRANSITION_ACTIVATE)
+    assert peer.change_state(number=Transition.TRANSITION_CONFIGURE)
+    assert peer.change_state(number=Transition.TRANSITION_ACTIVATE)
     answer = peer.call(GetState, "ba_node/get_state", GetState.Request()).current_state
     assert answer.id == State.PRIMARY_STATE_ACTIVE
