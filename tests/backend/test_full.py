@@ -83,7 +83,7 @@ def objectives(backend: Backend, of: Optimization, seen_by: Optimization) -> tup
     )
     points = np.nan_to_num(scene.landmarks.position[landmarks] - selection.origin)
     observations = selection.problem.observations
-    counted = np.isin(of.keyframe_id, seen_by.snapshot.keyframe_id)[observations.keyframe]
+    counted = np.isin(of.keyframe_id, seen_by.keyframe_id)[observations.keyframe]
     problem = some_observations(selection.problem, np.flatnonzero(counted & placed[observations.point]))
     now = dataclasses.replace(problem.start, rotation=poses[0], translation=poses[1], points=points)
     chosen = full.options(backend.config.solver, max_iterations=1)
