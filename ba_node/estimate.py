@@ -57,7 +57,6 @@ class Poses:
         )
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.keyframe_id)
 
     def __getitem__(self, rows: slice | IntArray | BoolArray) -> Poses:
@@ -82,7 +81,6 @@ class Cloud:
     views: NDArray[np.int32]
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.track_id)
 
 

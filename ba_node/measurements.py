@@ -113,7 +113,6 @@ class CameraRig:
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of cameras."""
         return len(self.models)
 
 

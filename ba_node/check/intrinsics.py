@@ -337,7 +337,6 @@ class _Measure:
         self.noise = max(float(np.median(norms[self._rows])), 1e-3)
 
     def __len__(self) -> int:
-        """Return the number of these observations."""
         return int(np.count_nonzero(self._rows))
 
     def __call__(self, adjusted: _Adjusted) -> float:

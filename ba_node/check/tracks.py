@@ -60,7 +60,6 @@ class Tracks:
     images: dict[Image, IntArray]
 
     def __len__(self) -> int:
-        """Return the number of keyframes."""
         return len(self.position)
 
     def match(self, a: Image, b: Image) -> tuple[IntArray, IntArray]:

@@ -48,7 +48,6 @@ class Pair:
     gate: float
 
     def __len__(self) -> int:
-        """Return their number."""
         return len(self.a)
 
     def zoomed(self, factor: float) -> Pair:

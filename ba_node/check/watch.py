@@ -57,7 +57,6 @@ class SetUpWatch:
     """
 
     def __init__(self) -> None:
-        """Start with nothing checked."""
         self.elsewhere: Callable[[Check], None] | None = None
         self._reason = ""
         self._scene: Scene | None = None

@@ -60,7 +60,6 @@ class RelativePoses:
     loss_scale: float = 1.0
 
     def __len__(self) -> int:
-        """Return the number of factors."""
         return len(self.keyframes)
 
     def take(self, rows: IntArray | BoolArray, number: IntArray) -> RelativePoses:

@@ -106,7 +106,6 @@ class Objective:
     """
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
-        """Prepare what stays the same over all iterations."""
         self.problem = problem
         self.options = options
         self.factors = FactorSum(problem.factors, problem.fixed, options.parameterisation) if problem.factors else None

@@ -89,7 +89,6 @@ class Observations:
     depth_sigma_m: FloatArray
 
     def __len__(self) -> int:
-        """Return the number of observations."""
         return len(self.keyframe)
 
 

@@ -36,7 +36,6 @@ class ReducedSolver:
     """
 
     def __init__(self, options: SolverOptions) -> None:
-        """Keep the choices."""
         self._options = options
         self.kind = ""
         self.text = ""

@@ -44,7 +44,6 @@ class Structure:
     """Which rows belong to which keyframe, point and (keyframe, point) edge; fixed over all iterations."""
 
     def __init__(self, problem: Problem) -> None:
-        """Sort the observations once."""
         obs = problem.observations
         self.size = 9 if problem.free_intrinsics else 6
         self.free = np.flatnonzero(~problem.fixed)

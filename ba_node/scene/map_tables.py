@@ -33,7 +33,6 @@ class MapTables:
     """
 
     def __init__(self, config: SceneConfig) -> None:
-        """Start empty."""
         self.config = config
         self.keyframes = Keyframes()
         self.landmarks = Landmarks()

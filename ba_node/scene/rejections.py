@@ -91,7 +91,6 @@ class RejectionLog:
     """
 
     def __init__(self) -> None:
-        """Start with nothing counted."""
         self.rejected: Counter[str] = Counter()
         self.notices: Counter[str] = Counter()
         self.notes: deque[str] = deque(maxlen=NOTES_KEPT)

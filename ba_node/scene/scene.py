@@ -32,7 +32,6 @@ class Scene(MapTables):
     """
 
     def __init__(self, config: SceneConfig, session_id: int | None = None) -> None:
-        """Start empty."""
         super().__init__(config)
         self.session_id = session_id
         self.frame_id = ""

@@ -44,7 +44,6 @@ class Table:
         cls.COLUMNS = {name: value for name, value in vars(cls).items() if isinstance(value, Column)}
 
     def __init__(self) -> None:
-        """Start empty."""
         self._size = 0
         self._buffers: dict[str, NDArray[Any]] = {
             name: np.empty((0, *column.shape), column.dtype) for name, column in self.COLUMNS.items()
@@ -52,7 +51,6 @@ class Table:
         self._expose()
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return self._size
 
     def append(self, count: int, **values: object) -> IntArray:
@@ -87,12 +85,10 @@ class IdIndex:
     """Row numbers by id: sorted ids, searched by bisection."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._ids: IdArray = np.empty(0, np.uint64)
         self._rows: IntArray = np.empty(0, np.intp)
 
     def __len__(self) -> int:
-        """Return the number of ids."""
         return len(self._ids)
 
     @property

@@ -60,7 +60,6 @@ class Trust:
     """
 
     def __init__(self) -> None:
-        """Start without doubt."""
         self.doubt = 0
         self.odd: Odd | None = None
         self.agreeing = 0

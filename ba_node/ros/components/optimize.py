@@ -59,7 +59,6 @@ class Optimize(Component):
     """The action of the node."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise."""
         super().__init__(host)
         self._goal: _Goal | None = None
         self._type = message_class(ACTIONS[_NAME].type_name)

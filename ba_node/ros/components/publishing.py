@@ -32,7 +32,6 @@ class Activity:
     """Say in one line every few seconds how it goes: rate, residuals, latency, and what became of the solutions."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._since_s: float | None = None
         self._counts: Counter[str] = Counter()
 
@@ -70,7 +69,6 @@ class Publishing(Component):
     """
 
     def __init__(self, host: Host) -> None:
-        """Advertise."""
         super().__init__(host)
         self._factory = RclpyFactory()
         self._throttle, self._activity = Throttle(_LOG_PERIOD_S), Activity()

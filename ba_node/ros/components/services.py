@@ -32,7 +32,6 @@ class Services(Component):
     """The services of the node."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise."""
         super().__init__(host)
         self._busy: Answer | None = None
         begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}

@@ -22,7 +22,6 @@ class SideOutputs(Component):
     """The topics of ``ON_DEMAND``. Who subscribes gets the next solve; the last markers are kept for those after."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise, and be told who comes and goes."""
         super().__init__(host)
         self._factory = RclpyFactory()
         self._asked = Extras()

@@ -24,7 +24,6 @@ class StaticFrames(Component):
     """Places cameras. A rig waits until the way from the body to every camera of it is known."""
 
     def __init__(self, host: Host) -> None:
-        """Subscribe, if the places are to come from there."""
         super().__init__(host)
         self._tree = StaticTree()
         self._waiting: CameraRig | None = None

@@ -46,7 +46,6 @@ class DeferredAnswers:
     """
 
     def __init__(self, node: Any, solver_lives: Callable[[], bool]) -> None:
-        """Make what wakes the executor."""
         self._node = node
         self._solver_lives = solver_lives
         self._actions: deque[Callable[[], None]] = deque()

@@ -45,7 +45,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     """A lifecycle node whose transitions are the methods below; each may raise."""
 
     def __init__(self, node_name: str, **node_options: Any) -> None:
-        """Make the node, unconfigured."""
         super().__init__(node_name, **node_options)
         self._machine = part(self, "_state_machine", object, "a refused transition is told without what is possible")
         for service in self.services:

@@ -92,7 +92,6 @@ class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
     """
 
     def __init__(self, **node_options: Any) -> None:
-        """Subscribe and advertise."""
         super().__init__(NODE_NAME, **node_options)
         self.sent = 0
         self.counted: Counter[str] = Counter()

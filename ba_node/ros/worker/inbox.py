@@ -65,7 +65,6 @@ class Inbox:
             return self._dropped
 
     def __len__(self) -> int:
-        """Return how many measurements wait."""
         with self._changed:
             return sum(len(lane) for lane in self._lanes.values())
 

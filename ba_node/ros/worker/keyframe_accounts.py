@@ -29,7 +29,6 @@ class KeyframeAccounts:
     """
 
     def __init__(self) -> None:
-        """Start with nothing."""
         self.solved = self.coalesced = self.rejected = self.forgotten = self.refined = 0
         # Arrival of each keyframe by session and id, s.
         self._unsolved: dict[Key, float] = {}

@@ -25,7 +25,6 @@ class Sliding:
     """The last numbers of a run, at most ``WINDOW`` of them."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._values: deque[float] = deque(maxlen=WINDOW)
 
     def add(self, value: float) -> Quantiles:
