@@ -8,7 +8,8 @@ resolved name of the topic and the policies history, depth, reliability and dura
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -27,9 +28,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from ba_node.messages.topics import CAMERAS, Delivery, Topic
 from ba_node.ros.worker.worker import Notice
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 # Bursts that one solve sends: one pose for each keyframe of a window.
 OUTPUT_DEPTH = 1000

@@ -23,24 +23,21 @@ in ``messages/topics.py``::
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ba_node.config import Config
+from ba_node.estimate import Estimate
+from ba_node.measurements import CameraRig
+from ba_node.messages.report import Report
+from ba_node.messages.topics import Topic
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.config import Config
-    from ba_node.estimate import Estimate
-    from ba_node.measurements import CameraRig
-    from ba_node.messages.report import Report
-    from ba_node.messages.topics import Topic
-    from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
-    from ba_node.ros.worker.inbox import Inbox
-    from ba_node.ros.worker.worker import Notice, Outcome, Worker
+from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
+from ba_node.ros.worker.inbox import Inbox
+from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 
 @dataclass

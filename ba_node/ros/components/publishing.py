@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ba_node.estimate import Status
+from ba_node.estimate import Estimate, Status
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.report import LatencyReport, Report, report_message
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS
@@ -16,10 +16,7 @@ from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, Throttle, log
 from ba_node.ros.worker.latency import Sliding
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Estimate
-    from ba_node.ros.worker.worker import Outcome
+from ba_node.ros.worker.worker import Outcome
 
 _LOG_PERIOD_S = 5.0
 # Leave first; their age is in the report that follows.

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rclpy.action import ActionServer
 from rclpy.action.server import GoalEvent, GoalStatus
@@ -13,9 +14,6 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from ba_node.ros.rclpy_compat.private import part
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # Feedback comes in bursts where iterations are short.
 _FEEDBACK_DEPTH = 100

@@ -17,6 +17,7 @@ import contextlib
 import threading
 import traceback
 from collections import deque
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
@@ -25,12 +26,10 @@ from ba_node.ros.log import Severity, fault, log, printable
 from ba_node.ros.rclpy_compat.private import RCLError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from ba_node.ros.components.base import Component, Host
 
-    # Sends success, message and further fields of an answer, on the executor's thread.
-    Send = Callable[[bool, str, dict[str, Any]], None]
+# Sends success, message and further fields of an answer, on the executor's thread.
+Send = Callable[[bool, str, dict[str, Any]], None]
 
 CLEANED_UP = "the node was cleaned up meanwhile"
 DEAD = "the solver's thread has ended: start the node anew"

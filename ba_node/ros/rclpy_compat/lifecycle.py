@@ -11,16 +11,14 @@ can be configured anew.
 from __future__ import annotations
 
 import traceback
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
 from ba_node.ros.log import Severity, fault, log, printable
 from ba_node.ros.rclpy_compat.private import RCLError, part
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _SET = "rcl_interfaces/SetParametersResult"
 

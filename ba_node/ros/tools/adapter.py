@@ -15,7 +15,8 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -29,9 +30,6 @@ from ba_node.messages.topics import INPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Throttle
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 NODE_NAME = "ba_adapter"
 CHANNELS = ("id", "camera", "u", "v")

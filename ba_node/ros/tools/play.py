@@ -16,8 +16,10 @@ import itertools
 import math
 import time
 from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
@@ -30,10 +32,6 @@ from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
-    from pathlib import Path
 
 _WRONG_OPTIONS = (*ARGUMENT_ERRORS, InvalidNamespaceException)
 _POLL_S = 0.02

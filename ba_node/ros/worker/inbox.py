@@ -8,16 +8,14 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from ba_node.backend import Backend
+from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
-if TYPE_CHECKING:
-    from ba_node.backend import Backend
-    from ba_node.estimate import Estimate
-
 # What it returns is published.
-Command = Callable[["Backend"], "Estimate | None"]
+Command = Callable[[Backend], Estimate | None]
 
 # What is given up first when the inbox is full. A keyframe without some of its tracks still moves;
 # tracks without their keyframe, or anything without cameras, are worth nothing.

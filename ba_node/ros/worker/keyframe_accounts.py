@@ -7,12 +7,9 @@ Those that the back-end holds until others tell what they are wait too.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection
 
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from ba_node.backend import CurrentMap
+from ba_node.backend import CurrentMap
 
 Key = tuple[int, int]
 

@@ -4,11 +4,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
-    from ba_node.estimate import Estimate
+from ba_node.config import Config
+from ba_node.estimate import Estimate
 
 # Solves in a row for one keyframe each after which it keeps up again.
 _CALM = 5

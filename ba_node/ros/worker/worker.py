@@ -14,22 +14,17 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from ba_node.estimate import Estimate, SolveReport, Status
+from ba_node.backend import Backend, Check
+from ba_node.estimate import Estimate, Iteration, SolveReport, Status
 from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
+from ba_node.ros.worker.inbox import Arrival, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
 from ba_node.ros.worker.lag import Lag
 from ba_node.ros.worker.latency import Budget
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.backend import Backend, Check
-    from ba_node.estimate import Iteration
-    from ba_node.ros.worker.inbox import Arrival, Inbox
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
 _MAX_OUTPUTS = 20
