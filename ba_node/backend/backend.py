@@ -58,27 +58,18 @@ def _no_clock() -> float:
 
 
 class Backend:
-    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data.
-
-    Attributes:
-        map: the current map.
-        finished: session id and last estimate of the sessions before, oldest first, the last few.
-        solve_count: solves since the beginning.
-        refused: the last keyframes that were turned away.
-        extras: what the next solve is to work out beside the estimate.
-        setup: the check of the set-up; while it gives a reason, every solve is held.
-        refusal: why the last solve of everything was held, in words; empty if it was not.
-    """
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data."""
 
     def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
         """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
-        self.map = CurrentMap(config, Scene(config.scene), 0)
+        self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
+        # session id and last estimate of the sessions before, oldest first, the last few
         self.finished: list[tuple[int, Estimate]] = []
-        self.solve_count = 0
-        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
-        self.extras = Extras()
-        self.setup = SetUpWatch()
-        self.refusal = ""
+        self.solve_count = 0  # solves since the beginning
+        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)  # the last keyframes that were turned away
+        self.extras = Extras()  # what the next solve is to work out beside the estimate
+        self.setup = SetUpWatch()  # the check of the set-up; while it gives a reason, every solve is held
+        self.refusal = ""  # why the last solve of everything was held, in words; empty if it was not
         self._clock = clock
         self._sessions = Sessions()
 

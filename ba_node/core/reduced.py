@@ -28,17 +28,12 @@ _TRIED_EPS = 0.01
 
 
 class ReducedSolver:
-    """Solve the systems of one run, all in the same way.
-
-    Attributes:
-        kind: dense, sparse or pcg; empty while none has been needed.
-        text: how the systems were solved, for the report, with what it costs.
-    """
+    """Solve the systems of one run, all in the same way."""
 
     def __init__(self, options: SolverOptions) -> None:
         self._options = options
-        self.kind = ""
-        self.text = ""
+        self.kind = ""  # dense, sparse or pcg; empty while none has been needed
+        self.text = ""  # how the systems were solved, for the report, with what it costs
         # Steps of PCG to be tried before an exact solver; 0 once they did not get there; None before the first system.
         self._tries: int | None = None
 

@@ -163,23 +163,14 @@ class Structure:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """H and g in blocks, undamped.
+    """H and g in blocks, undamped."""
 
-    Attributes:
-        b: (n_free, d, d) keyframe blocks.
-        c: (n_points, 3, 3) point blocks.
-        e: (n_edges, d, 3) coupling.
-        gradient_c: (n_free, d).
-        gradient_p: (n_points, 3).
-        pairs: blocks of B between two keyframes; None without factors.
-    """
-
-    b: FloatArray
-    c: FloatArray
-    e: FloatArray
-    gradient_c: FloatArray
-    gradient_p: FloatArray
-    pairs: Pairs | None = None
+    b: FloatArray  # (n_free, d, d) keyframe blocks
+    c: FloatArray  # (n_points, 3, 3) point blocks
+    e: FloatArray  # (n_edges, d, 3) coupling
+    gradient_c: FloatArray  # (n_free, d)
+    gradient_p: FloatArray  # (n_points, 3)
+    pairs: Pairs | None = None  # blocks of B between two keyframes; None without factors
 
     @property
     def gradient_norm(self) -> float:

@@ -32,15 +32,10 @@ class EmptyBagError(BagError):
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """What a user says about topics.
+    """What a user says about topics."""
 
-    Attributes:
-        topics: input -> topic, for those that are not to be found.
-        namespace: only topics in this namespace; empty for any.
-    """
-
-    topics: Mapping[str, str] = field(default_factory=dict)
-    namespace: str = ""
+    topics: Mapping[str, str] = field(default_factory=dict)  # input -> topic, for those that are not to be found
+    namespace: str = ""  # only topics in this namespace; empty for any
 
 
 def parse_topic(text: str) -> tuple[str, str]:

@@ -28,22 +28,14 @@ class Direction(enum.Enum):
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic.
+    """A topic."""
 
-    Attributes:
-        name: of an input relative to the namespace, of an output below the node's name; with a slash, shared by all of
-            ROS.
-        type_name: ``package/msg/Type``.
-        text: what it holds.
-        direction: seen from the node.
-        delivery: quality of service.
-    """
-
+    # of an input relative to the namespace, of an output below the node's name; with a slash, shared by all of ROS
     name: str
-    type_name: str
-    text: str
-    direction: Direction = Direction.TAKEN
-    delivery: Delivery = Delivery.RELIABLE
+    type_name: str  # ``package/msg/Type``
+    text: str  # what it holds
+    direction: Direction = Direction.TAKEN  # seen from the node
+    delivery: Delivery = Delivery.RELIABLE  # quality of service
 
     @property
     def is_shared(self) -> bool:

@@ -54,31 +54,20 @@ def _nothing(_done: int, _total: int) -> None:
 
 @dataclass(frozen=True)
 class Watch:
-    """What a replay takes from outside.
+    """What a replay takes from outside."""
 
-    Attributes:
-        clock: seconds, for the times in report.json alone.
-        progress: called with the number of messages read and of all messages.
-    """
-
-    clock: Callable[[], float] = _no_clock
-    progress: Callable[[int, int], None] = _nothing
+    clock: Callable[[], float] = _no_clock  # seconds, for the times in report.json alone
+    progress: Callable[[int, int], None] = _nothing  # called with the number of messages read and of all messages
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """What is done before and after the recording.
+    """What is done before and after the recording."""
 
-    Attributes:
-        load: map to begin with; the recording must go on in its session.
-        optimize: refine everything of the newest session at the end.
-        save: file for the map of the newest session.
-        topics: which topics of the recording are taken, where several are possible.
-    """
-
-    load: Path | None = None
-    optimize: bool = False
-    save: Path | None = None
+    load: Path | None = None  # map to begin with; the recording must go on in its session
+    optimize: bool = False  # refine everything of the newest session at the end
+    save: Path | None = None  # file for the map of the newest session
+    # which topics of the recording are taken, where several are possible
     topics: TopicChoice = field(default_factory=TopicChoice)
 
 

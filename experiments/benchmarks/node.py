@@ -43,21 +43,13 @@ _CALL_PERIOD_S = 0.03
 
 @dataclass(frozen=True)
 class Case:
-    """What the front-end sees, and how much of it a window holds.
+    """What the front-end sees, and how much of it a window holds."""
 
-    Attributes:
-        about: in words.
-        tracks: points that each image of the stereo pair sees.
-        track_keyframes: keyframes after which a track ends; 0: it goes on, and comes back when its point does.
-        landmarks: points of the world, for each keyframe.
-        fixed: older keyframes that take part with fixed poses.
-    """
-
-    about: str
-    tracks: int
-    track_keyframes: int
-    landmarks: int
-    fixed: int
+    about: str  # in words
+    tracks: int  # points that each image of the stereo pair sees
+    track_keyframes: int  # keyframes after which a track ends; 0: it goes on, and comes back when its point does
+    landmarks: int  # points of the world, for each keyframe
+    fixed: int  # older keyframes that take part with fixed poses
 
 
 CASES = {

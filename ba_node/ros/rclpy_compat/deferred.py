@@ -38,11 +38,7 @@ _LOOK_S = 0.5
 
 
 class DeferredAnswers:
-    """Runs things on the executor's thread, in order, and keeps the answers that clients wait for; until cleanup.
-
-    Attributes:
-        left_waiting: clients that were answered because of a cleanup, when that was.
-    """
+    """Runs things on the executor's thread, in order, and keeps the answers that clients wait for; until cleanup."""
 
     def __init__(self, node: Any, solver_lives: Callable[[], bool]) -> None:
         self._node = node
@@ -51,7 +47,7 @@ class DeferredAnswers:
         self._expected: dict[Answer, None] = {}
         self._lock = threading.Lock()
         self._open = True
-        self.left_waiting = 0
+        self.left_waiting = 0  # clients that were answered because of a cleanup, when that was
         self._guard = node.create_guard_condition(self._run)
         # Silence is no reason not to look, and /clock may stand still.
         self._timer = node.create_timer(_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -82,17 +82,12 @@ def keyframe_from_odometry(odometry: Any, session_id: int) -> Keyframe:
 
 
 class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
-    """The converter node.
-
-    Attributes:
-        sent: keyframes that were sent on.
-        counted: what was dropped, by reason.
-    """
+    """The converter node."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__(NODE_NAME, **node_options)
-        self.sent = 0
-        self.counted: Counter[str] = Counter()
+        self.sent = 0  # keyframes that were sent on
+        self.counted: Counter[str] = Counter()  # what was dropped, by reason
         self._session_id = 0
         # By stamp, ns; the newest of them.
         self._features: dict[int, Any] = {}

@@ -16,13 +16,10 @@ class Lag:
 
     Args:
         patience_s: for how long that may go on without a word.
-
-    Attributes:
-        warnings: what is to be said in reports while it goes on.
     """
 
     def __init__(self, patience_s: float) -> None:
-        self.warnings: tuple[str, ...] = ()
+        self.warnings: tuple[str, ...] = ()  # what is to be said in reports while it goes on
         self._patience_s = patience_s
         self._since_s: float | None = None
         self._solves = self._keyframes = self._calm = 0

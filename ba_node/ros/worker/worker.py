@@ -38,36 +38,22 @@ _PATIENCE_S = 5.0
 
 @dataclass(frozen=True)
 class Notice:
-    """Something to log.
+    """Something to log."""
 
-    Attributes:
-        key: what it is about; the reader may limit how often each is logged.
-        text: one line, or several with a traceback.
-        is_error: a fault of ours, not of the input.
-    """
-
-    key: str
-    text: str
-    is_error: bool = False
+    key: str  # what it is about; the reader may limit how often each is logged
+    text: str  # one line, or several with a traceback
+    is_error: bool = False  # a fault of ours, not of the input
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solve gave; or what has been turned away since the last one, when there is no solve to tell it.
+    """What a solve gave; or what has been turned away since the last one, when there is no solve to tell it."""
 
-    Attributes:
-        report: of the solve, or of the last one.
-        queue: what has become of keyframes so far.
-        stamp_ns: of the newest keyframe, ns.
-        estimate: what the solve gave; None without one.
-        arrived_s: when its newest keyframe came in, by the worker's clock, s.
-    """
-
-    report: SolveReport
-    queue: QueueReport
-    stamp_ns: int
-    estimate: Estimate | None = None
-    arrived_s: float = 0.0
+    report: SolveReport  # of the solve, or of the last one
+    queue: QueueReport  # what has become of keyframes so far
+    stamp_ns: int  # of the newest keyframe, ns
+    estimate: Estimate | None = None  # what the solve gave; None without one
+    arrived_s: float = 0.0  # when its newest keyframe came in, by the worker's clock, s
 
 
 Output = Outcome | Notice
