@@ -53,14 +53,10 @@ FINISHED_KEPT = 8
 _REFUSED_KEPT = 1000
 
 
-def _no_clock() -> float:
-    return 0.0
-
-
 class Backend:
     """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data."""
 
-    def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
+    def __init__(self, config: Config, *, clock: Callable[[], float] = lambda: 0.0) -> None:
         """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
         self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
         # session id and last estimate of the sessions before, oldest first, the last few
@@ -212,10 +208,7 @@ class Backend:
             self.scene.end_pending()
 
     def solve(self, on_iteration: Callable[[Iteration], bool] | None = None) -> Estimate | None:
-        """Refine the newest window; None while there is no keyframe.
-
-        Args:
-            on_iteration: called with each iteration; returning False ends the solve after it.
+        """Refine the newest window; None without a keyframe. ``on_iteration`` ends the solve by returning False.
 
         Returns:
             The estimate. After a failed or skipped solve poses and points are as before, and the report says why.

@@ -159,13 +159,7 @@ class FactorSum:
     """
 
     def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray, parameterisation: str = "local") -> None:
-        """Find which free keyframes they couple.
-
-        Args:
-            factors: of the problem.
-            fixed: (n_kf,).
-            parameterisation: how a pose is stepped.
-        """
+        """Find which free keyframes they couple; ``fixed`` is (n_kf,)."""
         self._factors, self._parameterisation = tuple(factors), parameterisation
         self._free = np.flatnonzero(~fixed)
         self._column = np.full(len(fixed), -1, np.intp)

@@ -61,11 +61,8 @@ class System(Protocol):
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Return the solution by PCG in the space ``D x``, in the space that is not scaled.
 
-        Args:
-            kind: preconditioner.
-            scale: (n,) 1/D.
-            limits: see linear.PcgLimits; the radius is that of the scaled space.
-            formed: form S for the products.
+        ``kind`` is the preconditioner, ``scale`` (n,) 1/D; the radius of the limits is that of the scaled space. S is
+        ``formed`` for the products.
         """
 
     def gather(self, of_keyframes: FloatArray, of_points: FloatArray) -> FloatArray:

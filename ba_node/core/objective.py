@@ -185,14 +185,7 @@ class Objective:
     def retract(
         self, state: State, step_keyframes: FloatArray, step_points: FloatArray, of: IntArray | slice = slice(None)
     ) -> State:
-        """Return the state after a step.
-
-        Args:
-            state: before it.
-            step_keyframes: (n, 6 or 9) of some keyframes, or of all.
-            step_points: (n_pt, 3).
-            of: (n,) which keyframes.
-        """
+        """Return the state after a step, (n, 6 or 9) of the keyframes ``of`` (default: all), (n_pt, 3) of points."""
         rotation, translation, intrinsics = state.rotation.copy(), state.translation.copy(), state.intrinsics
         rotation[of], translation[of] = parameterisation.retract(
             self.options.parameterisation, rotation[of], translation[of], step_keyframes[:, :6]

@@ -40,10 +40,7 @@ class ReducedSolver:
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
 
-        Args:
-            system: damped.
-            hessian: returns diag(B) and diag(C), not damped.
-            radius: of the region, in the scaled space; infinite for none.
+        ``hessian`` returns diag(B) and diag(C), not damped; the radius is in the scaled space, infinite for none.
         """
         if len(system.rhs) == 0:
             return linear.Solution(np.zeros(0))

@@ -202,14 +202,7 @@ class ReducedSystem:
     def __init__(
         self, structure: Structure, equations: NormalEquations, damping_c: FloatArray, damping_p: FloatArray
     ) -> None:
-        """Factor C and couple it to the keyframes.
-
-        Args:
-            structure: of the problem.
-            equations: undamped.
-            damping_c: (n_free, d) added to diag(B).
-            damping_p: (n_points, 3) added to diag(C).
-        """
+        """Factor C and couple it to the keyframes; damping, (n_free, d) and (n_points, 3), adds to the diagonals."""
         self._structure = structure
         self.b = columns.plus_diagonal(equations.b, damping_c)
         self._pairs = equations.pairs

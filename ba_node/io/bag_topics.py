@@ -67,12 +67,9 @@ class Chosen:
 
 
 class Chooser:
-    """Chooses among the topics of one recording.
+    """Chooses among the topics of one recording that have messages of the type of each input.
 
-    Args:
-        found: topics with messages of the type of each input.
-        frames_of: the frames that the first messages of a topic name.
-        content_of: the cameras in the first message of a topic, None if it cannot be read.
+    ``frames_of`` tells the frames that the first messages of a topic name, ``content_of`` the cameras in the first one.
     """
 
     def __init__(

@@ -148,12 +148,9 @@ _running: list[_Process] = []
 
 
 class _Process:
-    """A process of the demo, with a log. Use it as a context manager: it is over when the block is.
+    """A Python module that runs with a log of its output. Use it as a context manager: it is over when the block is.
 
-    Args:
-        module: Python module to run, with its arguments.
-        log: where its output goes.
-        interrupt: end it with SIGINT, as Ctrl-C does; otherwise it ends by itself.
+    It ends by itself, unless ``interrupt`` asks for a SIGINT, as of Ctrl-C.
     """
 
     def __init__(self, module: list[str], log: Path, *, interrupt: bool) -> None:

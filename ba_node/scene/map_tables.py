@@ -85,9 +85,8 @@ class MapTables:
         What was known of a landmark stays with its older views, under an id that nobody has; the track keeps the newer
         ones and has no position.
 
-        Args:
-            landmarks: (n,) rows, all different, each with older views.
-            since: (n,) place in the order of time of the first keyframe whose views stay.
+        Landmarks are (n,) rows, all different, each with older views; ``since`` is the place in the order of time of
+        the first keyframe whose views stay.
 
         Returns:
             (n,) rows of the landmarks of the older views.

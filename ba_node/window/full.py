@@ -256,11 +256,7 @@ def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
 
 
 def _anchors(member: IntArray) -> IntArray:
-    """Return for each keyframe, oldest first, the last member before it; before the first member, that one.
-
-    Args:
-        member: (n,) number of each keyframe in the copy, -1 for others.
-    """
+    """Return for each keyframe, oldest first, the last ``member`` (number in the copy, -1: none), or the first."""
     at = np.maximum.accumulate(np.where(member >= 0, np.arange(len(member)), -1))
     return np.asarray(member[np.where(at < 0, int(np.argmax(member >= 0)), at)])
 

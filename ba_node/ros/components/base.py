@@ -89,19 +89,15 @@ class Component:
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Take an estimate as it leaves the worker, after the report on it, oldest first; only while active.
 
-        Args:
-            estimate: of every solve, failed and skipped ones too (``estimate.report.status.usable``).
-            newest: the last one of those that came together that replaces the map (``estimate.replaces_map``): what
-                replaces the ones before needs only this.
+        Failed and skipped solves give one too. ``newest`` is the last of those that came together that replaces the
+        map: what replaces the ones before needs only this.
         """
 
     def publisher(self, topic: Topic, profile: Any = None, **options: Any) -> Any:
         """Make a publisher that is destroyed at cleanup. Its profile can be overridden by parameters.
 
-        Args:
-            topic: of messages/topics.py.
-            profile: quality of service; None for that of the topic.
-            options: ``matched``, called when a subscriber comes or goes; others as of rclpy.
+        Its quality of service is ``profile``, or that of the topic. Options are ``matched``, called when a subscriber
+        comes or goes, and those of rclpy.
 
         Raises:
             LookupError: there is no message class of its type.

@@ -33,13 +33,7 @@ class Activity:
         self._counts: Counter[str] = Counter()
 
     def line(self, report: Report, now_s: float, period_s: float) -> str:
-        """Take in the report of a solve; return the line if one is due, else an empty text.
-
-        Args:
-            report: with latencies.
-            now_s: by a clock that does not jump, s.
-            period_s: time between two lines; 0 for none.
-        """
+        """Take in the report of a solve; return the line if one is due, every ``period_s`` (0: never), else nothing."""
         if self._since_s is None:
             self._since_s = now_s
         self._counts[_WORDS.get(report.solve.status, "taken")] += 1

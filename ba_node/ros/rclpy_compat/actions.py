@@ -22,13 +22,8 @@ _FEEDBACK_DEPTH = 100
 class DeferredAction:
     """An action server; all its callbacks, and its methods, are for the executor's thread.
 
-    Args:
-        node: whose action it is.
-        kind: type of the action.
-        name: its name.
-        decide: called with each request; returns whether it becomes a goal.
-        accept: called with the handle of each goal, which it passes to :meth:`begin`, and later to :meth:`finish`.
-        cancel: called with the handle of a goal that is to end.
+    ``decide`` returns whether a request becomes a goal; ``accept`` gets the handle of each goal, which it passes to
+    :meth:`begin`, and later to :meth:`finish`; ``cancel`` that of a goal that is to end.
     """
 
     def __init__(

@@ -152,13 +152,9 @@ class Answer:
 
 
 class DeferredService:
-    """A service that answers later.
+    """A service that answers later; its response has ``success`` and ``message``.
 
-    Args:
-        component: whose service it is.
-        kind: type of the service; its response has ``success`` and ``message``.
-        name: its name.
-        begin: called with each request and the answer to it; must not block.
+    ``begin`` is called with each request and the answer to it, and must not block.
     """
 
     def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Answer], None]) -> None:

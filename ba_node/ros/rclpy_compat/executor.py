@@ -32,12 +32,7 @@ EVENT_PERIOD_S = 0.1
 
 
 class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is not typed
-    """The executor of the node.
-
-    Args:
-        context: of rclpy; None for the default one.
-        clock: steady clock, s.
-    """
+    """The executor of the node."""
 
     # rclpy's own attribute: what ends a wait.
     _guard: Any

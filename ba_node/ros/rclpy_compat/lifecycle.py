@@ -106,14 +106,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
 
 
 def answering(node: Any, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a callback that answers with a refusal, as far as the type of the response can say one, when it raises.
-
-    Args:
-        node: whose log hears of it.
-        name: of the service.
-        kind: class of its responses.
-        callback: takes request and response, returns the response.
-    """
+    """Return a callback that answers with a refusal, as far as the type of the response can say one, when it raises."""
 
     def answer(request: Any, response: Any) -> Any:
         try:

@@ -25,12 +25,7 @@ _POLL_S = 0.05
 
 
 class NodeListener:
-    """Subscribe to the outputs of a node in a ROS context of its own. Use it as a context manager.
-
-    Args:
-        node_name: full name of the node.
-        domain: ROS_DOMAIN_ID; None for that of the environment.
-    """
+    """Subscribe to the outputs of a node in a ROS context of its own. Use it as a context manager."""
 
     def __init__(self, node_name: str, domain: int | None = None) -> None:
         self.reports: list[Any] = []  # ``ba_msgs/SolverReport`` of every solve, oldest first

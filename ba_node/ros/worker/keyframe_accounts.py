@@ -52,12 +52,10 @@ class KeyframeAccounts:
         self.rejected += 1
 
     def close(self, current: CurrentMap, refined: Collection[int], held: Collection[Key] = ()) -> None:
-        """Close the accounts of a solve.
+        """Close the accounts of a solve, after which the map is ``current``.
 
-        Args:
-            current: the map after it.
-            refined: ids of those that took part, if it is usable.
-            held: session and id of those that the map does not have yet.
+        ``refined`` are ids of those that took part, if it is usable, ``held`` session and id of those that the map does
+        not have yet.
         """
         n_solved = 0
         for key in [key for key in self._unsolved if key not in held]:

@@ -28,12 +28,7 @@ class Lag:
     def update(self, start_s: float, end_s: float, n_solved: int, estimate: Estimate | None, config: Config) -> str:
         """Take in a solve; return a warning when it is time for one, once for each time that it falls behind.
 
-        Args:
-            start_s: of the solve, s.
-            end_s: of the solve, s.
-            n_solved: keyframes that it took together.
-            estimate: what came of it.
-            config: parameters, to say which of them would help.
+        ``n_solved`` keyframes were taken together; the parameters are to say which of them would help.
         """
         self._calm = self._calm + 1 if n_solved <= 1 else 0
         if self._calm >= _CALM:

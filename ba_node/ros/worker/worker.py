@@ -60,14 +60,10 @@ Output = Outcome | Notice
 
 
 class Worker:
-    """The solver's thread.
+    """The solver's thread; from :meth:`start` on the back-end is its alone.
 
-    Args:
-        backend: used by this thread alone from :meth:`start` on.
-        inbox: where measurements and commands come from.
-        settle_time_s: silence after which the newest keyframe is complete.
-        notify: called, on this thread, when :meth:`outputs` has something new.
-        clock: steady clock, s.
+    ``settle_time_s`` is the silence after which the newest keyframe is complete; ``notify`` is called, on this thread,
+    when :meth:`outputs` has something new; the clock (s) is a steady one.
     """
 
     def __init__(
