@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -106,10 +105,6 @@ class SolveReport:
     correction_m: float = 0.0
     correction_rad: float = 0.0
     correction_held: bool = False
-
-    def without_times(self) -> SolveReport:
-        """Return a copy that does not depend on the machine, for reproducible files."""
-        return dataclasses.replace(self, solve_time_s=0.0)
 
 
 @dataclass(frozen=True)

@@ -75,37 +75,17 @@ class Backend:
         return self.map.config
 
     @property
-    def map_index(self) -> int:
-        """Return the number of the current map; it rises when another takes its place, whatever the session ids."""
-        return self.map.index
-
-    @property
     def scene(self) -> Scene:
         """Return the tables of the current map."""
         return self.map.scene
 
     @property
-    def rejected(self) -> Counter[str]:
-        """Return what was turned away in this session, by reason (``rejections.REASONS``)."""
-        return self.map.rejected
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Return what somebody has to know or mend, in words."""
-        return self.map.warnings
-
-    @property
     def report(self) -> SolveReport:
         """Return the report of the last solve, with what has been turned away since."""
-        counts = dict(sorted(self.rejected.items()))
+        counts = dict(sorted(self.map.rejected.items()))
         return dataclasses.replace(
-            self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.warnings
+            self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.map.warnings
         )
-
-    @property
-    def stamp_ns(self) -> int:
-        """Return the stamp of the newest keyframe, 0 before the first."""
-        return self.map.stamp_ns
 
     @property
     def notices(self) -> Counter[str]:
@@ -334,7 +314,7 @@ class Backend:
         Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.
         """
         known.scene.config = self.config.scene
-        self.map = CurrentMap(self.config, known.scene, self.map_index + 1)
+        self.map = CurrentMap(self.config, known.scene, self.map.index + 1)
         self.map.report, self.map.correction = known.report, known.correction
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
         self.finished = known.finished[-FINISHED_KEPT:]
@@ -365,7 +345,7 @@ class Backend:
         if len(before.keyframes) and not begin.replaces:
             assert before.session_id is not None
             before.end_pending()
-            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.rejected.items())))
+            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.map.rejected.items())))
             self.finished.append((before.session_id, self.map.estimate()))
             del self.finished[:-FINISHED_KEPT]
         self._renew(session_id, before.next_cameras or before.cameras)
@@ -378,4 +358,4 @@ class Backend:
     def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
         scene = Scene(self.config.scene, session_id)
         scene.cameras, scene.refused_rig = cameras, self.scene.refused_rig
-        self.map = CurrentMap(self.config, scene, self.map_index + 1)
+        self.map = CurrentMap(self.config, scene, self.map.index + 1)

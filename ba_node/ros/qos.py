@@ -19,7 +19,6 @@ from rclpy.qos import (
     QoSCompatibility,
     QoSPolicyKind,
     QoSProfile,
-    ReliabilityPolicy,
     qos_check_compatible,
     qos_policy_name_from_kind,
     qos_profile_sensor_data,
@@ -39,29 +38,17 @@ _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIAB
 
 def reliable(depth: int) -> Any:
     """Return a profile that repeats lost messages and keeps nothing for late subscribers."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=depth)
 
 
 def lossless() -> Any:
     """Return a profile that keeps every message until all subscribers have acknowledged it."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
-    )
+    return QoSProfile(history=HistoryPolicy.KEEP_ALL)
 
 
 def latched(depth: int = 1) -> Any:
     """Return a profile whose last messages reach subscribers that come later."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def profile(topic: Topic, depth: int = OUTPUT_DEPTH) -> Any:

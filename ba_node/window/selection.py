@@ -26,9 +26,9 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, determined, gauge, moving, odometry, trial, turns
+from ba_node.window import arrival, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
-from ba_node.window.problems import part_of, problem_of, some_observations
+from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
 # Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
 _VIEWS = 400
@@ -116,7 +116,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     lost = _contradicted(scene, part, usable)
     moves = _moving(scene, part, norms, config)
     least = config.guard.min_points if config.guard.enabled else 2
-    kept, keyframes, points = determined.determined(part.problem, usable, moves, config.window.max_landmarks, least)
+    kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]
     usable &= ~moves.take(part.problem.observations.point)

@@ -27,8 +27,8 @@ from ba_node.config import OutputConfig
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import FeatureTracks
 from ba_node.messages import conversion
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, output_messages
-from ba_node.messages.topics import TOPICS
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.tools.domain import free_domain, isolation

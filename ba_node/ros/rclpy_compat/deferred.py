@@ -46,22 +46,17 @@ class DeferredAnswers:
         self._actions: deque[Callable[[], None]] = deque()
         self._expected: dict[Answer, None] = {}
         self._lock = threading.Lock()
-        self._open = True
+        self.open = True
         self.left_waiting = 0  # clients that were answered because of a cleanup, when that was
         self._guard = node.create_guard_condition(self._run)
         # Silence is no reason not to look, and /clock may stand still.
         self._timer = node.create_timer(_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    @property
-    def open(self) -> bool:
-        """Return False once the node was cleaned up."""
-        return self._open
-
     def expect(self, send: Send) -> Answer:
         """Return an answer that a client waits for; at cleanup and after it is sent at once."""
         answer = Answer(self, self._node, send)
         self._expected[answer] = None
-        if not self._open:
+        if not self.open:
             answer.send(success=False, message=CLEANED_UP)
         return answer
 
@@ -72,7 +67,7 @@ class DeferredAnswers:
     def call(self, action: Callable[[], None]) -> None:
         """Have something run on the executor's thread. May be called from any; after cleanup it does nothing."""
         with self._lock:
-            if not self._open:
+            if not self.open:
                 return
             self._actions.append(action)
             with contextlib.suppress(RCLError):  # then the timer finds it
@@ -81,7 +76,7 @@ class DeferredAnswers:
     def close(self) -> None:
         """Answer all who still wait, and go."""
         with self._lock:
-            self._open = False
+            self.open = False
         self._run()
         self.left_waiting = len(self._expected)
         self._give_up(CLEANED_UP)

@@ -25,7 +25,7 @@ from rclpy.node import Node
 
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
-from ba_node.messages.conversion import stamp_ns_from_message
+from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class

@@ -17,7 +17,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,17 +81,13 @@ class PlaySummary:
     duration_s: float  # from the first message to the last, s
 
 
-def _nothing(*_: object) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class Listener:
     """Who is told about the play."""
 
     # called with the number of messages done and of all messages
-    progress: Callable[[int, int], None] = field(default=_nothing)
-    notice: Callable[[str], None] = field(default=_nothing)  # called with a line of text
+    progress: Callable[[int, int], None] = lambda *_: None
+    notice: Callable[[str], None] = lambda *_: None  # called with a line of text
 
 
 def play(bag: Path | str, options: PlayOptions = PlayOptions(), listener: Listener = Listener()) -> PlaySummary:

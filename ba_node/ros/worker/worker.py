@@ -23,8 +23,7 @@ from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
 from ba_node.ros.worker.inbox import Arrival, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
-from ba_node.ros.worker.lag import Lag
-from ba_node.ros.worker.latency import Budget
+from ba_node.ros.worker.latency import Budget, Lag
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
 _MAX_OUTPUTS = 20
@@ -234,29 +233,29 @@ class Worker:
 
     def _turned_away(self) -> object:
         """Return what a report says of things turned away."""
-        return self._backend.map_index, Counter(self._backend.rejected), tuple(self._backend.warnings)
+        return self._backend.map.index, Counter(self._backend.map.rejected), tuple(self._backend.map.warnings)
 
     def _report_rejections(self) -> None:
         """Report what was turned away since the last report, if no solve did."""
         now_s = self._clock()
         self._has_news = self._turned_away() != self._reported and bool(
-            self._backend.rejected or self._backend.warnings
+            self._backend.map.rejected or self._backend.map.warnings
         )
         if self._has_news and now_s - self._reported_s >= _REPORT_PERIOD_S:
             self._reported_s = now_s
-            self._put(Outcome(self._backend.report, self._queue(), self._backend.stamp_ns))
+            self._put(Outcome(self._backend.report, self._queue(), self._backend.map.stamp_ns))
 
     def _log_rejections(self) -> None:
-        rejected, notices = Counter(self._backend.rejected), []
-        if self._backend.map_index != self._logged_map:
-            self._logged_map, self._logged, self._warned = self._backend.map_index, Counter(), set()
+        rejected, notices = Counter(self._backend.map.rejected), []
+        if self._backend.map.index != self._logged_map:
+            self._logged_map, self._logged, self._warned = self._backend.map.index, Counter(), set()
         for reason in sorted(rejected - self._logged):
             notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
             notices.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
         self._logged = rejected
         # What is a rejection too has been told with its count.
         heads = tuple(notice.text[:_HEAD] for notice in notices)
-        warnings = self._backend.warnings
+        warnings = self._backend.map.warnings
         news = [text for text in warnings if text not in self._warned]
         self._warned = set(warnings)
         notices += [Notice(f"warning {text[:_HEAD]}", text) for text in news if text[:_HEAD] not in heads]
