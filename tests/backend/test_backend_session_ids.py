@@ -52,7 +52,7 @@ def test_one_message_of_a_higher_session_does_not_end_the_map(what: str, session
     parts[6] += changed([USELESS[what]()], session_id=session)
     played = Played(joined(parts))
     assert (played.ids, played.finished) == (all_ids(), [])
-    assert played.map.rejected.total() == 1, played.rejected
+    assert played.map.rejected.total() == 1, played.map.rejected
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
@@ -61,7 +61,7 @@ def test_one_message_of_a_higher_session_does_not_open_the_first_one(what: str) 
     stray = changed([USELESS[what]()], session_id=7)
     played = Played([data().rig, *stray, *messages()[1:]])
     assert (played.ids, played.scene.session_id) == (all_ids(), 0)
-    assert played.map.rejected.total() == 1, played.rejected
+    assert played.map.rejected.total() == 1, played.map.rejected
 
 
 def test_tracks_and_guesses_that_come_before_the_first_keyframe_of_their_session_are_used() -> None:
