@@ -28,7 +28,7 @@ class Solution:
 
 
 def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Solution:
-    """Solve ``A x = b``, A dense (written over) or sparse; no solution if A is not symmetric positive definite."""
+    """Solve ``A x = b`` for symmetric positive definite A, dense (written over) or sparse; no solution if A is not."""
     try:
         if scipy.sparse.issparse(matrix):
             factor = scipy.sparse.linalg.splu(

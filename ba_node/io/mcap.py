@@ -93,7 +93,7 @@ class BagReader:
         self._stack.close()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Yield (topic, type, log time in ns, CDR bytes) of some topics (None: all), by log time, then as in the file.
+        """Yield (topic, type, log time in ns, CDR bytes) of topics (None: all) by log time, then place in the file.
 
         Raises:
             BagError: nothing of the recording can be read after all.

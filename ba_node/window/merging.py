@@ -28,7 +28,7 @@ _NOTICED = 10.0
 _LEAP = 0.5
 # From as many keyframes on it is said that tracks move, if more than this share do.
 _KNOWN_KEYFRAMES = 15
-_MANY_MOVING = 0.15
+_MANY_MOVING = 0.2
 
 
 class Merged(NamedTuple):
@@ -139,8 +139,9 @@ def _note_moving(scene: Scene, selection: Selection) -> None:
     if selection.problem.n_keyframes >= _KNOWN_KEYFRAMES and count > _MANY_MOVING * of:
         scene.log.warn(
             "moving",
-            f"{count} of {of} tracks of the window move against the rest, as those on objects that move do: they were"
-            " left out of the solve, and the motion that the others and the front-end agree on was taken",
+            f"{count} of {of} tracks of the window move against the rest, as those on objects that move do, or those"
+            " that slip off their points: they were left out of the solve; the motion that the others and the front-end"
+            " agree on was taken",
         )
 
 

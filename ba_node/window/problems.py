@@ -111,6 +111,9 @@ def _number(rows: IntArray, n: int) -> IntArray:
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
+# Of the tracks that a keyframe shares with others this share has to have a place. If only few have, nothing shows
+# parallax, and they are mismatches or worse.
+_LEAST_PLACED = 0.3
 
 
 def determined(
@@ -125,16 +128,21 @@ def determined(
         Rows of the observations, (n_kf,) and (n_pt,) True for what is kept.
     """
     obs, n_kf, n_pt = problem.observations, problem.n_keyframes, problem.n_points
-    keep_pt = ~np.isnan(problem.start.points[:, 0])
+    placed = ~np.isnan(problem.start.points[:, 0])
+    keep_pt = placed.copy()
     if np.count_nonzero(keep_pt) > max_landmarks:
         keep_pt = _most_seen(keep_pt, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
     # Views of a point by several cameras of a keyframe are neighbours, and count once.
     first = np.ones(len(obs), bool)
     first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
     static = ~moves.take(obs.point)
+    views = np.bincount(obs.point[first], minlength=n_pt)
+    shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
+    known = np.bincount(obs.keyframe[first & usable & static & placed.take(obs.point)], minlength=n_kf)
+    mostly = known >= _LEAST_PLACED * shared
     while True:
         used = usable & keep_pt.take(obs.point)
-        keep_kf = np.bincount(obs.keyframe, used & static, n_kf) >= MIN_OBSERVATIONS
+        keep_kf = mostly & (np.bincount(obs.keyframe, used & static, n_kf) >= MIN_OBSERVATIONS)
         keep_kf &= np.bincount(obs.keyframe[used & static & first], minlength=n_kf) >= min_points
         used &= keep_kf.take(obs.keyframe)
         seen_enough = np.bincount(obs.point, used, n_pt) >= 2

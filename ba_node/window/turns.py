@@ -10,7 +10,8 @@ noise, there is no parallax, and R is far better than the front-end's.
 
 Only keyframes that see few points with a place are looked at: the others have better to go by. Each is compared with
 the one before, and then with the first of its run, its anchor, so that slow motion is told from none once it has added
-up.
+up. A camera that does not sit on the axis moves as the body turns, and near points take that for more of a turn: such
+turns are left to the front-end.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _LEAST_OVERLAP = 0.4
 _WITHIN = 4.0
 _LEAST_EXPLAINED = 0.6
 _ROUNDS = 5
+# A camera beside the axis moves as the body turns. With points this near that feigns a rotation, which must be noise.
+_NEAR_M = 2.0
 # A camera that turns on loses its anchor from sight: so many anchors may follow each other.
 _MAX_ANCHORS = 4
 
@@ -118,6 +121,7 @@ def find(problem: Problem, rows: IntArray, used: BoolArray, placed: BoolArray) -
         return None
     sigma = np.zeros(n)
     np.maximum.at(sigma, rays.keyframe, rays.sigma_rad)
+    sigma *= np.sqrt(2.0)
     done, before, chain = np.zeros(n, bool), found, np.full(n, -1)
     for _ in range(_MAX_ANCHORS):
         # The first of each run of keyframes that are still to be compared.
@@ -125,13 +129,21 @@ def find(problem: Problem, rows: IntArray, used: BoolArray, placed: BoolArray) -
         begins = left & ~np.append(False, left[:-1])
         wanted = np.where(left, np.maximum.accumulate(np.where(begins, np.arange(n) - 1, -1)), -1)
         turned, explained, shared = _compare(rays, wanted)
+        explained &= _swing(problem, turned) <= _NEAR_M * sigma
         chain[explained], rotation[explained] = wanted[explained], turned[explained]
         done |= explained
         # Parallax has added up: from there on it is no rotation alone.
         before &= ~((wanted >= 0) & shared & ~explained)
         if not (before & ~done).any():
             break
-    return Turns(np.where(done, rows[chain], -1), rotation, np.sqrt(2.0) * sigma)
+    return Turns(np.where(done, rows[chain], -1), rotation, sigma)
+
+
+def _swing(problem: Problem, turned: FloatArray) -> FloatArray:
+    """Return how far rotations of the body move the camera that they move most, (n_kf,) m."""
+    rig = problem.cameras
+    centre = -(np.swapaxes(rig.rotation, 1, 2) @ rig.translation[:, :, None])[..., 0]
+    return np.asarray(np.linalg.norm((turned - np.eye(3)) @ centre.T, axis=1).max(axis=1))
 
 
 def _rays(problem: Problem, used: BoolArray) -> _Rays:

@@ -119,7 +119,7 @@ def jumped(stream: Stream, at: int, shift: Iterable[float], turn: float, stays: 
 
 WRONG_RIGS: dict[str, tuple[str, Callable[[CameraRig], CameraRig], str]] = {
     "baseline reversed": ("stereo", reversed_baseline, "observations agree"),
-    "cameras swapped": ("stereo", swapped, "observations agree"),
+    "cameras swapped": ("stereo", swapped, "of the observations of camera 1 agree"),
     "extrinsics inverted": ("stereo", inverted, "observations agree"),
     "extrinsics of one camera inverted": ("one camera", inverted, "observations agree"),
     "second camera pitched by 1 degree": ("stereo", turned(0, 1.0), "observations agree"),

@@ -14,8 +14,8 @@ from experiments.robustness.faults import FAULTS, Recording, spoiled
 from tests.cases.conftest import Replay, harmless
 
 # Fault and rig that are not mended yet; one goes as soon as its tests pass. Of what one camera sees 40 % move, and in
-# places far more than half; on the spot its turns begin too early to be placed.
-PENDING = {("outliers_moving", "mono"), ("pure_rotation", "mono")}
+# places far more than half.
+PENDING = {("outliers_moving", "mono")}
 
 
 def siblings() -> list[Any]:
