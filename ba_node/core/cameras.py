@@ -69,14 +69,11 @@ _NAMES: dict[str, tuple[Model, tuple[int, ...]]] = {
 
 
 def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> tuple[Model, FloatArray]:
-    """Return model and parameter row of a camera given as in ``sensor_msgs/CameraInfo``.
+    """Return model and (12,) parameters of a camera given as in ``sensor_msgs/CameraInfo``.
 
     The name is distortion_model; many drivers of rectified cameras leave it empty, where there is no distortion.
     Intrinsics are (4,) fx fy cx cy, px. No coefficients means no distortion; zeros beyond those of the model are let
     pass.
-
-    Returns:
-        The model and (12,) parameters.
 
     Raises:
         CameraError: the model is unknown, or the numbers do not fit it.

@@ -42,11 +42,7 @@ def pose_jacobian(
 def retract(
     kind: str, rotation: FloatArray, translation: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return poses, (n, 3, 3) and (n, 3) m, after a step (n, 6): rotation (rad), then translation (m).
-
-    Returns:
-        Rotations (n, 3, 3) and translations (n, 3).
-    """
+    """Return poses, (n, 3, 3) and (n, 3) m, after a step (n, 6): rotation (rad), then translation (m)."""
     if kind == "local":
         moved = translation + (rotation @ step[:, 3:, None])[..., 0]
         return rotation @ geometry.so3_exp(step[:, :3]), moved
