@@ -46,6 +46,7 @@ class Result:
     """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start.
 
     ``linear_solver`` says how the reduced systems were solved, and what that takes; empty if there was none.
+    ``weakest`` is of the free poses, if it was asked for: see ``covariance.weakest``.
     """
 
     state: State
@@ -54,6 +55,7 @@ class Result:
     method: str
     trace: tuple[Iteration, ...]
     linear_solver: str = ""
+    weakest: tuple[float, float] = (0.0, 0.0)
 
     @property
     def objective_before(self) -> float:

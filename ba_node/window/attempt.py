@@ -73,7 +73,7 @@ def attempt(
         options = methods.from_config(config.solver)
         problem = _begun(selection.problem, selection.norms[selection.inlier], options)
         began = clock()
-        result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration)
+        result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True)
         solve_time_s += clock() - began
         found = outcome(scene, selection, result, config.tracks, config.solver.kernels)
         if found.state is None:

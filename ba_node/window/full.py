@@ -96,7 +96,7 @@ class Optimization:
     ) -> None:
         """Solve, on any thread; the map is not touched. Arguments as of :func:`options` and ``solver.solve``."""
         chosen = options(config, method, max_iterations)
-        result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration)
+        result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
 
     @property
