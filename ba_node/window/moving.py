@@ -52,7 +52,8 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     residuals at the start, sigmas; no solve has refined the poses of ``unrefined`` (n_kf,) yet.
     """
     point = problem.observations.point
-    if len(point) < _MANY * problem.n_keyframes:
+    # Where most poses are the front-end's alone, as after a burst of keyframes, none is known well enough to tell.
+    if len(point) < _MANY * problem.n_keyframes or np.count_nonzero(unrefined) > 1 + problem.n_keyframes // 2:
         return np.zeros(problem.n_points, bool)
     norms = np.where(np.isnan(problem.start.points[:, 0]).take(point), np.inf, norms)
     off = _off(problem, norms, unrefined)

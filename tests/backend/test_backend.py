@@ -81,6 +81,23 @@ def test_replay_comes_nearer_to_the_truth(options: dict[str, Any]) -> None:
     assert backend.scene.keyframes.refined.all()
 
 
+@pytest.mark.parametrize("baseline_m", [0.12, 0.0])
+@pytest.mark.parametrize("seed", [3, 5, 9])
+def test_keyframes_that_come_all_at_once_are_refined_together(seed: int, baseline_m: float) -> None:
+    """None of them is refined yet, and the front-end's poses are off: that is no reason to take tracks for moving."""
+    data = generated(SyntheticOptions(seed=seed, keyframes=6, length_m=10.0, path="line", baseline_m=baseline_m))
+    backend = Backend(Config())
+    for _, _, measurement in data.timeline():
+        for admitted in backend.admit(measurement):
+            backend.take(admitted)
+    backend.flush(final=True)
+    estimate = backend.solve()
+    assert estimate is not None
+    assert estimate.report.status is Status.CONVERGED, estimate.report.reason
+    assert estimate.report.inlier_share > 0.9
+    assert len(estimate.cloud) > 50
+
+
 def test_a_replay_solves_once_for_every_keyframe() -> None:
     data = recording(landmarks=2000, tracks=120)
     estimates = replay(Backend(Config()), (m for _, _, m in data.timeline()))

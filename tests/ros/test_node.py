@@ -99,7 +99,11 @@ def _rejected(peer: Any) -> dict[str, int]:
 
 
 @pytest.fixture(scope="class", params=[_play, _burst])
-def played(domain: int, request: pytest.FixtureRequest, scene: SyntheticData) -> Iterator[tuple[NodeProcess, Peer]]:  # noqa: ARG001
+def played(
+    domain: int,  # noqa: ARG001
+    request: pytest.FixtureRequest,
+    scene: SyntheticData,
+) -> Iterator[tuple[NodeProcess, Peer]]:
     """Return a node that has solved a scene, and who listens to it."""
     with contextlib.closing(NodeProcess()) as node, contextlib.closing(Peer()) as peer:
         peer.advertise()
