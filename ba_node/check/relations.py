@@ -63,27 +63,16 @@ _CLEAR = 0.5
 
 @dataclass(frozen=True)
 class Relation:
-    """Two images, the rays they share, and their relation by the tracks.
+    """Two images, the rays they share, and their relation by the tracks."""
 
-    Attributes:
-        a: image (keyframe, camera).
-        b: image.
-        rows_a: (n,) rows of the tracks.
-        rows_b: (n,).
-        pair: the rays.
-        pose: b from a, direction of the translation only.
-        share: of the rays that agree with it.
-        parallax: usual parallax of these, in units of the gate.
-    """
-
-    a: Image
-    b: Image
-    rows_a: IntArray
-    rows_b: IntArray
-    pair: Pair
-    pose: Pose
-    share: float
-    parallax: float
+    a: Image  # image (keyframe, camera)
+    b: Image  # image
+    rows_a: IntArray  # (n,) rows of the tracks
+    rows_b: IntArray  # (n,)
+    pair: Pair  # the rays
+    pose: Pose  # b from a, direction of the translation only
+    share: float  # of the rays that agree with it
+    parallax: float  # usual parallax of these, in units of the gate
 
     def at(self, pose: Pose) -> Relation:
         """Return the same with another pose."""

@@ -15,6 +15,9 @@ out); factors count in S and in both sums like all else, and everything is relat
 Where a condition ``g'x = 0`` on the step of all keyframes fixes scale, and not a fixed pose, S is inverted on the
 directions that the condition leaves: with an orthonormal basis Q of them, ``S^-1 -> Q (Q' S Q)^-1 Q'``.
 
+A lower bound is had at once: the inverse of a keyframe's own block of S is its covariance with all other keyframes held
+exact, hence that of its steps to them. It costs one elimination more, and tells which keyframe hangs loose.
+
 A direction that nothing determines has no variance. Keyframes that take part in such a direction are unknown (NaN); the
 others keep theirs. S is scaled to a unit diagonal first, so that units do not decide what is rounding.
 """
@@ -28,8 +31,8 @@ import scipy
 
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
-from ba_node.core import native_kernels
-from ba_node.core.kernels import DENSE_LIMIT
+from ba_node.core import geometry, native_kernels
+from ba_node.core.kernels import DENSE_LIMIT, Kernels
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
 
@@ -40,13 +43,9 @@ _SHARE = 1e-4
 
 
 def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
-    """Return the covariance of the step of every free pose at a solution.
+    """Return the covariance of the step of every free pose at a solution, by the options that it was solved with.
 
-    Args:
-        problem: as it was solved.
-        state: its solution.
-        options: loss, cheirality and the kernels that it was solved with; poses are stepped locally.
-        conditions: (n_free, 6, n_conditions) g: conditions that hold what no fixed pose holds; or none, (n_free, 6, 0).
+    Conditions g (n_free, 6, n_conditions) hold what no fixed pose holds; poses are stepped locally.
 
     Returns:
         (n_free, 6, 6) in the local tangent, ``R <- R Exp(dphi), t <- t + R dt``: rotation (rad), then translation (m),
@@ -67,6 +66,53 @@ def pose_covariances(problem: Problem, state: State, options: SolverOptions, con
     if not np.isfinite(variance) or not np.isfinite(s).all():
         return unknown
     return variance * _diagonal_of_inverse(s, conditions.reshape(n, -1))
+
+
+def weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
+    """Return the standard deviations of the least determined of the free poses, in their worst directions.
+
+    Each is that of a pose with all others held exact, and with noise as stated by sigma_px: a lower bound. Factors
+    count.
+
+    Args:
+        kernels: linearised at the state; their reduced system is another one afterwards.
+        problem: as it was solved.
+        state: its solution.
+        options: that it was solved with.
+
+    Returns:
+        Of the position (m) and of the rotation (rad); 0, 0 where they are unknown, or nothing determines one of them.
+    """
+    unknown = (0.0, 0.0)
+    if options.parameterisation != "local" or problem.free_intrinsics or not kernels.n_free:
+        return unknown
+    system = kernels.damp("none", 0.0)
+    if system.side != "points":
+        return unknown
+    tangent = _inverses(system.diagonal_blocks()[0])
+    # The body is at p = -R't, and moves by p x dphi - dt.
+    _, position = geometry.inverse(state.rotation[~problem.fixed], state.translation[~problem.fixed])
+    moves = np.concatenate([geometry.hat(position), np.broadcast_to(-np.eye(3), (len(position), 3, 3))], axis=2)
+    both = np.stack([moves @ tangent @ np.swapaxes(moves, 1, 2), tangent[:, :3, :3]])
+    if not np.isfinite(both).all():
+        return unknown
+    sigma_m, sigma_rad = np.sqrt(np.linalg.eigvalsh(both)[:, :, -1].max(axis=1))
+    return float(sigma_m), float(sigma_rad)
+
+
+def _inverses(blocks: FloatArray) -> FloatArray:
+    """Return the inverses of blocks (n, 6, 6) of S; NaN for all if one of them is singular to rounding."""
+    with np.errstate(all="ignore"):
+        unit = 1.0 / np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
+        scale = unit[:, :, None] * unit[:, None, :]
+        try:
+            inverse = np.linalg.inv(blocks * scale)
+        except np.linalg.LinAlgError:
+            return np.full_like(blocks, np.nan)
+    # A positive definite block has positive variances.
+    variances = np.diagonal(inverse, axis1=1, axis2=2)
+    sound = variances.min() > 0.0 and variances.max() < 1.0 / _ROUNDING
+    return inverse * scale if sound else np.full_like(blocks, np.nan)
 
 
 def unit_variance(objective: Objective, state: State, n_conditions: int = 0) -> float:

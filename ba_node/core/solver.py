@@ -26,11 +26,12 @@ A step that is not finite, or that could not be computed, counts as a rejected o
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from ba_node.config import ConfigError, SolverOptions
-from ba_node.core import linear, native_kernels
+from ba_node.core import covariance, linear, native_kernels
 from ba_node.core.annealing import Annealing
 from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
@@ -44,26 +45,20 @@ _SAVED_RHO = 0.3
 _MAX_REJECTED = 25
 
 
-def _no_clock() -> float:
-    return 0.0
-
-
 def solve(
     problem: Problem,
     options: SolverOptions,
     *,
-    clock: Callable[[], float] = _no_clock,
+    clock: Callable[[], float] = lambda: 0.0,
     on_iteration: Callable[[Iteration], bool] | None = None,
     kernels: Kernels | None = None,
+    weakest: bool = False,
 ) -> Result:
     """Minimise the robust objective of a problem.
 
-    Args:
-        problem: must pass :meth:`Problem.check`.
-        options: the parts of the method.
-        clock: seconds, for the trace alone; nothing depends on it.
-        on_iteration: called with each row of the trace; returning False stops the solve.
-        kernels: of the problem, to work with in place of those that the options ask for: for experiments.
+    The clock (s) is for the trace alone; ``on_iteration`` gets each row of it, and stops the solve by returning False.
+    ``kernels`` work in place of those that the options ask for: for experiments. ``weakest`` asks how far off the least
+    determined of the free poses may be.
 
     Returns:
         The best state found, with a trace and the reason for stopping; finite always.
@@ -86,7 +81,10 @@ def solve(
     except native_kernels.KernelsError as error:
         return Result(problem.start, Status.FAILED, str(error), options.method, ())
     with np.errstate(all="ignore"):
-        return run.run()
+        result = run.run()
+        if weakest and result.status.usable:
+            result = replace(result, weakest=covariance.weakest(run.kernels, problem, result.state, options))
+        return result
 
 
 class _Run:

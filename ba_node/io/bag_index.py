@@ -55,42 +55,25 @@ class Message(NamedTuple):
 
 
 class Block(NamedTuple):
-    """A record that holds messages: a chunk, or a message that stands alone. Sorts by time, then place in the file.
+    """A record that holds messages: a chunk, or a message that stands alone. Sorts by time, then place in the file."""
 
-    Attributes:
-        start_ns: smallest log time in it, ns.
-        offset: where it begins, bytes.
-        length: with its head, bytes.
-        channels: those with messages in it; None if that is not known.
-    """
-
-    start_ns: int
-    offset: int
-    length: int
-    channels: frozenset[int] | None = None
+    start_ns: int  # smallest log time in it, ns
+    offset: int  # where it begins, bytes
+    length: int  # with its head, bytes
+    channels: frozenset[int] | None = None  # those with messages in it; None if that is not known
 
 
 @dataclass
 class BagIndex:
-    """Where the messages of a file are.
+    """Where the messages of a file are."""
 
-    Attributes:
-        schemas: by id.
-        channels: by id.
-        blocks: what holds messages, sorted.
-        message_count: number of messages that can be read.
-        counts: the same by channel; empty if that is not known.
-        end_ns: largest log time, ns.
-        problems: what is wrong with the file, as (reason, words).
-    """
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)
-    message_count: int = 0
-    counts: Counter[int] = field(default_factory=Counter)
-    end_ns: int = 0
-    problems: list[tuple[str, str]] = field(default_factory=list)
+    schemas: dict[int, Schema] = field(default_factory=dict)  # by id
+    channels: dict[int, Channel] = field(default_factory=dict)  # by id
+    blocks: list[Block] = field(default_factory=list)  # what holds messages, sorted
+    message_count: int = 0  # number of messages that can be read
+    counts: Counter[int] = field(default_factory=Counter)  # the same by channel; empty if that is not known
+    end_ns: int = 0  # largest log time, ns
+    problems: list[tuple[str, str]] = field(default_factory=list)  # what is wrong with the file, as (reason, words)
 
     def add(self, record: Message | Schema | Channel) -> None:
         """Take note of a schema or a channel; of those that come twice the first counts."""

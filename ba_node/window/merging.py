@@ -32,17 +32,12 @@ _MANY_MOVING = 0.2
 
 
 class Merged(NamedTuple):
-    """What came of a result.
+    """What came of a result."""
 
-    Attributes:
-        norms: (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these.
-        state: the solution in the scale that it has in the map; None without a usable result.
-        explained: how well its poses explain the tracks that they are tried on; None likewise.
-    """
-
+    # (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these
     norms: FloatArray
-    state: State | None
-    explained: Explained | None = None
+    state: State | None  # the solution in the scale that it has in the map; None without a usable result
+    explained: Explained | None = None  # how well its poses explain the tracks that they are tried on; None likewise
 
 
 def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:

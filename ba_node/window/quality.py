@@ -50,6 +50,8 @@ def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[
         "gradient_norm": result.gradient_norm,
         "rms_px_before": rms_of_norms_px(selection, selection.norms),
         "rms_px_after": rms_of_norms_px(selection, norms),
+        "weakest_m": result.weakest[0],
+        "weakest_rad": result.weakest[1],
         "keyframes": int(np.count_nonzero(~problem.fixed)),
         "fixed_keyframes": int(np.count_nonzero(problem.fixed)),
         "landmarks": problem.n_points,

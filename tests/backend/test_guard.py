@@ -250,6 +250,8 @@ def test_nothing_is_held_of_sound_data(kind: str, drift: dict[str, Any]) -> None
     assert report.inlier_share > 0.9
     assert 2.0 < report.parallax_deg < 60.0
     assert 0.0 < report.held_out_px_after <= 1.1 * report.held_out_px_before
+    # Of stereo that sees much: millimetres, and well below a degree.
+    assert 0.0 < report.weakest_m < 0.05 and 0.0 < report.weakest_rad < 0.005
     assert report.held_keyframes == 0
 
 

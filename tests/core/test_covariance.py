@@ -173,3 +173,52 @@ def test_the_weighted_squares_are_those_of_the_linearisation(make_problem: MakeP
         squares, rows = measure.weighted_squares(problem.start)
         assert squares == pytest.approx(np.sum(lin.residual**2), rel=1e-12)
         assert rows == int(np.count_nonzero(np.any(lin.d_point != 0.0, axis=2)))
+
+
+def alone(problem: Problem, state: State, chosen: SolverOptions) -> tuple[float, float]:
+    """Return the largest standard deviations of one pose and all points, the other poses held, out of the whole H."""
+    h, _ = matrix_forms.explicit_dense(problem, Objective(problem, chosen).linearise(state))
+    h = np.asarray(h)
+    n = int(np.count_nonzero(~problem.fixed))
+    found = []
+    for k, row in enumerate(np.flatnonzero(~problem.fixed)):
+        kept = np.concatenate([np.arange(6 * k, 6 * k + 6), np.arange(6 * n, len(h))])
+        own = np.linalg.inv(h[np.ix_(kept, kept)])[:6, :6]
+        # Move the body by each unit step, and see where it goes.
+        steps = 1e-6 * np.eye(6)
+        turned = np.array([state.rotation[row] @ geometry.so3_exp(step[:3]) for step in steps])
+        moved = state.translation[row] + (state.rotation[row] @ steps[:, 3:].T).T
+        before = -state.rotation[row].T @ state.translation[row]
+        to_body = (-(np.swapaxes(turned, 1, 2) @ moved[:, :, None])[..., 0] - before).T / 1e-6
+        variances = to_body @ own @ to_body.T, own[:3, :3]
+        found.append([np.sqrt(np.linalg.eigvalsh(variance).max()) for variance in variances])
+    sigma_m, sigma_rad = np.max(found, axis=0)
+    return float(sigma_m), float(sigma_rad)
+
+
+@pytest.mark.parametrize("fields", [{"stereo": True}, {"fixed": 2}], ids=["stereo", "mono"])
+def test_the_weakest_pose_is_that_of_the_whole_of_h(make_problem: MakeProblem, fields: dict[str, object]) -> None:
+    problem, _ = make_problem(noise_px=1.0, **fields)
+    told = []
+    for kernels in ("native", "numpy"):
+        result = solver.solve(problem, options(backend=kernels), weakest=True)
+        told.append(result.weakest)
+        assert result.weakest == pytest.approx(alone(problem, result.state, options()), rel=1e-3)
+    assert told[0] == pytest.approx(told[1], rel=1e-6)
+
+
+def test_the_weakest_pose_is_a_lower_bound(make_problem: MakeProblem) -> None:
+    problem, _ = make_problem(stereo=True, noise_px=1.0)
+    result = solver.solve(problem, options(), weakest=True)
+    variance = covariance.unit_variance(Objective(problem, options()), result.state)
+    every = covariance.pose_covariances(problem, result.state, options(), none(problem)) / variance
+    rotation = np.sqrt(np.linalg.eigvalsh(every[:, :3, :3]).max())
+    assert 0.0 < result.weakest[1] < rotation
+
+
+def test_the_weakest_pose_is_unknown_where_one_hangs_loose(make_problem: MakeProblem) -> None:
+    problem, _ = make_problem(stereo=True, noise_px=1.0)
+    last = problem.observations.keyframe == problem.n_keyframes - 1
+    loose = _without(problem, ~(last & (np.cumsum(last) > 2)))
+    for kernels in ("native", "numpy"):
+        assert solver.solve(loose, options(backend=kernels), weakest=True).weakest == (0.0, 0.0)

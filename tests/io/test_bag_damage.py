@@ -17,7 +17,8 @@ from ba_node.io import ros_types
 from ba_node.io.bag_index import MAGIC
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
-from ba_node.messages.conversion import INPUT_TYPES, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import keyframe_message, rig_message, tracks_message
+from ba_node.messages.topics import INPUT_TYPES
 
 if TYPE_CHECKING:
     from pathlib import Path
