@@ -51,7 +51,7 @@ _CAP = 10.0
 _BRACKET = 1.18
 _SMALLER, _LARGER = (0.92, 0.7, 0.6, 0.5, 0.4), (1.08, 1.4, 1.65, 2.0, 2.5)
 # Factors nearer to 1 than this are not named.
-_LEAST_FACTOR = 0.12
+_LEAST_FACTOR = 0.06
 # Two estimates of a factor agree to this.
 _SAME_FACTOR = 1.15
 # Usual residual, in sigmas, from which on it is more than noise, and factors far from 1 are tried too.

@@ -166,6 +166,16 @@ def test_what_is_given_counts_where_consensus_finds_nothing_better() -> None:
     assert "camera 1 is where the rig says" in found.sound
 
 
+@pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])
+def test_focal_length_that_is_a_tenth_short_is_named(rig: str) -> None:
+    scene = Scene(Config().scene)
+    for measurement in spoiled("focal_off", rig, 0.9, seed=162, path="loop").measurements:
+        scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    assert re.search(r"focal length off by a factor of about 0\.(8[7-9]|9[0-3])", examine(tracks).causes())
+
+
 @pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
 def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
     """By 60 and 36 px: steps point 10 degrees beside the front-end's, all to the same side."""
