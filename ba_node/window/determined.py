@@ -38,7 +38,7 @@ def determined(
     static = ~moves.take(obs.point)
     views = np.bincount(obs.point[first], minlength=n_pt)
     shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
-    known = np.bincount(obs.keyframe[first & usable & static & placed.take(obs.point)], minlength=n_kf)
+    known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
     mostly = known >= _LEAST_PLACED * shared
     while True:
         used = usable & keep_pt.take(obs.point)
