@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -32,19 +31,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of keyframes, oldest first.
+    """Poses of keyframes, oldest first."""
 
-    Attributes:
-        keyframe_id: (n,) uint64.
-        stamp_ns: (n,) int64, ns.
-        position: (n, 3) body in the fixed frame, m.
-        orientation: (n, 4) fixed frame from body, unit quaternion x y z w.
-    """
-
-    keyframe_id: IdArray
-    stamp_ns: NDArray[np.int64]
-    position: FloatArray
-    orientation: FloatArray
+    keyframe_id: IdArray  # (n,) uint64
+    stamp_ns: NDArray[np.int64]  # (n,) int64, ns
+    position: FloatArray  # (n, 3) body in the fixed frame, m
+    orientation: FloatArray  # (n, 4) fixed frame from body, unit quaternion x y z w
 
     @classmethod
     def of(cls, keyframes: Sequence[Keyframe]) -> Poses:
@@ -57,7 +49,6 @@ class Poses:
         )
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.keyframe_id)
 
     def __getitem__(self, rows: slice | IntArray | BoolArray) -> Poses:
@@ -67,22 +58,14 @@ class Poses:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points of the map.
+    """Points of the map."""
 
-    Attributes:
-        track_id: (n,) uint64.
-        position: (n, 3) in the fixed frame, m.
-        rms_px: (n,) root mean square reprojection error per coordinate, px.
-        views: (n,) number of observations.
-    """
-
-    track_id: IdArray
-    position: FloatArray
-    rms_px: NDArray[np.float32]
-    views: NDArray[np.int32]
+    track_id: IdArray  # (n,) uint64
+    position: FloatArray  # (n, 3) in the fixed frame, m
+    rms_px: NDArray[np.float32]  # (n,) root mean square reprojection error per coordinate, px
+    views: NDArray[np.int32]  # (n,) number of observations
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.track_id)
 
 
@@ -123,10 +106,6 @@ class SolveReport:
     correction_rad: float = 0.0
     correction_held: bool = False
 
-    def without_times(self) -> SolveReport:
-        """Return a copy that does not depend on the machine, for reproducible files."""
-        return dataclasses.replace(self, solve_time_s=0.0)
-
 
 @dataclass(frozen=True)
 class Transform:
@@ -147,35 +126,22 @@ class Transform:
 
 @dataclass(frozen=True)
 class Correction:
-    """Where the front-end's fixed frame stands in the map, as published: map from odom.
+    """Where the front-end's fixed frame stands in the map, as published: map from odom."""
 
-    Attributes:
-        odom_frame: name of the front-end's fixed frame.
-        position: (3,) of its origin, m.
-        orientation: (4,) unit quaternion x y z w.
-    """
-
-    odom_frame: str
-    position: FloatArray
-    orientation: FloatArray
+    odom_frame: str  # name of the front-end's fixed frame
+    position: FloatArray  # (3,) of its origin, m
+    orientation: FloatArray  # (4,) unit quaternion x y z w
 
 
 @dataclass(frozen=True)
 class WindowView:
-    """What there is to see of a solve; rows as in ``Estimate.refined``.
+    """What there is to see of a solve; rows as in ``Estimate.refined``."""
 
-    Attributes:
-        free: (n,) True where the pose was free, False where it was fixed.
-        rms_px: (n,) root mean square residual per coordinate of each keyframe, px; NaN without observations.
-        links: (m, 2) pairs of keyframes that see common points.
-        shared: (m,) number of their common points.
-        frusta: (n_cam, 5, 3) what each camera sees, in the body: its centre, then the corners at a depth of 1 m.
-    """
-
-    free: BoolArray
-    rms_px: FloatArray
-    links: IntArray
-    shared: IntArray
+    free: BoolArray  # (n,) True where the pose was free, False where it was fixed
+    rms_px: FloatArray  # (n,) root mean square residual per coordinate of each keyframe, px; NaN without observations
+    links: IntArray  # (m, 2) pairs of keyframes that see common points
+    shared: IntArray  # (m,) number of their common points
+    # (n_cam, 5, 3) what each camera sees, in the body: its centre, then the corners at a depth of 1 m
     frusta: FloatArray
 
 
@@ -189,32 +155,21 @@ class Extras:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is published after a solve.
+    """What is published after a solve."""
 
-    Attributes:
-        stamp_ns: stamp of the newest keyframe, ns.
-        frame_id: name of the map's frame.
-        refined: poses of the keyframes in the solve, free and fixed, oldest first.
-        trajectory: poses of all keyframes that are kept, oldest first, the newest estimate of each.
-        cloud: all points that are kept.
-        report: how the solve went.
-        correction: of the front-end's fixed frame; None before the first usable solve of a session.
-        covariance: (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown,
-            0 for poses that were fixed. None if it was not asked for, or the solve is not usable.
-        view: what there is to see; None likewise.
-        map_index: number of the map; another one has another, whatever the session ids.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    refined: Poses
-    trajectory: Poses
-    cloud: Cloud
-    report: SolveReport
+    stamp_ns: int  # stamp of the newest keyframe, ns
+    frame_id: str  # name of the map's frame
+    refined: Poses  # poses of the keyframes in the solve, free and fixed, oldest first
+    trajectory: Poses  # poses of all keyframes that are kept, oldest first, the newest estimate of each
+    cloud: Cloud  # all points that are kept
+    report: SolveReport  # how the solve went
+    # of the front-end's fixed frame; None before the first usable solve of a session
     correction: Correction | None = None
+    # (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown, 0 for poses
+    # that were fixed. None if it was not asked for, or the solve is not usable.
     covariance: FloatArray | None = None
-    view: WindowView | None = None
-    map_index: int = 0
+    view: WindowView | None = None  # what there is to see; None likewise
+    map_index: int = 0  # number of the map; another one has another, whatever the session ids
 
     @property
     def replaces_map(self) -> bool:

@@ -23,97 +23,57 @@ def _no_floats() -> FloatArray:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A keyframe and the front-end's pose of it (message ``ba_msgs/Keyframe``).
+    """A keyframe and the front-end's pose of it (message ``ba_msgs/Keyframe``)."""
 
-    Attributes:
-        session_id: rises when the front-end restarts.
-        keyframe_id: any uint64.
-        stamp_ns: time of the image, ns.
-        frame_id: name of the fixed frame.
-        position: (3,) body in the fixed frame, m.
-        orientation: (4,) fixed frame from body, quaternion x y z w.
-    """
-
-    session_id: int
-    keyframe_id: int
-    stamp_ns: int
-    frame_id: str
-    position: FloatArray
-    orientation: FloatArray
+    session_id: int  # rises when the front-end restarts
+    keyframe_id: int  # any uint64
+    stamp_ns: int  # time of the image, ns
+    frame_id: str  # name of the fixed frame
+    position: FloatArray  # (3,) body in the fixed frame, m
+    orientation: FloatArray  # (4,) fixed frame from body, quaternion x y z w
 
 
 @dataclass(frozen=True)
 class FeatureTracks:
-    """What one camera saw in one keyframe (message ``ba_msgs/FeatureTracks``).
+    """What one camera saw in one keyframe (message ``ba_msgs/FeatureTracks``)."""
 
-    Attributes:
-        session_id: as in the keyframe.
-        keyframe_id: the keyframe it belongs to.
-        camera_index: index into the rig.
-        track_id: (n,) uint64.
-        uv: (n, 2) raw image coordinates, px. When u and v differ in length, ``malformed`` says so.
-        sigma_px: (n,) or (0,): standard deviation of u and v, px.
-        depth_m: (n,) or (0,): distance along the optical axis, m, NaN for none.
-        malformed: why the arrays of the message could not be put together, empty if they could.
-    """
-
-    session_id: int
-    keyframe_id: int
-    camera_index: int
-    track_id: IdArray
-    uv: FloatArray
-    sigma_px: FloatArray = field(default_factory=_no_floats)
+    session_id: int  # as in the keyframe
+    keyframe_id: int  # the keyframe it belongs to
+    camera_index: int  # index into the rig
+    track_id: IdArray  # (n,) uint64
+    uv: FloatArray  # (n, 2) raw image coordinates, px. When u and v differ in length, ``malformed`` says so.
+    sigma_px: FloatArray = field(default_factory=_no_floats)  # (n,) or (0,): standard deviation of u and v, px
+    # (n,) or (0,): distance along the optical axis, m, NaN for none
     depth_m: FloatArray = field(default_factory=_no_floats)
-    malformed: str = ""
+    malformed: str = ""  # why the arrays of the message could not be put together, empty if they could
 
 
 @dataclass(frozen=True)
 class LandmarkGuesses:
-    """First positions of points (message ``ba_msgs/LandmarkGuesses``).
+    """First positions of points (message ``ba_msgs/LandmarkGuesses``)."""
 
-    Attributes:
-        session_id: as in the keyframe.
-        track_id: (n,) uint64.
-        position: (n, 3) in the fixed frame, m.
-        malformed: why the arrays could not be put together, empty if they could.
-    """
-
-    session_id: int
-    track_id: IdArray
-    position: FloatArray
-    malformed: str = ""
+    session_id: int  # as in the keyframe
+    track_id: IdArray  # (n,) uint64
+    position: FloatArray  # (n, 3) in the fixed frame, m
+    malformed: str = ""  # why the arrays could not be put together, empty if they could
 
 
 @dataclass(frozen=True)
 class CameraRig:
-    """The cameras on the body (messages ``ba_msgs/CameraRig`` and ``sensor_msgs/CameraInfo``).
+    """The cameras on the body (messages ``ba_msgs/CameraRig`` and ``sensor_msgs/CameraInfo``)."""
 
-    Attributes:
-        frame_id: name of the body frame.
-        names: optical frame of each camera.
-        models: distortion model of each camera, as in CameraInfo.
-        intrinsics: (n, 4) fx fy cx cy, px of the image.
-        distortion: n arrays, the coefficients as in CameraInfo.
-        image_size: (n, 2) width and height, px; 0 if unknown.
-        position: (n, 3) camera in the body, m.
-        orientation: (n, 4) body from camera optical frame, quaternion x y z w.
-        malformed: why a camera of the message cannot be used, empty if all can.
-        notes: what was adjusted, a sentence each.
-    """
-
-    frame_id: str
-    names: tuple[str, ...]
-    models: tuple[str, ...]
-    intrinsics: FloatArray
-    distortion: tuple[FloatArray, ...]
-    image_size: NDArray[np.int64]
-    position: FloatArray
-    orientation: FloatArray
-    malformed: str = ""
-    notes: tuple[str, ...] = ()
+    frame_id: str  # name of the body frame
+    names: tuple[str, ...]  # optical frame of each camera
+    models: tuple[str, ...]  # distortion model of each camera, as in CameraInfo
+    intrinsics: FloatArray  # (n, 4) fx fy cx cy, px of the image
+    distortion: tuple[FloatArray, ...]  # n arrays, the coefficients as in CameraInfo
+    image_size: NDArray[np.int64]  # (n, 2) width and height, px; 0 if unknown
+    position: FloatArray  # (n, 3) camera in the body, m
+    orientation: FloatArray  # (n, 4) body from camera optical frame, quaternion x y z w
+    malformed: str = ""  # why a camera of the message cannot be used, empty if all can
+    notes: tuple[str, ...] = ()  # what was adjusted, a sentence each
 
     def __len__(self) -> int:
-        """Return the number of cameras."""
         return len(self.models)
 
 

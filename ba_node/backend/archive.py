@@ -36,27 +36,16 @@ _CORRECTION = {"rotation": Column(np.float64, (3, 3)), "translation": Column(np.
 
 @dataclass(frozen=True)
 class MapState:
-    """All that a back-end knows, parameters apart.
+    """All that a back-end knows, parameters apart."""
 
-    Attributes:
-        scene: the current map.
-        finished: session id and last estimate of the sessions before.
-        report: of the last solve.
-        correction: map from odom.
-        current: row of the newest keyframe that came, None before the first.
-        settled: it counts as complete.
-        delivered: cameras that delivered for each of the last keyframes.
-        solve_count: solves since the beginning.
-    """
-
-    scene: Scene
-    finished: list[tuple[int, Estimate]]
-    report: SolveReport
-    correction: MapCorrection
-    current: int | None
-    settled: bool
-    delivered: tuple[int, ...]
-    solve_count: int
+    scene: Scene  # the current map
+    finished: list[tuple[int, Estimate]]  # session id and last estimate of the sessions before
+    report: SolveReport  # of the last solve
+    correction: MapCorrection  # map from odom
+    current: int | None  # row of the newest keyframe that came, None before the first
+    settled: bool  # it counts as complete
+    delivered: tuple[int, ...]  # cameras that delivered for each of the last keyframes
+    solve_count: int  # solves since the beginning
 
     def sizes(self) -> dict[str, int]:
         """Return how many keyframes, landmarks and observations there are."""

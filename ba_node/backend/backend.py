@@ -53,32 +53,19 @@ FINISHED_KEPT = 8
 _REFUSED_KEPT = 1000
 
 
-def _no_clock() -> float:
-    return 0.0
-
-
 class Backend:
-    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data.
+    """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data."""
 
-    Attributes:
-        map: the current map.
-        finished: session id and last estimate of the sessions before, oldest first, the last few.
-        solve_count: solves since the beginning.
-        refused: the last keyframes that were turned away.
-        extras: what the next solve is to work out beside the estimate.
-        setup: the check of the set-up; while it gives a reason, every solve is held.
-        refusal: why the last solve of everything was held, in words; empty if it was not.
-    """
-
-    def __init__(self, config: Config, *, clock: Callable[[], float] = _no_clock) -> None:
+    def __init__(self, config: Config, *, clock: Callable[[], float] = lambda: 0.0) -> None:
         """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
-        self.map = CurrentMap(config, Scene(config.scene), 0)
+        self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
+        # session id and last estimate of the sessions before, oldest first, the last few
         self.finished: list[tuple[int, Estimate]] = []
-        self.solve_count = 0
-        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)
-        self.extras = Extras()
-        self.setup = SetUpWatch()
-        self.refusal = ""
+        self.solve_count = 0  # solves since the beginning
+        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)  # the last keyframes that were turned away
+        self.extras = Extras()  # what the next solve is to work out beside the estimate
+        self.setup = SetUpWatch()  # the check of the set-up; while it gives a reason, every solve is held
+        self.refusal = ""  # why the last solve of everything was held, in words; empty if it was not
         self._clock = clock
         self._sessions = Sessions()
 
@@ -88,37 +75,17 @@ class Backend:
         return self.map.config
 
     @property
-    def map_index(self) -> int:
-        """Return the number of the current map; it rises when another takes its place, whatever the session ids."""
-        return self.map.index
-
-    @property
     def scene(self) -> Scene:
         """Return the tables of the current map."""
         return self.map.scene
 
     @property
-    def rejected(self) -> Counter[str]:
-        """Return what was turned away in this session, by reason (``rejections.REASONS``)."""
-        return self.map.rejected
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Return what somebody has to know or mend, in words."""
-        return self.map.warnings
-
-    @property
     def report(self) -> SolveReport:
         """Return the report of the last solve, with what has been turned away since."""
-        counts = dict(sorted(self.rejected.items()))
+        counts = dict(sorted(self.map.rejected.items()))
         return dataclasses.replace(
-            self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.warnings
+            self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.map.warnings
         )
-
-    @property
-    def stamp_ns(self) -> int:
-        """Return the stamp of the newest keyframe, 0 before the first."""
-        return self.map.stamp_ns
 
     @property
     def notices(self) -> Counter[str]:
@@ -221,10 +188,7 @@ class Backend:
             self.scene.end_pending()
 
     def solve(self, on_iteration: Callable[[Iteration], bool] | None = None) -> Estimate | None:
-        """Refine the newest window; None while there is no keyframe.
-
-        Args:
-            on_iteration: called with each iteration; returning False ends the solve after it.
+        """Refine the newest window; None without a keyframe. ``on_iteration`` ends the solve by returning False.
 
         Returns:
             The estimate. After a failed or skipped solve poses and points are as before, and the report says why.
@@ -350,7 +314,7 @@ class Backend:
         Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.
         """
         known.scene.config = self.config.scene
-        self.map = CurrentMap(self.config, known.scene, self.map_index + 1)
+        self.map = CurrentMap(self.config, known.scene, self.map.index + 1)
         self.map.report, self.map.correction = known.report, known.correction
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
         self.finished = known.finished[-FINISHED_KEPT:]
@@ -381,7 +345,7 @@ class Backend:
         if len(before.keyframes) and not begin.replaces:
             assert before.session_id is not None
             before.end_pending()
-            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.rejected.items())))
+            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.map.rejected.items())))
             self.finished.append((before.session_id, self.map.estimate()))
             del self.finished[:-FINISHED_KEPT]
         self._renew(session_id, before.next_cameras or before.cameras)
@@ -394,4 +358,4 @@ class Backend:
     def _renew(self, session_id: int | None, cameras: Cameras | None) -> None:
         scene = Scene(self.config.scene, session_id)
         scene.cameras, scene.refused_rig = cameras, self.scene.refused_rig
-        self.map = CurrentMap(self.config, scene, self.map_index + 1)
+        self.map = CurrentMap(self.config, scene, self.map.index + 1)

@@ -50,7 +50,6 @@ class Completion:
     """
 
     def __init__(self, newest: int | None = None, closed: bool = False, delivered: Iterable[int] = ()) -> None:
-        """Take up what is known."""
         self.newest, self.closed = newest, closed
         self.delivered = deque(delivered, maxlen=_LEARN_FROM)
 
@@ -93,7 +92,6 @@ class CurrentMap:
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
-        """Take up a scene of which nothing was solved."""
         self.config, self.scene, self.index = config, scene, index
         self.completion = Completion()
         self.report = SolveReport(reason="not solved yet")
@@ -241,6 +239,7 @@ class CurrentMap:
         if self._trust.lost and self._young():
             self.scene.forget_solutions()
             self.correction = MapCorrection()
+            self.correct(int(self.scene.order[-1]))
             text = f"solutions are held, and what was taken before is given up: {reason}"
         self.scene.log.warn("held", text)
 

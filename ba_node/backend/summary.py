@@ -15,52 +15,31 @@ from ba_node.window import quality
 
 @dataclass(frozen=True)
 class MapSummary:
-    """What there is to tell of a map.
+    """What there is to tell of a map."""
 
-    Attributes:
-        session_id: the session, None before the first message that names one.
-        frame_id: name of the front-end's fixed frame, empty if it has none.
-        cameras: number of cameras; 0 before a rig came that can be used.
-        refused_rig: why the last rig that was refused was, empty if none was.
-        keyframes: number of keyframes.
-        refined: those that took part in a usable solve.
-        landmarks: number of tracks.
-        observations: number of observations.
-        outliers: those that sit out the next solve.
-        residuals: of the states ``input`` and ``refined``, figures as of ``window.quality.summary``.
-        rejected: what was turned away, by reason.
-        notices: what was unusual but used, by kind.
-        rejection_notes: the last rejections in words, oldest first.
-        warnings: what somebody has to know or mend, by kind.
-    """
-
-    session_id: int | None
-    frame_id: str
-    cameras: int
-    refused_rig: str
-    keyframes: int
-    refined: int
-    landmarks: int
-    observations: int
-    outliers: int
+    session_id: int | None  # the session, None before the first message that names one
+    frame_id: str  # name of the front-end's fixed frame, empty if it has none
+    cameras: int  # number of cameras; 0 before a rig came that can be used
+    refused_rig: str  # why the last rig that was refused was, empty if none was
+    keyframes: int  # number of keyframes
+    refined: int  # those that took part in a usable solve
+    landmarks: int  # number of tracks
+    observations: int  # number of observations
+    outliers: int  # those that sit out the next solve
+    # of the states ``input`` and ``refined``, figures as of ``window.quality.summary``
     residuals: dict[str, dict[str, float | int | None]]
-    rejected: dict[str, int]
-    notices: dict[str, int]
-    rejection_notes: list[str]
-    warnings: dict[str, str]
+    rejected: dict[str, int]  # what was turned away, by reason
+    notices: dict[str, int]  # what was unusual but used, by kind
+    rejection_notes: list[str]  # the last rejections in words, oldest first
+    warnings: dict[str, str]  # what somebody has to know or mend, by kind
 
 
 @dataclass(frozen=True)
 class MapEnded:
-    """Another map has taken the place of the one before.
+    """Another map has taken the place of the one before."""
 
-    Attributes:
-        summary: of the map before.
-        replaced: True if it held nothing but a keyframe with a wrong stamp, and counts as never begun.
-    """
-
-    summary: MapSummary
-    replaced: bool
+    summary: MapSummary  # of the map before
+    replaced: bool  # True if it held nothing but a keyframe with a wrong stamp, and counts as never begun
 
 
 def summary_of(scene: Scene, config: Config) -> MapSummary:

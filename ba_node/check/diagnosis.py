@@ -12,40 +12,24 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Row:
-    """How well a hypothesis explains the tracks.
+    """How well a hypothesis explains the tracks."""
 
-    Attributes:
-        test: what is compared.
-        hypothesis: what is assumed.
-        share: of the shared tracks that meet, in front of the cameras, 0 to 1.
-        rotation_deg: angle between its rotation and that of the tracks; NaN if there is none.
-        direction_deg: the same for the direction of the translation.
-    """
-
-    test: str
-    hypothesis: str
-    share: float
-    rotation_deg: float = float("nan")
-    direction_deg: float = float("nan")
+    test: str  # what is compared
+    hypothesis: str  # what is assumed
+    share: float  # of the shared tracks that meet, in front of the cameras, 0 to 1
+    rotation_deg: float = float("nan")  # angle between its rotation and that of the tracks; NaN if there is none
+    direction_deg: float = float("nan")  # the same for the direction of the translation
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A likely mistake.
+    """A likely mistake."""
 
-    Attributes:
-        causes: what it is, in words, or what it may be where the tracks cannot tell these apart.
-        evidence: what the tracks say.
-        changes: the field or parameter to change, for each cause.
-        harmful: solves would make poses worse.
-        usual: it is one of the mistakes that are made often, and explains the tracks; not only a misfit.
-    """
-
-    causes: tuple[str, ...]
-    evidence: str
-    changes: tuple[str, ...]
-    harmful: bool = True
-    usual: bool = False
+    causes: tuple[str, ...]  # what it is, in words, or what it may be where the tracks cannot tell these apart
+    evidence: str  # what the tracks say
+    changes: tuple[str, ...]  # the field or parameter to change, for each cause
+    harmful: bool = True  # solves would make poses worse
+    usual: bool = False  # it is one of the mistakes that are made often, and explains the tracks; not only a misfit
 
     @property
     def sentence(self) -> str:
@@ -64,21 +48,13 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """What the tracks tell about a set-up.
+    """What the tracks tell about a set-up."""
 
-    Attributes:
-        findings: likely mistakes, the surest first.
-        sound: what was tested and fits, in words.
-        untold: what the tracks could not tell (yet), and why.
-        rows: the hypotheses.
-        told: the tests that need no more tracks.
-    """
-
-    findings: list[Finding] = field(default_factory=list)
-    sound: list[str] = field(default_factory=list)
-    untold: list[str] = field(default_factory=list)
-    rows: list[Row] = field(default_factory=list)
-    told: frozenset[str] = frozenset()
+    findings: list[Finding] = field(default_factory=list)  # likely mistakes, the surest first
+    sound: list[str] = field(default_factory=list)  # what was tested and fits, in words
+    untold: list[str] = field(default_factory=list)  # what the tracks could not tell (yet), and why
+    rows: list[Row] = field(default_factory=list)  # the hypotheses
+    told: frozenset[str] = frozenset()  # the tests that need no more tracks
 
     @property
     def harmful(self) -> bool:

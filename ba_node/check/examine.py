@@ -14,6 +14,8 @@ from ba_node.check.tracks import Tracks
 
 _RELATIONS = frozenset({"cameras", "poses"})
 _BUILD_ON_THESE = ("intrinsics", "lengths")
+# Sizes of the image whose losses differ by no more than this factor are both named.
+_ALIKE = 1.1
 # What nothing can be told without.
 _PIXELS = "pixels"
 
@@ -81,14 +83,18 @@ def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:
 
 def _of_size(tracks: Tracks, motion: Diagnosis) -> Finding | None:
     """Return another size of the images as the cause, if poses that contradict the tracks fit with it."""
-    found: list[tuple[float, Finding]] = []
+    found: list[tuple[float, intrinsics.Model]] = []
+    evidence = motion.findings[0].evidence if motion.findings else "the poses fit the tracks with that undone"
     for model in intrinsics.other_sizes(tracks):
         other = tracks.with_params(model.params)
         pairs = relations.in_motion(other)
         outcome = relations.check_motion(other, pairs)
         if outcome.sound:
             motion.rows.append(dataclasses.replace(outcome.rows[0], hypothesis=model.cause))
-            evidence = motion.findings[0].evidence if motion.findings else "the poses fit the tracks with that undone"
-            finding = Finding((model.cause,), evidence, (model.change,), usual=True)
-            found.append((intrinsics.loss_of(other, pairs), finding))
-    return min(found, key=lambda one: one[0])[1] if found else None
+            found.append((intrinsics.loss_of(other, pairs), model))
+    if not found:
+        return None
+    found.sort(key=lambda one: one[0])
+    # Few keyframes cannot tell these apart.
+    named = [model for loss, model in found if loss <= _ALIKE * found[0][0]]
+    return Finding(tuple(one.cause for one in named), evidence, tuple(one.change for one in named), usual=True)

@@ -73,19 +73,12 @@ _INFO = "camera_info in camera_rig"
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model in question.
+    """A camera model in question."""
 
-    Attributes:
-        cause: what it would mean.
-        change: what to change.
-        params: (n_cam, 12).
-        lens: the model of all cameras; None for those given.
-    """
-
-    cause: str
-    change: str
-    params: FloatArray
-    lens: cameras.Model | None = None
+    cause: str  # what it would mean
+    change: str  # what to change
+    params: FloatArray  # (n_cam, 12)
+    lens: cameras.Model | None = None  # the model of all cameras; None for those given
 
     def confirms(self, other: Model) -> bool:
         """Return True if it says the same, whatever the precise numbers."""
@@ -325,19 +318,15 @@ class _Measure:
     """How well an adjustment explains the observations that are no mismatches, as the given model has them.
 
     The loss is in units of the usual residual: that of real images is seldom what sigma_px says.
-
-    Attributes:
-        noise: usual residual with the given model, sigmas.
     """
 
     def __init__(self, norms: FloatArray) -> None:
         usual = float(np.median(norms))
         # Where most residuals are large, the given model is in doubt, and they are not for it to judge.
         self._rows = (norms < _MISMATCH * max(usual, 1.0)) | (usual > _LARGE)
-        self.noise = max(float(np.median(norms[self._rows])), 1e-3)
+        self.noise = max(float(np.median(norms[self._rows])), 1e-3)  # usual residual with the given model, sigmas
 
     def __len__(self) -> int:
-        """Return the number of these observations."""
         return int(np.count_nonzero(self._rows))
 
     def __call__(self, adjusted: _Adjusted) -> float:

@@ -71,17 +71,11 @@ class SetUp:
 
 @dataclass(frozen=True)
 class Mistake:
-    """A way to give a set-up wrongly.
+    """A way to give a set-up wrongly."""
 
-    Attributes:
-        name: as a user would say it; ``{camera}`` is the camera in question.
-        change: the field or parameter to change.
-        undo: from the set-up as given to the one that was meant; for cameras: of which one.
-    """
-
-    name: str
-    change: str
-    undo: Callable[[SetUp, int], SetUp]
+    name: str  # as a user would say it; ``{camera}`` is the camera in question
+    change: str  # the field or parameter to change
+    undo: Callable[[SetUp, int], SetUp]  # from the set-up as given to the one that was meant; for cameras: of which one
 
 
 def as_given(tracks: Tracks) -> SetUp:

@@ -63,27 +63,16 @@ _CLEAR = 0.5
 
 @dataclass(frozen=True)
 class Relation:
-    """Two images, the rays they share, and their relation by the tracks.
+    """Two images, the rays they share, and their relation by the tracks."""
 
-    Attributes:
-        a: image (keyframe, camera).
-        b: image.
-        rows_a: (n,) rows of the tracks.
-        rows_b: (n,).
-        pair: the rays.
-        pose: b from a, direction of the translation only.
-        share: of the rays that agree with it.
-        parallax: usual parallax of these, in units of the gate.
-    """
-
-    a: Image
-    b: Image
-    rows_a: IntArray
-    rows_b: IntArray
-    pair: Pair
-    pose: Pose
-    share: float
-    parallax: float
+    a: Image  # image (keyframe, camera)
+    b: Image  # image
+    rows_a: IntArray  # (n,) rows of the tracks
+    rows_b: IntArray  # (n,)
+    pair: Pair  # the rays
+    pose: Pose  # b from a, direction of the translation only
+    share: float  # of the rays that agree with it
+    parallax: float  # usual parallax of these, in units of the gate
 
     def at(self, pose: Pose) -> Relation:
         """Return the same with another pose."""
@@ -169,8 +158,8 @@ def check_cameras(tracks: Tracks) -> Diagnosis:
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             continue
         found = _check_camera(given, camera, relation)
-        if found.rows[1].share < _CONTRADICT and _agree_alone(tracks, camera):
-            found = Diagnosis([_ids_differ(camera, found.rows[1].share)], rows=found.rows)
+        if (best := max(row.share for row in found.rows)) < _CONTRADICT and _agree_alone(tracks, camera):
+            found = Diagnosis([_ids_differ(camera, best)], rows=found.rows)
         unclear = relation.share < AGREED and found.rows[0].share > _CLEAR * relation.share
         why = "too many outliers" if unclear else "too few keyframes"
         if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
@@ -190,9 +179,7 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
     rows = [row("as given", now), row("free", relation.pose)]
     if not np.linalg.norm(now.translation) > 0.0:
         return _same_place(camera, relation, rows)
-    if rows[0].share >= _FITS * rows[1].share or rows[1].share < _CONTRADICT:
-        if rows[1].share < _CONTRADICT:
-            return Diagnosis(untold=[f"the tracks of cameras 0 and {camera} contradict each other"], rows=rows)
+    if rows[0].share >= max(_FITS * rows[1].share, _CONTRADICT):
         return Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
     others = {one: one.undo(given, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS}
     # Where points are far, consensus finds one of many relations; a usual mistake may be the way to a better one.
@@ -200,6 +187,8 @@ def _check_camera(given: SetUp, camera: int, relation: Relation) -> Diagnosis:
         (relation, *(relation.at(two_view.refined(pair, pose)) for pose in others.values())), key=lambda one: one.share
     )
     rows = [row("as given", now), row("free", relation.pose)]
+    if relation.share < _CONTRADICT:
+        return Diagnosis(untold=[f"the tracks of cameras 0 and {camera} contradict each other"], rows=rows)
     tried = {one: row(one.name.format(camera=camera), pose) for one, pose in others.items()}
     rows += tried.values()
     best = max(one.share for one in tried.values())

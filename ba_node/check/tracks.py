@@ -29,38 +29,22 @@ _NOTHING = np.empty(0, np.intp)
 
 @dataclass(frozen=True)
 class Tracks:
-    """What the front-end has delivered; keyframes oldest first.
+    """What the front-end has delivered; keyframes oldest first."""
 
-    Attributes:
-        stamp_ns: (n_kf,).
-        rotation: (n_kf, 3, 3) fixed frame from body, as given.
-        position: (n_kf, 3) as given, m.
-        cameras: the rig, as given.
-        keyframe: (n_obs,) index of the keyframe.
-        camera: (n_obs,) index of the camera.
-        track: (n_obs,) number of the track.
-        uv: (n_obs, 2) px.
-        sigma_px: (n_obs,).
-        depth_m: (n_obs,) NaN for none.
-        ray: (n_obs, 2) X/Z and Y/Z; NaN where there is none.
-        images: rows of each image (keyframe, camera), by track.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    rotation: FloatArray
-    position: FloatArray
-    cameras: Cameras
-    keyframe: IntArray
-    camera: IntArray
-    track: IntArray
-    uv: FloatArray
-    sigma_px: FloatArray
-    depth_m: FloatArray
-    ray: FloatArray
-    images: dict[Image, IntArray]
+    stamp_ns: NDArray[np.int64]  # (n_kf,)
+    rotation: FloatArray  # (n_kf, 3, 3) fixed frame from body, as given
+    position: FloatArray  # (n_kf, 3) as given, m
+    cameras: Cameras  # the rig, as given
+    keyframe: IntArray  # (n_obs,) index of the keyframe
+    camera: IntArray  # (n_obs,) index of the camera
+    track: IntArray  # (n_obs,) number of the track
+    uv: FloatArray  # (n_obs, 2) px
+    sigma_px: FloatArray  # (n_obs,)
+    depth_m: FloatArray  # (n_obs,) NaN for none
+    ray: FloatArray  # (n_obs, 2) X/Z and Y/Z; NaN where there is none
+    images: dict[Image, IntArray]  # rows of each image (keyframe, camera), by track
 
     def __len__(self) -> int:
-        """Return the number of keyframes."""
         return len(self.position)
 
     def match(self, a: Image, b: Image) -> tuple[IntArray, IntArray]:

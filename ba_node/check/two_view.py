@@ -48,7 +48,6 @@ class Pair:
     gate: float
 
     def __len__(self) -> int:
-        """Return their number."""
         return len(self.a)
 
     def zoomed(self, factor: float) -> Pair:
@@ -62,15 +61,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class Pose:
-    """``x_b = R x_a + t``, t of unit length where only its direction is known.
+    """``x_b = R x_a + t``, t of unit length where only its direction is known."""
 
-    Attributes:
-        rotation: (3, 3).
-        translation: (3,).
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
+    rotation: FloatArray  # (3, 3)
+    translation: FloatArray  # (3,)
 
     def turned_from(self, other: Pose) -> float:
         """Return the angle between two rotations, degrees."""

@@ -31,17 +31,11 @@ _NEWEST = 60
 
 @dataclass
 class Check:
-    """A check that may run on any thread.
+    """A check that may run on any thread."""
 
-    Attributes:
-        scene: that it is of; asked only whether it is still the current one.
-        work: what it does; the scene is not touched.
-        found: what it found, None before :meth:`run`.
-    """
-
-    scene: Scene
-    work: Callable[[], Diagnosis]
-    found: Diagnosis | None = None
+    scene: Scene  # that it is of; asked only whether it is still the current one
+    work: Callable[[], Diagnosis]  # what it does; the scene is not touched
+    found: Diagnosis | None = None  # what it found, None before :meth:`run`
 
     def run(self) -> Check:
         """Do the work."""
@@ -50,14 +44,10 @@ class Check:
 
 
 class SetUpWatch:
-    """The check of one session after the other.
-
-    Attributes:
-        elsewhere: runs a check on another thread and sees to it that :meth:`take` gets it; None to do it at once.
-    """
+    """The check of one session after the other."""
 
     def __init__(self) -> None:
-        """Start with nothing checked."""
+        # runs a check on another thread and sees to it that :meth:`take` gets it; None to do it at once
         self.elsewhere: Callable[[Check], None] | None = None
         self._reason = ""
         self._scene: Scene | None = None

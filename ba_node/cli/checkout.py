@@ -38,17 +38,11 @@ def load(name: str, what: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class CheckoutCommand:
-    """A command of ``ba`` that a checkout has.
+    """A command of ``ba`` that a checkout has."""
 
-    Attributes:
-        name: of the command.
-        module: below ``experiments``; it has SUMMARY, EXAMPLE, add_arguments and run as the files of this folder.
-        SUMMARY: one line for ``ba --help``, which does not import the module.
-    """
-
-    name: str
-    module: str
-    SUMMARY: str
+    name: str  # of the command
+    module: str  # below ``experiments``; it has SUMMARY, EXAMPLE, add_arguments and run as the files of this folder
+    SUMMARY: str  # one line for ``ba --help``, which does not import the module
 
     def load(self) -> ModuleType:
         """Import the module of the command, or raise CheckoutError."""

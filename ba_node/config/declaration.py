@@ -22,49 +22,29 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class Choice:
-    """One value of an option that is chosen by name.
+    """One value of an option that is chosen by name."""
 
-    Attributes:
-        name: how it is asked for.
-        doc: what it is.
-        source: equation, algorithm or table of the thesis; empty if it is not from there.
-        aliases: other names for it.
-    """
-
-    name: str
-    doc: str = ""
-    source: str = ""
-    aliases: tuple[str, ...] = ()
+    name: str  # how it is asked for
+    doc: str = ""  # what it is
+    source: str = ""  # equation, algorithm or table of the thesis; empty if it is not from there
+    aliases: tuple[str, ...] = ()  # other names for it
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One declared option.
+    """One declared option."""
 
-    Attributes:
-        name: for example ``max_iterations``; that of a parameter of the node has its group in front,
-            ``solver.max_iterations``.
-        kind: bool, int, float or str.
-        default: value when nothing is set.
-        doc: what it does, one sentence.
-        unit: physical unit, empty if it has none.
-        minimum: smallest allowed number, None if unbounded.
-        maximum: largest allowed number, None if unbounded.
-        allowed: what it may be, if it is chosen by name; empty if not.
-        aliases: other names of the option.
-        live: True if a change takes effect at the next solve, False if only at start.
-    """
-
+    # for example ``max_iterations``; that of a parameter of the node has its group in front, ``solver.max_iterations``
     name: str
-    kind: type
-    default: Value
-    doc: str
-    unit: str = ""
-    minimum: float | None = None
-    maximum: float | None = None
-    allowed: tuple[Choice, ...] = ()
-    aliases: tuple[str, ...] = ()
-    live: bool = True
+    kind: type  # bool, int, float or str
+    default: Value  # value when nothing is set
+    doc: str  # what it does, one sentence
+    unit: str = ""  # physical unit, empty if it has none
+    minimum: float | None = None  # smallest allowed number, None if unbounded
+    maximum: float | None = None  # largest allowed number, None if unbounded
+    allowed: tuple[Choice, ...] = ()  # what it may be, if it is chosen by name; empty if not
+    aliases: tuple[str, ...] = ()  # other names of the option
+    live: bool = True  # True if a change takes effect at the next solve, False if only at start
 
     @property
     def choices(self) -> tuple[str, ...]:

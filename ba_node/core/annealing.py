@@ -36,7 +36,6 @@ class Annealing:
     """
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
-        """Set the first level."""
         self._objective = Objective(problem, options)
         self.state, self.value = problem.start, self._objective.value(problem.start)
         norms = np.linalg.norm(self._objective.errors(problem.start), axis=1) / problem.observations.sigma_px

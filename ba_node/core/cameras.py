@@ -69,15 +69,11 @@ _NAMES: dict[str, tuple[Model, tuple[int, ...]]] = {
 
 
 def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> tuple[Model, FloatArray]:
-    """Return model and parameter row of a camera given as in ``sensor_msgs/CameraInfo``.
+    """Return model and (12,) parameters of a camera given as in ``sensor_msgs/CameraInfo``.
 
-    Args:
-        name: distortion_model; empty, as many drivers of rectified cameras leave it, where there is no distortion.
-        intrinsics: (4,) fx fy cx cy, px.
-        coefficients: d; all missing means no distortion. Zeros beyond those of the model are let pass.
-
-    Returns:
-        The model and (12,) parameters.
+    The name is distortion_model; many drivers of rectified cameras leave it empty, where there is no distortion.
+    Intrinsics are (4,) fx fy cx cy, px. No coefficients means no distortion; zeros beyond those of the model are let
+    pass.
 
     Raises:
         CameraError: the model is unknown, or the numbers do not fit it.
@@ -131,9 +127,7 @@ def behind(x_cam: FloatArray, model: ModelArray) -> BoolArray:
 
     Those on or behind the camera plane; for the equidistant model, which sees beyond it, those near the axis behind.
 
-    Args:
-        x_cam: (n, 3), m.
-        model: (n,) or (1,).
+    Points are (n, 3), m; the model is (n,) or (1,).
     """
     hidden = x_cam[:, 2] <= MIN_DEPTH
     fisheye = model == Model.EQUIDISTANT
@@ -144,13 +138,10 @@ def behind(x_cam: FloatArray, model: ModelArray) -> BoolArray:
 
 
 def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
-    """Project points in camera frames to pixels.
+    """Project points (n, 3) in the optical frame of each row's camera, m, to pixels.
 
-    Args:
-        x_cam: (n, 3) in the optical frame of each row's camera, m. What is :func:`behind` gives infinities or pixels
-            without meaning: callers sort these out.
-        model: (n,) Model of each row, or (1,) of all.
-        params: (n, 12) parameters of each row, or (1, 12) of all; without distortion beyond k1 and k2 six will do.
+    What is :func:`behind` gives infinities or pixels without meaning: callers sort these out. Model and parameters are
+    those of each row, (n,) and (n, 12), or (1,) and (1, 12) of all; without distortion beyond k1 and k2 six will do.
 
     Returns:
         (n, 2) u, v, px.
@@ -173,13 +164,7 @@ def project(x_cam: FloatArray, model: ModelArray, params: FloatArray) -> FloatAr
 def project_jacobian(
     x_cam: FloatArray, model: ModelArray, params: FloatArray, *, intrinsics: bool = True
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Project points, with derivatives.
-
-    Args:
-        x_cam: (n, 3), m.
-        model: (n,) or (1,).
-        params: (n, 12) or fewer, as of :func:`project`.
-        intrinsics: whether derivatives by f, k1 and k2 are wanted.
+    """Project points, with derivatives; arrays as of :func:`project`, those by f, k1 and k2 if they are wanted.
 
     Returns:
         uv: (n, 2) px; d uv / d x_cam: (n, 2, 3) px/m; d uv / d (f, k1, k2): (n, 2, 3) where f scales fx and fy
@@ -227,12 +212,7 @@ def _mixed_jacobian(
 
 
 def rays(uv: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
-    """Return the directions in which cameras see pixels, the inverse of :func:`project`.
-
-    Args:
-        uv: (n, 2) px.
-        model: (n,).
-        params: (n, 12).
+    """Return the directions in which cameras see pixels (n, 2), the inverse of :func:`project`.
 
     Returns:
         (n, 3) unit vectors in the optical frame; NaN where no ray projects to the pixel (outside the model's domain).

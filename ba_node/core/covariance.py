@@ -43,13 +43,9 @@ _SHARE = 1e-4
 
 
 def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
-    """Return the covariance of the step of every free pose at a solution.
+    """Return the covariance of the step of every free pose at a solution, by the options that it was solved with.
 
-    Args:
-        problem: as it was solved.
-        state: its solution.
-        options: loss, cheirality and the kernels that it was solved with; poses are stepped locally.
-        conditions: (n_free, 6, n_conditions) g: conditions that hold what no fixed pose holds; or none, (n_free, 6, 0).
+    Conditions g (n_free, 6, n_conditions) hold what no fixed pose holds; poses are stepped locally.
 
     Returns:
         (n_free, 6, 6) in the local tangent, ``R <- R Exp(dphi), t <- t + R dt``: rotation (rad), then translation (m),

@@ -41,26 +41,16 @@ _ORTHONORMAL = 1e-6
 
 @dataclass(frozen=True)
 class RelativePoses:
-    """Measured poses of one keyframe in another; one end may be fixed.
+    """Measured poses of one keyframe in another; one end may be fixed."""
 
-    Attributes:
-        keyframes: (n, 2) i and j.
-        rotation: (n, 3, 3) body i from body j.
-        translation: (n, 3) body i from body j: where j is in i, m.
-        root_information: (n, 6, 6) W, on rotation (rad), then translation (m) along the axes of body i.
-        loss: robust loss.
-        loss_scale: where it leaves the square.
-    """
-
-    keyframes: IntArray
-    rotation: FloatArray
-    translation: FloatArray
-    root_information: FloatArray
-    loss: str = "squared"
-    loss_scale: float = 1.0
+    keyframes: IntArray  # (n, 2) i and j
+    rotation: FloatArray  # (n, 3, 3) body i from body j
+    translation: FloatArray  # (n, 3) body i from body j: where j is in i, m
+    root_information: FloatArray  # (n, 6, 6) W, on rotation (rad), then translation (m) along the axes of body i
+    loss: str = "squared"  # robust loss
+    loss_scale: float = 1.0  # where it leaves the square
 
     def __len__(self) -> int:
-        """Return the number of factors."""
         return len(self.keyframes)
 
     def take(self, rows: IntArray | BoolArray, number: IntArray) -> RelativePoses:
@@ -122,17 +112,11 @@ class RelativePoses:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Blocks of B between two free keyframes, by their numbers among the free ones; those below the diagonal follow.
+    """Blocks of B between two free keyframes, by their numbers among the free ones; those below the diagonal follow."""
 
-    Attributes:
-        rows: (n_pairs,) the lower number.
-        columns: (n_pairs,) the higher number; pairs are distinct and sorted.
-        blocks: (n_pairs, 6, 6).
-    """
-
-    rows: IntArray
-    columns: IntArray
-    blocks: FloatArray
+    rows: IntArray  # (n_pairs,) the lower number
+    columns: IntArray  # (n_pairs,) the higher number; pairs are distinct and sorted
+    blocks: FloatArray  # (n_pairs, 6, 6)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return the product with x, (n_free, d), d >= 6; the same."""
@@ -153,19 +137,12 @@ class Pairs:
 
 @dataclass(frozen=True)
 class FactorTerms:
-    """What all factors add to the equations of the free keyframes.
+    """What all factors add to the equations of the free keyframes."""
 
-    Attributes:
-        value: 1/2 sum Psi.
-        gradient: (n_free, 6).
-        diagonal: (n_free, 6, 6) to the blocks of B.
-        pairs: between two free keyframes.
-    """
-
-    value: float
-    gradient: FloatArray
-    diagonal: FloatArray
-    pairs: Pairs
+    value: float  # 1/2 sum Psi
+    gradient: FloatArray  # (n_free, 6)
+    diagonal: FloatArray  # (n_free, 6, 6) to the blocks of B
+    pairs: Pairs  # between two free keyframes
 
     def curvature(self, step: FloatArray) -> float:
         """Return ``p'H p`` of the factors' part of H for a step (n_free, d), d >= 6."""
@@ -182,13 +159,7 @@ class FactorSum:
     """
 
     def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray, parameterisation: str = "local") -> None:
-        """Find which free keyframes they couple.
-
-        Args:
-            factors: of the problem.
-            fixed: (n_kf,).
-            parameterisation: how a pose is stepped.
-        """
+        """Find which free keyframes they couple; ``fixed`` is (n_kf,)."""
         self._factors, self._parameterisation = tuple(factors), parameterisation
         self._free = np.flatnonzero(~fixed)
         self._column = np.full(len(fixed), -1, np.intp)

@@ -30,19 +30,12 @@ _MIN_PROMISE = 1e-8
 
 @dataclass(frozen=True)
 class InnerIterations:
-    """What the inner iterations did.
+    """What the inner iterations did."""
 
-    Attributes:
-        state: of which only the points differ.
-        before: the objective at the start.
-        after: the objective of ``state``.
-        rows: of all observations at ``state``.
-    """
-
-    state: State
-    before: float
-    after: float
-    rows: PointRows
+    state: State  # of which only the points differ
+    before: float  # the objective at the start
+    after: float  # the objective of ``state``
+    rows: PointRows  # of all observations at ``state``
 
 
 def iterate_points(objective: Objective, structure: Structure, state: State, steps: int) -> InnerIterations:

@@ -19,21 +19,13 @@ DENSE_LIMIT = 3000
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step did.
+    """What a step did."""
 
-    Attributes:
-        state: after the step and the inner iterations.
-        predicted: by what the undamped model said the objective would fall, ``-g'p - 1/2 |J p|^2``.
-        damping: ``1/2 mu p'D p``, which the damped model adds.
-        before_inner: objective after the step alone; NaN if the state is not finite.
-        objective: objective of ``state``; NaN if that is not finite.
-    """
-
-    state: State
-    predicted: float
-    damping: float
-    before_inner: float
-    objective: float
+    state: State  # after the step and the inner iterations
+    predicted: float  # by what the undamped model said the objective would fall, ``-g'p - 1/2 |J p|^2``
+    damping: float  # ``1/2 mu p'D p``, which the damped model adds
+    before_inner: float  # objective after the step alone; NaN if the state is not finite
+    objective: float  # objective of ``state``; NaN if that is not finite
 
 
 class LinearSolver(NamedTuple):
@@ -44,17 +36,11 @@ class LinearSolver(NamedTuple):
 
 
 class System(Protocol):
-    """A damped system ``S x = rhs`` after elimination of the points, of the keyframes, or of nothing.
+    """A damped system ``S x = rhs`` after elimination of the points, of the keyframes, or of nothing."""
 
-    Attributes:
-        rhs: (n,) right-hand side.
-        side: what was eliminated: points, cameras or none.
-        radius_factor: by what the radius of a trust region is multiplied on this side.
-    """
-
-    rhs: FloatArray
-    side: str
-    radius_factor: float
+    rhs: FloatArray  # (n,) right-hand side
+    side: str  # what was eliminated: points, cameras or none
+    radius_factor: float  # by what the radius of a trust region is multiplied on this side
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one.
@@ -75,11 +61,8 @@ class System(Protocol):
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Return the solution by PCG in the space ``D x``, in the space that is not scaled.
 
-        Args:
-            kind: preconditioner.
-            scale: (n,) 1/D.
-            limits: see linear.PcgLimits; the radius is that of the scaled space.
-            formed: form S for the products.
+        ``kind`` is the preconditioner, ``scale`` (n,) 1/D; the radius of the limits is that of the scaled space. S is
+        ``formed`` for the products.
         """
 
     def gather(self, of_keyframes: FloatArray, of_points: FloatArray) -> FloatArray:

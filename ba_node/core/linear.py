@@ -20,17 +20,11 @@ Product = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Solution:
-    """What a linear solver found.
+    """What a linear solver found."""
 
-    Attributes:
-        x: (n,) the solution, None if there is none that is finite.
-        iterations: PCG steps; 0 with a direct solver.
-        on_boundary: True if it ends on the boundary of the trust region.
-    """
-
-    x: FloatArray | None
-    iterations: int = 0
-    on_boundary: bool = False
+    x: FloatArray | None  # (n,) the solution, None if there is none that is finite
+    iterations: int = 0  # PCG steps; 0 with a direct solver
+    on_boundary: bool = False  # True if it ends on the boundary of the trust region
 
 
 def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Solution:
@@ -52,19 +46,13 @@ def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Sol
 
 @dataclass(frozen=True)
 class PcgLimits:
-    """When conjugate gradients stop.
+    """When conjugate gradients stop."""
 
-    Attributes:
-        t_eps: |r| <= min(t_eps, |b|) |b|.
-        max_iterations: cap on steps.
-        radius: of the region.
-        q_eps: step i added less than q_eps / i of what the model b'x - x'A x / 2 has gained (Nash and Sofer 1990):
-            further steps would not lower the objective by what they cost. 0 for never.
-    """
-
-    t_eps: float
-    max_iterations: int
-    radius: float = np.inf
+    t_eps: float  # |r| <= min(t_eps, |b|) |b|
+    max_iterations: int  # cap on steps
+    radius: float = np.inf  # of the region
+    # step i added less than q_eps / i of what the model b'x - x'A x / 2 has gained (Nash and Sofer 1990): further steps
+    # would not lower the objective by what they cost. 0 for never.
     q_eps: float = 0.0
 
 

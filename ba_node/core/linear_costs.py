@@ -38,34 +38,21 @@ MAX_BYTES = 4.8e9
 
 @dataclass(frozen=True)
 class Sizes:
-    """What is known of the structure of a problem's reduced system.
+    """What is known of the structure of a problem's reduced system."""
 
-    Attributes:
-        unknowns: n.
-        block: d.
-        edges: (point, free keyframe) pairs.
-        pairs: pairs of free keyframes that see the same point, over all points, each keyframe with itself too.
-    """
-
-    unknowns: int
-    block: int
-    edges: int
-    pairs: int
+    unknowns: int  # n
+    block: int  # d
+    edges: int  # (point, free keyframe) pairs
+    pairs: int  # pairs of free keyframes that see the same point, over all points, each keyframe with itself too
 
 
 @dataclass(frozen=True)
 class Factor:
-    """What is known of the sparse Cholesky factor of S.
+    """What is known of the sparse Cholesky factor of S."""
 
-    Attributes:
-        blocks: blocks of the factor that are not zero.
-        products: multiplications of two blocks.
-        complete: False if counting was given up because there were too many.
-    """
-
-    blocks: int
-    products: float
-    complete: bool = True
+    blocks: int  # blocks of the factor that are not zero
+    products: float  # multiplications of two blocks
+    complete: bool = True  # False if counting was given up because there were too many
 
 
 def block_bytes(block: int) -> int:

@@ -60,13 +60,10 @@ LOSSES: dict[str, Callable[[FloatArray, float], CostAndWeight]] = {
 
 
 def evaluate(loss: str, norm: FloatArray, scale: float, graduation: float = np.inf) -> CostAndWeight:
-    """Return the cost and the IRLS weight of residuals.
+    """Return the cost and the IRLS weight of residuals, of norm (n,), for one of LOSSES.
 
-    Args:
-        loss: one of LOSSES.
-        norm: (n,) norm of each whitened residual.
-        scale: where the loss leaves the square.
-        graduation: mu of the surrogate of a truncated quadratic; infinite for the loss itself.
+    The loss leaves the square at ``scale``. ``graduation`` is mu of the surrogate of a truncated quadratic; infinite
+    for the loss itself.
 
     Returns:
         (n,) Psi and (n,) weights in [0, 1].

@@ -35,7 +35,6 @@ class NumpyKernels:
     """The kernels in numpy and scipy."""
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
-        """Sort the observations once."""
         columns.keep_memory()
         self._structure = Structure(problem)
         self._objective = Objective(problem, options)

@@ -27,36 +27,22 @@ _BEHIND_NORM = 100.0
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals and Jacobians, both already multiplied by the square root of the IRLS weight.
+    """Residuals and Jacobians, both already multiplied by the square root of the IRLS weight."""
 
-    Attributes:
-        objective: 1/2 sum Psi.
-        residual: (n_obs, d), d = 2 or 3.
-        d_keyframe: (n_obs, d, 6 or 9).
-        d_point: (n_obs, d, 3).
-        factors: what the factors add; None if there are none.
-    """
-
-    objective: float
-    residual: FloatArray
-    d_keyframe: FloatArray
-    d_point: FloatArray
-    factors: FactorTerms | None = None
+    objective: float  # 1/2 sum Psi
+    residual: FloatArray  # (n_obs, d), d = 2 or 3
+    d_keyframe: FloatArray  # (n_obs, d, 6 or 9)
+    d_point: FloatArray  # (n_obs, d, 3)
+    factors: FactorTerms | None = None  # what the factors add; None if there are none
 
 
 @dataclass(frozen=True)
 class PointRows:
-    """What one observation says about its point alone.
+    """What one observation says about its point alone."""
 
-    Attributes:
-        cost: (n_obs,) Psi.
-        residual: (n_obs, d), weighted.
-        d_point: (n_obs, d, 3), weighted.
-    """
-
-    cost: FloatArray
-    residual: FloatArray
-    d_point: FloatArray
+    cost: FloatArray  # (n_obs,) Psi
+    residual: FloatArray  # (n_obs, d), weighted
+    d_point: FloatArray  # (n_obs, d, 3), weighted
 
     def update(self, rows: IntArray, other: PointRows, taken: IntArray) -> None:
         """Write over some rows with some of another's."""
@@ -66,29 +52,17 @@ class PointRows:
 
 @dataclass(frozen=True)
 class _Observed:
-    """What is known of some observations; of what is the same for all in the problem there is one row.
+    """What is known of some observations; of what is the same for all in the problem there is one row."""
 
-    Attributes:
-        image: (n,) index into the pairs (keyframe, camera) that see anything.
-        point: (n,).
-        uv: (n, 2), px.
-        weight: (n,) or (1,) 1 / sigma, 1/px.
-        model: (n,) or (1,).
-        params: (n, m) or (1, m), see cameras.project.
-        depth_m: (n,) zero where there is none; (0,) if none has one.
-        depth_weight: (n,) 1 / sigma, zero where there is no depth, 1/m.
-        ignored: (n,) True for those that count for nothing.
-    """
-
-    image: IntArray
-    point: IntArray
-    uv: FloatArray
-    weight: FloatArray
-    model: NDArray[np.uint8]
-    params: FloatArray
-    depth_m: FloatArray
-    depth_weight: FloatArray
-    ignored: BoolArray
+    image: IntArray  # (n,) index into the pairs (keyframe, camera) that see anything
+    point: IntArray  # (n,)
+    uv: FloatArray  # (n, 2), px
+    weight: FloatArray  # (n,) or (1,) 1 / sigma, 1/px
+    model: NDArray[np.uint8]  # (n,) or (1,)
+    params: FloatArray  # (n, m) or (1, m), see cameras.project
+    depth_m: FloatArray  # (n,) zero where there is none; (0,) if none has one
+    depth_weight: FloatArray  # (n,) 1 / sigma, zero where there is no depth, 1/m
+    ignored: BoolArray  # (n,) True for those that count for nothing
 
     def part(self, rows: IntArray | slice) -> _Observed:
         """Return what is known of some of them."""
@@ -98,17 +72,12 @@ class _Observed:
 
 
 class Objective:
-    """The objective of one problem; knows which image each observation belongs to.
-
-    Attributes:
-        options: of which the cost model counts here: parameterisation, loss, its scale, cheirality.
-        factors: the sum of the problem's factors; None if it has none.
-    """
+    """The objective of one problem; knows which image each observation belongs to."""
 
     def __init__(self, problem: Problem, options: SolverOptions) -> None:
-        """Prepare what stays the same over all iterations."""
         self.problem = problem
-        self.options = options
+        self.options = options  # of which the cost model counts here: parameterisation, loss, its scale, cheirality
+        # the sum of the problem's factors; None if it has none
         self.factors = FactorSum(problem.factors, problem.fixed, options.parameterisation) if problem.factors else None
         # mu of the surrogate that stands in for a truncated quadratic; infinite for the loss itself.
         self.graduation = np.inf
@@ -216,14 +185,7 @@ class Objective:
     def retract(
         self, state: State, step_keyframes: FloatArray, step_points: FloatArray, of: IntArray | slice = slice(None)
     ) -> State:
-        """Return the state after a step.
-
-        Args:
-            state: before it.
-            step_keyframes: (n, 6 or 9) of some keyframes, or of all.
-            step_points: (n_pt, 3).
-            of: (n,) which keyframes.
-        """
+        """Return the state after a step, (n, 6 or 9) of the keyframes ``of`` (default: all), (n_pt, 3) of points."""
         rotation, translation, intrinsics = state.rotation.copy(), state.translation.copy(), state.intrinsics
         rotation[of], translation[of] = parameterisation.retract(
             self.options.parameterisation, rotation[of], translation[of], step_keyframes[:, :6]

@@ -19,12 +19,8 @@ def pose_jacobian(
 ) -> FloatArray:
     """Return the derivative of residuals by the step of their keyframe's pose.
 
-    Args:
-        kind: local or global.
-        d_point: (n, d, 3) derivative by the point in the world.
-        point: (n, 3) point in the world, m.
-        rotation: (n_kf, 3, 3) body from world.
-        row_pose: (n,) keyframe of each row.
+    ``d_point`` (n, d, 3) is the derivative by the points in the world (n, 3), m; ``row_pose`` (n,) is the keyframe of
+    each row, with rotations (n_kf, 3, 3) body from world.
 
     Returns:
         (n, d, 6): rotation, then translation.
@@ -46,17 +42,7 @@ def pose_jacobian(
 def retract(
     kind: str, rotation: FloatArray, translation: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return poses after a step.
-
-    Args:
-        kind: local or global.
-        rotation: (n, 3, 3).
-        translation: (n, 3), m.
-        step: (n, 6): rotation (rad), then translation (m).
-
-    Returns:
-        Rotations (n, 3, 3) and translations (n, 3).
-    """
+    """Return poses, (n, 3, 3) and (n, 3) m, after a step (n, 6): rotation (rad), then translation (m)."""
     if kind == "local":
         moved = translation + (rotation @ step[:, 3:, None])[..., 0]
         return rotation @ geometry.so3_exp(step[:, :3]), moved

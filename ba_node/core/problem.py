@@ -30,18 +30,12 @@ class ProblemError(ValueError):
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns.
+    """The unknowns."""
 
-    Attributes:
-        rotation: (n_kf, 3, 3) body from world.
-        translation: (n_kf, 3) body from world, m.
-        points: (n_pt, 3) in the world, m.
-        intrinsics: (n_kf, 3) f, k1, k2 of each keyframe's camera (f in px), or (0, 3) when the cameras' own are used.
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
-    points: FloatArray
+    rotation: FloatArray  # (n_kf, 3, 3) body from world
+    translation: FloatArray  # (n_kf, 3) body from world, m
+    points: FloatArray  # (n_pt, 3) in the world, m
+    # (n_kf, 3) f, k1, k2 of each keyframe's camera (f in px), or (0, 3) when the cameras' own are used
     intrinsics: FloatArray
 
     def is_finite(self) -> bool:
@@ -51,45 +45,28 @@ class State:
 
 @dataclass(frozen=True)
 class Cameras:
-    """The cameras of the rig.
+    """The cameras of the rig."""
 
-    Attributes:
-        rotation: (n_cam, 3, 3) camera optical frame from body.
-        translation: (n_cam, 3) camera optical frame from body, m.
-        model: (n_cam,) see ``cameras.Model``.
-        params: (n_cam, 12) fx fy cx cy in px, then eight distortion coefficients in CameraInfo's order, zero-padded.
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
-    model: NDArray[np.uint8]
+    rotation: FloatArray  # (n_cam, 3, 3) camera optical frame from body
+    translation: FloatArray  # (n_cam, 3) camera optical frame from body, m
+    model: NDArray[np.uint8]  # (n_cam,) see ``cameras.Model``
+    # (n_cam, 12) fx fy cx cy in px, then eight distortion coefficients in CameraInfo's order, zero-padded
     params: FloatArray
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Who saw what where. Rows are sorted by point (stable), which every sum over a point's rows relies on.
+    """Who saw what where. Rows are sorted by point (stable), which every sum over a point's rows relies on."""
 
-    Attributes:
-        keyframe: (n_obs,) index into the poses.
-        camera: (n_obs,) index into the cameras.
-        point: (n_obs,) index into the points, ascending.
-        uv: (n_obs, 2) raw image coordinates, px.
-        sigma_px: (n_obs,) standard deviation of u and of v, px.
-        depth_m: (n_obs,) measured distance along the optical axis, m; NaN for none; (0,) if none has one.
-        depth_sigma_m: (n_obs,) its standard deviation, m; or (0,).
-    """
-
-    keyframe: IntArray
-    camera: IntArray
-    point: IntArray
-    uv: FloatArray
-    sigma_px: FloatArray
-    depth_m: FloatArray
-    depth_sigma_m: FloatArray
+    keyframe: IntArray  # (n_obs,) index into the poses
+    camera: IntArray  # (n_obs,) index into the cameras
+    point: IntArray  # (n_obs,) index into the points, ascending
+    uv: FloatArray  # (n_obs, 2) raw image coordinates, px
+    sigma_px: FloatArray  # (n_obs,) standard deviation of u and of v, px
+    depth_m: FloatArray  # (n_obs,) measured distance along the optical axis, m; NaN for none; (0,) if none has one
+    depth_sigma_m: FloatArray  # (n_obs,) its standard deviation, m; or (0,)
 
     def __len__(self) -> int:
-        """Return the number of observations."""
         return len(self.keyframe)
 
 
@@ -126,21 +103,13 @@ class KeyframeFactors(Protocol):
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem: start values, what is fixed, cameras and observations.
+    """A problem: start values, what is fixed, cameras and observations."""
 
-    Attributes:
-        start: where the solver begins.
-        fixed: (n_kf,) True where the pose (and intrinsics) of a keyframe is fixed.
-        cameras: the rig.
-        observations: sorted by point.
-        factors: all terms of the objective that are not reprojections, see factors.py.
-    """
-
-    start: State
-    fixed: BoolArray
-    cameras: Cameras
-    observations: Observations
-    factors: tuple[KeyframeFactors, ...] = ()
+    start: State  # where the solver begins
+    fixed: BoolArray  # (n_kf,) True where the pose (and intrinsics) of a keyframe is fixed
+    cameras: Cameras  # the rig
+    observations: Observations  # sorted by point
+    factors: tuple[KeyframeFactors, ...] = ()  # all terms of the objective that are not reprojections, see factors.py
 
     @property
     def n_keyframes(self) -> int:

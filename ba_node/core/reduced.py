@@ -28,28 +28,19 @@ _TRIED_EPS = 0.01
 
 
 class ReducedSolver:
-    """Solve the systems of one run, all in the same way.
-
-    Attributes:
-        kind: dense, sparse or pcg; empty while none has been needed.
-        text: how the systems were solved, for the report, with what it costs.
-    """
+    """Solve the systems of one run, all in the same way."""
 
     def __init__(self, options: SolverOptions) -> None:
-        """Keep the choices."""
         self._options = options
-        self.kind = ""
-        self.text = ""
+        self.kind = ""  # dense, sparse or pcg; empty while none has been needed
+        self.text = ""  # how the systems were solved, for the report, with what it costs
         # Steps of PCG to be tried before an exact solver; 0 once they did not get there; None before the first system.
         self._tries: int | None = None
 
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
 
-        Args:
-            system: damped.
-            hessian: returns diag(B) and diag(C), not damped.
-            radius: of the region, in the scaled space; infinite for none.
+        ``hessian`` returns diag(B) and diag(C), not damped; the radius is in the scaled space, infinite for none.
         """
         if len(system.rhs) == 0:
             return linear.Solution(np.zeros(0))

@@ -28,29 +28,17 @@ class Status(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Iteration:
-    """One row of the trace. Row 0 is the start.
+    """One row of the trace. Row 0 is the start."""
 
-    Attributes:
-        iteration: number of the outer iteration.
-        time_s: seconds since the solve began, by the caller's clock.
-        objective: robust objective after the iteration (dimensionless, px^2 / sigma^2).
-        gradient_norm: Euclidean norm of its gradient.
-        linear_iterations: PCG steps; 0 with a direct solver.
-        accepted: True if the step was taken.
-        damping: mu during the iteration.
-        radius: radius of the trust region during the iteration, inf without one.
-        side: what was eliminated: points, cameras or none; empty in row 0.
-    """
-
-    iteration: int
-    time_s: float
-    objective: float
-    gradient_norm: float
-    linear_iterations: int
-    accepted: bool
-    damping: float
-    radius: float
-    side: str = ""
+    iteration: int  # number of the outer iteration
+    time_s: float  # seconds since the solve began, by the caller's clock
+    objective: float  # robust objective after the iteration (dimensionless, px^2 / sigma^2)
+    gradient_norm: float  # Euclidean norm of its gradient
+    linear_iterations: int  # PCG steps; 0 with a direct solver
+    accepted: bool  # True if the step was taken
+    damping: float  # mu during the iteration
+    radius: float  # radius of the trust region during the iteration, inf without one
+    side: str = ""  # what was eliminated: points, cameras or none; empty in row 0
 
 
 @dataclass(frozen=True)

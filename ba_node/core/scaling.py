@@ -25,9 +25,7 @@ _MIN_DIAGONAL = 1e-6
 def diagonals(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return D for keyframes (n_free, d) and points (n_points, 3); zeros for ``none``.
 
-    Args:
-        kind: a choice of damping or trust_region.
-        hessian: diag(B) (n_free, d) and diag(C) (n_points, 3).
+    ``hessian`` is diag(B) (n_free, d) and diag(C) (n_points, 3).
     """
     d_c, d_p = hessian
     if kind == "identity":

@@ -44,7 +44,6 @@ class Structure:
     """Which rows belong to which keyframe, point and (keyframe, point) edge; fixed over all iterations."""
 
     def __init__(self, problem: Problem) -> None:
-        """Sort the observations once."""
         obs = problem.observations
         self.size = 9 if problem.free_intrinsics else 6
         self.free = np.flatnonzero(~problem.fixed)
@@ -164,23 +163,14 @@ class Structure:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """H and g in blocks, undamped.
+    """H and g in blocks, undamped."""
 
-    Attributes:
-        b: (n_free, d, d) keyframe blocks.
-        c: (n_points, 3, 3) point blocks.
-        e: (n_edges, d, 3) coupling.
-        gradient_c: (n_free, d).
-        gradient_p: (n_points, 3).
-        pairs: blocks of B between two keyframes; None without factors.
-    """
-
-    b: FloatArray
-    c: FloatArray
-    e: FloatArray
-    gradient_c: FloatArray
-    gradient_p: FloatArray
-    pairs: Pairs | None = None
+    b: FloatArray  # (n_free, d, d) keyframe blocks
+    c: FloatArray  # (n_points, 3, 3) point blocks
+    e: FloatArray  # (n_edges, d, 3) coupling
+    gradient_c: FloatArray  # (n_free, d)
+    gradient_p: FloatArray  # (n_points, 3)
+    pairs: Pairs | None = None  # blocks of B between two keyframes; None without factors
 
     @property
     def gradient_norm(self) -> float:
@@ -212,14 +202,7 @@ class ReducedSystem:
     def __init__(
         self, structure: Structure, equations: NormalEquations, damping_c: FloatArray, damping_p: FloatArray
     ) -> None:
-        """Factor C and couple it to the keyframes.
-
-        Args:
-            structure: of the problem.
-            equations: undamped.
-            damping_c: (n_free, d) added to diag(B).
-            damping_p: (n_points, 3) added to diag(C).
-        """
+        """Factor C and couple it to the keyframes; damping, (n_free, d) and (n_points, 3), adds to the diagonals."""
         self._structure = structure
         self.b = columns.plus_diagonal(equations.b, damping_c)
         self._pairs = equations.pairs

@@ -45,28 +45,20 @@ _SAVED_RHO = 0.3
 _MAX_REJECTED = 25
 
 
-def _no_clock() -> float:
-    return 0.0
-
-
 def solve(
     problem: Problem,
     options: SolverOptions,
     *,
-    clock: Callable[[], float] = _no_clock,
+    clock: Callable[[], float] = lambda: 0.0,
     on_iteration: Callable[[Iteration], bool] | None = None,
     kernels: Kernels | None = None,
     weakest: bool = False,
 ) -> Result:
     """Minimise the robust objective of a problem.
 
-    Args:
-        problem: must pass :meth:`Problem.check`.
-        options: the parts of the method.
-        clock: seconds, for the trace alone; nothing depends on it.
-        on_iteration: called with each row of the trace; returning False stops the solve.
-        kernels: of the problem, to work with in place of those that the options ask for: for experiments.
-        weakest: tell how far off the least determined of the free poses may be.
+    The clock (s) is for the trace alone; ``on_iteration`` gets each row of it, and stops the solve by returning False.
+    ``kernels`` work in place of those that the options ask for: for experiments. ``weakest`` asks how far off the least
+    determined of the free poses may be.
 
     Returns:
         The best state found, with a trace and the reason for stopping; finite always.

@@ -38,23 +38,14 @@ _DIAGONAL = np.arange(3)
 
 @dataclass(frozen=True)
 class Rays:
-    """Views of points as rays in the world; rows whose pixel no ray projects to are left out.
+    """Views of points as rays in the world; rows whose pixel no ray projects to are left out."""
 
-    Attributes:
-        point: (n,) index of the point.
-        centre: (n, 3) camera centre, m.
-        direction: (n, 3) unit vector.
-        px_per_rad: (n,) focal length over sigma.
-        distance_m: (n,) measured distance along the ray, NaN where there is none.
-        distance_sigma_m: (n,) its standard deviation.
-    """
-
-    point: IntArray
-    centre: FloatArray
-    direction: FloatArray
-    px_per_rad: FloatArray
-    distance_m: FloatArray
-    distance_sigma_m: FloatArray
+    point: IntArray  # (n,) index of the point
+    centre: FloatArray  # (n, 3) camera centre, m
+    direction: FloatArray  # (n, 3) unit vector
+    px_per_rad: FloatArray  # (n,) focal length over sigma
+    distance_m: FloatArray  # (n,) measured distance along the ray, NaN where there is none
+    distance_sigma_m: FloatArray  # (n,) its standard deviation
 
     def part(self, which: BoolArray) -> Rays:
         """Return some of them."""
@@ -63,17 +54,11 @@ class Rays:
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Points and how well their rays determine them.
+    """Points and how well their rays determine them."""
 
-    Attributes:
-        points: (n_pt, 3), m; NaN where there is neither a pair of rays nor a ray with a distance.
-        parallax_rad: (n_pt,) largest angle between two rays (exact for two, at least half of it for more).
-        measured: (n_pt,) True where a distance was measured.
-    """
-
-    points: FloatArray
-    parallax_rad: FloatArray
-    measured: BoolArray
+    points: FloatArray  # (n_pt, 3), m; NaN where there is neither a pair of rays nor a ray with a distance
+    parallax_rad: FloatArray  # (n_pt,) largest angle between two rays (exact for two, at least half of it for more)
+    measured: BoolArray  # (n_pt,) True where a distance was measured
 
 
 def rays_of(problem: Problem) -> Rays:

@@ -34,17 +34,11 @@ class EvaluationError(ValueError):
 
 @dataclass(frozen=True)
 class Alignment:
-    """``x -> scale * rotation @ x + translation``, from the frame of the estimate to that of the reference.
+    """``x -> scale * rotation @ x + translation``, from the frame of the estimate to that of the reference."""
 
-    Attributes:
-        rotation: (3, 3).
-        translation: (3,) m.
-        scale: 1 unless the alignment was sim3.
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
-    scale: float
+    rotation: FloatArray  # (3, 3)
+    translation: FloatArray  # (3,) m
+    scale: float  # 1 unless the alignment was sim3
 
     def apply(self, points: FloatArray) -> FloatArray:
         """Return points (n, 3) in the frame of the reference."""

@@ -49,23 +49,14 @@ class Statistics:
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Absolute error of a trajectory after alignment (Sturm et al., IROS 2012).
+    """Absolute error of a trajectory after alignment (Sturm et al., IROS 2012)."""
 
-    Attributes:
-        alignment: from the estimate to the reference.
-        stamp_ns: (n,) of the estimate's poses that have a partner, by time.
-        translation_m: (n,) distance to the partner.
-        rotation_deg: (n,) angle to the partner.
-        translation: summary, m.
-        rotation: summary, deg.
-    """
-
-    alignment: Alignment
-    stamp_ns: NDArray[np.int64]
-    translation_m: FloatArray
-    rotation_deg: FloatArray
-    translation: Statistics
-    rotation: Statistics
+    alignment: Alignment  # from the estimate to the reference
+    stamp_ns: NDArray[np.int64]  # (n,) of the estimate's poses that have a partner, by time
+    translation_m: FloatArray  # (n,) distance to the partner
+    rotation_deg: FloatArray  # (n,) angle to the partner
+    translation: Statistics  # summary, m
+    rotation: Statistics  # summary, deg
 
 
 def associate(

@@ -21,21 +21,13 @@ _TRUTH, _BEFORE, _AFTER, _CLOUD = "#000000", "#D55E00", "#0072B2", "#8C8C8C"
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is drawn.
+    """What is drawn."""
 
-    Attributes:
-        before: trajectory of the front-end; None to show that after adjustment alone.
-        after: trajectory after adjustment.
-        truth: reference.
-        cloud: (n, 3) points of the map, in the frame of ``after``, m; may be empty.
-        kind: alignment of both trajectories to the truth.
-    """
-
-    before: Poses | None
-    after: Poses
-    truth: Poses
-    cloud: FloatArray
-    kind: Kind = "se3"
+    before: Poses | None  # trajectory of the front-end; None to show that after adjustment alone
+    after: Poses  # trajectory after adjustment
+    truth: Poses  # reference
+    cloud: FloatArray  # (n, 3) points of the map, in the frame of ``after``, m; may be empty
+    kind: Kind = "se3"  # alignment of both trajectories to the truth
 
 
 def draw(target: Path | IO[bytes], comparison: Comparison) -> None:

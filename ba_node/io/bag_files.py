@@ -22,17 +22,11 @@ _KNOWN = ("mcap", "sqlite3")
 
 
 class BagFiles(NamedTuple):
-    """The files of a recording.
+    """The files of a recording."""
 
-    Attributes:
-        paths: the files, in no particular order.
-        are_parts: a metadata.yaml says that they are parts of one recording.
-        warnings: what somebody has to know about them, by kind.
-    """
-
-    paths: list[Path]
-    are_parts: bool
-    warnings: dict[str, str]
+    paths: list[Path]  # the files, in no particular order
+    are_parts: bool  # a metadata.yaml says that they are parts of one recording
+    warnings: dict[str, str]  # what somebody has to know about them, by kind
 
 
 def find_files(paths: Sequence[Path]) -> BagFiles:

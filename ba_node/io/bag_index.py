@@ -36,6 +36,13 @@ MAX_WAITING_BYTES = 2**29
 _HEAD = struct.Struct("<BQ")
 # channel, number, log time, publish time in front of a message's bytes
 _MESSAGE = struct.Struct("<HIQQ")
+# How files begin that are taken for a recording -> what to do with them.
+_OTHERS = {
+    b"\x28\xb5\x2f\xfd": "; it is packed with zstd: unpack it, or name it .mcap.zstd",
+    b"\x1f\x8b": "; it is packed with gzip: unpack it",
+    b"PK\x03\x04": "; it is a zip archive: unpack it",
+    b"#ROSBAG": "; it is a recording of ROS 1: convert it, with rosbags-convert for one",
+}
 _COMPRESSIONS = ("", "lz4", "zstd")
 
 
@@ -48,42 +55,25 @@ class Message(NamedTuple):
 
 
 class Block(NamedTuple):
-    """A record that holds messages: a chunk, or a message that stands alone. Sorts by time, then place in the file.
+    """A record that holds messages: a chunk, or a message that stands alone. Sorts by time, then place in the file."""
 
-    Attributes:
-        start_ns: smallest log time in it, ns.
-        offset: where it begins, bytes.
-        length: with its head, bytes.
-        channels: those with messages in it; None if that is not known.
-    """
-
-    start_ns: int
-    offset: int
-    length: int
-    channels: frozenset[int] | None = None
+    start_ns: int  # smallest log time in it, ns
+    offset: int  # where it begins, bytes
+    length: int  # with its head, bytes
+    channels: frozenset[int] | None = None  # those with messages in it; None if that is not known
 
 
 @dataclass
 class BagIndex:
-    """Where the messages of a file are.
+    """Where the messages of a file are."""
 
-    Attributes:
-        schemas: by id.
-        channels: by id.
-        blocks: what holds messages, sorted.
-        message_count: number of messages that can be read.
-        counts: the same by channel; empty if that is not known.
-        end_ns: largest log time, ns.
-        problems: what is wrong with the file, as (reason, words).
-    """
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)
-    message_count: int = 0
-    counts: Counter[int] = field(default_factory=Counter)
-    end_ns: int = 0
-    problems: list[tuple[str, str]] = field(default_factory=list)
+    schemas: dict[int, Schema] = field(default_factory=dict)  # by id
+    channels: dict[int, Channel] = field(default_factory=dict)  # by id
+    blocks: list[Block] = field(default_factory=list)  # what holds messages, sorted
+    message_count: int = 0  # number of messages that can be read
+    counts: Counter[int] = field(default_factory=Counter)  # the same by channel; empty if that is not known
+    end_ns: int = 0  # largest log time, ns
+    problems: list[tuple[str, str]] = field(default_factory=list)  # what is wrong with the file, as (reason, words)
 
     def add(self, record: Message | Schema | Channel) -> None:
         """Take note of a schema or a channel; of those that come twice the first counts."""
@@ -101,8 +91,10 @@ def read_index(stream: IO[bytes], size: int) -> BagIndex:
     """
     if size == 0:
         raise BagError("the file is empty (0 bytes)")
-    if stream.read(len(MAGIC)) != MAGIC:
-        raise BagError("not an MCAP file: it does not begin with the MCAP magic bytes")
+    begin = stream.read(len(MAGIC))
+    if begin != MAGIC:
+        other = next((what for magic, what in _OTHERS.items() if begin.startswith(magic)), "")
+        raise BagError(f"not an MCAP file: it does not begin with the MCAP magic bytes{other}")
     index = _from_summary(stream, size) or _from_records(stream, size)
     if index.message_count == 0:
         if not index.problems:

@@ -28,43 +28,26 @@ _ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.ID
 
 @dataclass(frozen=True)
 class BagChannel:
-    """Messages of one topic and type in one file.
+    """Messages of one topic and type in one file."""
 
-    Attributes:
-        id: in its file.
-        topic: full name.
-        type_name: ``package/msg/Type``; empty if the file does not say.
-        encoding: of messages and of definitions, as the file names them.
-        definition: of the type.
-        count: messages in it, None if that is not known.
-    """
-
-    id: int
-    topic: str
-    type_name: str
-    encoding: tuple[str, str]
-    definition: str
-    count: int | None
+    id: int  # in its file
+    topic: str  # full name
+    type_name: str  # ``package/msg/Type``; empty if the file does not say
+    encoding: tuple[str, str]  # of messages and of definitions, as the file names them
+    definition: str  # of the type
+    count: int | None  # messages in it, None if that is not known
 
 
 @dataclass(frozen=True)
 class Source:
-    """One open file.
+    """One open file."""
 
-    Attributes:
-        channels: all.
-        message_count: messages that can be read.
-        start_ns: log time of the first, ns.
-        end_ns: log time of the last, ns.
-        problems: what is wrong with it, as (reason, words).
-        read: yields the messages of some channels by log time; what cannot be read goes to the function given.
-    """
-
-    channels: list[BagChannel]
-    message_count: int
-    start_ns: int
-    end_ns: int
-    problems: list[tuple[str, str]]
+    channels: list[BagChannel]  # all
+    message_count: int  # messages that can be read
+    start_ns: int  # log time of the first, ns
+    end_ns: int  # log time of the last, ns
+    problems: list[tuple[str, str]]  # what is wrong with it, as (reason, words)
+    # yields the messages of some channels by log time; what cannot be read goes to the function given
     read: Callable[[Collection[int], Callable[[str, str], None]], Iterator[Message]]
 
 

@@ -32,15 +32,10 @@ class EmptyBagError(BagError):
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """What a user says about topics.
+    """What a user says about topics."""
 
-    Attributes:
-        topics: input -> topic, for those that are not to be found.
-        namespace: only topics in this namespace; empty for any.
-    """
-
-    topics: Mapping[str, str] = field(default_factory=dict)
-    namespace: str = ""
+    topics: Mapping[str, str] = field(default_factory=dict)  # input -> topic, for those that are not to be found
+    namespace: str = ""  # only topics in this namespace; empty for any
 
 
 def parse_topic(text: str) -> tuple[str, str]:
@@ -72,12 +67,9 @@ class Chosen:
 
 
 class Chooser:
-    """Chooses among the topics of one recording.
+    """Chooses among the topics of one recording that have messages of the type of each input.
 
-    Args:
-        found: topics with messages of the type of each input.
-        frames_of: the frames that the first messages of a topic name.
-        content_of: the cameras in the first message of a topic, None if it cannot be read.
+    ``frames_of`` tells the frames that the first messages of a topic name, ``content_of`` the cameras in the first one.
     """
 
     def __init__(

@@ -69,14 +69,9 @@ class BagWriter:
         self._stack.__exit__(kind, error, traceback)
 
     def write(self, topic: str, type_name: str, message: Any, log_time_ns: int, latched: bool = False) -> None:
-        """Add a message.
+        """Add a message made with ``ROSBAGS_FACTORY``, at a time of recording, ns, that players and readers go by.
 
-        Args:
-            topic: full name; a missing leading slash is added, as every name in a bag is absolute.
-            type_name: for example ``ba_msgs/msg/Keyframe``.
-            message: made with ``ROSBAGS_FACTORY``.
-            log_time_ns: time of recording, ns; players and readers go by it.
-            latched: durability ``transient_local`` for the topic, the same in every call for it.
+        Names in a bag are absolute: a missing leading slash is added. ``latched`` is durability ``transient_local``.
 
         Raises:
             BagError: a time outside uint64, a topic with two types or durabilities, a message that does not fit.

@@ -45,21 +45,13 @@ class BalError(ValueError):
 
 @dataclass(frozen=True)
 class BalProblem:
-    """A problem as the file has it.
+    """A problem as the file has it."""
 
-    Attributes:
-        cameras: (n, 9) rotation vector, translation, f (px), k1, k2.
-        points: (m, 3) in the world.
-        camera_index: (l,) camera of each observation.
-        point_index: (l,) point of each observation.
-        observations: (l, 2) u to the right, v upwards, px, from the centre of the image.
-    """
-
-    cameras: FloatArray
-    points: FloatArray
-    camera_index: IntArray
-    point_index: IntArray
-    observations: FloatArray
+    cameras: FloatArray  # (n, 9) rotation vector, translation, f (px), k1, k2
+    points: FloatArray  # (m, 3) in the world
+    camera_index: IntArray  # (l,) camera of each observation
+    point_index: IntArray  # (l,) point of each observation
+    observations: FloatArray  # (l, 2) u to the right, v upwards, px, from the centre of the image
 
 
 def read_bal(path: Path | str) -> BalProblem:

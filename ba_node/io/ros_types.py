@@ -37,7 +37,7 @@ class TypeMismatchError(ValueError):
 
 
 class RosbagsFactory:
-    """Make messages as dataclasses of rosbags (a :class:`~ba_node.messages.conversion.MessageFactory`)."""
+    """Make messages as dataclasses of rosbags (a :class:`~ba_node.messages.factory.MessageFactory`)."""
 
     def make(self, type_name: str, **fields: Any) -> Any:
         """Return a message with all its fields."""

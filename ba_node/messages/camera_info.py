@@ -37,19 +37,12 @@ _SKEW = 1e-6
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera to the pixels of its images.
+    """A camera to the pixels of its images."""
 
-    Attributes:
-        intrinsics: (4,) fx fy cx cy, px.
-        distortion: coefficients d.
-        image_size: (2,) int64, width and height, px, 0 if unknown.
-        note: how k was adjusted to the image, empty if it was not.
-    """
-
-    intrinsics: FloatArray
-    distortion: FloatArray
-    image_size: NDArray[np.int64]
-    note: str = ""
+    intrinsics: FloatArray  # (4,) fx fy cx cy, px
+    distortion: FloatArray  # coefficients d
+    image_size: NDArray[np.int64]  # (2,) int64, width and height, px, 0 if unknown
+    note: str = ""  # how k was adjusted to the image, empty if it was not
 
 
 def lens_of(info: Any) -> Lens:

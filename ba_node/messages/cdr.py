@@ -36,7 +36,6 @@ class Cdr:
     """A message that grows. Its stamps raise ConversionError if their seconds exceed 32 bits."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._parts: list[bytes | memoryview] = []
         self._size = 0
 

@@ -27,22 +27,7 @@ from ba_node.messages.factory import (
     pose_message,
     stamp_ns_from_message,
 )
-from ba_node.messages.outputs import output_messages
-from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
-
-__all__ = [
-    "INPUT_TYPES",
-    "OUTPUT_TYPES",
-    "ConversionError",
-    "MessageFactory",
-    "guesses_message",
-    "keyframe_message",
-    "measurement_from_message",
-    "output_messages",
-    "rig_message",
-    "stamp_ns_from_message",
-    "tracks_message",
-]
+from ba_node.messages.topics import INPUT_TYPES
 
 _NO_LENS = Lens(np.zeros(4), np.zeros(0), np.zeros(2, np.int64))
 

@@ -31,35 +31,20 @@ class Level(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Health:
-    """What is known about the node at one moment.
+    """What is known about the node at one moment."""
 
-    Attributes:
-        rates_hz: messages a second of each input topic.
-        publishers: publishers of each input topic, by its full name.
-        silence_s: since the last keyframe, or since the node was configured.
-        ignoring: why data is ignored, in words; empty when it is taken.
-        inbox_waiting: messages in the inbox.
-        inbox_size: how many may wait.
-        recent: what was dropped or turned away lately, by reason.
-        report: of the last solve; None before the first.
-        tf: what becomes of the transform map -> odom, in words.
-        memory_mb: resident, MB.
-        clock: what is wrong with simulated time, in words; empty if nothing is.
-        solver_alive: the solver's thread works.
-    """
-
-    rates_hz: Mapping[str, float] = field(default_factory=dict)
-    publishers: Mapping[str, int] = field(default_factory=dict)
-    silence_s: float = 0.0
-    ignoring: str = ""
-    inbox_waiting: int = 0
-    inbox_size: int = 1
-    recent: Mapping[str, int] = field(default_factory=dict)
-    report: Report | None = None
-    tf: str = ""
-    memory_mb: float = 0.0
-    clock: str = ""
-    solver_alive: bool = True
+    rates_hz: Mapping[str, float] = field(default_factory=dict)  # messages a second of each input topic
+    publishers: Mapping[str, int] = field(default_factory=dict)  # publishers of each input topic, by its full name
+    silence_s: float = 0.0  # since the last keyframe, or since the node was configured
+    ignoring: str = ""  # why data is ignored, in words; empty when it is taken
+    inbox_waiting: int = 0  # messages in the inbox
+    inbox_size: int = 1  # how many may wait
+    recent: Mapping[str, int] = field(default_factory=dict)  # what was dropped or turned away lately, by reason
+    report: Report | None = None  # of the last solve; None before the first
+    tf: str = ""  # what becomes of the transform map -> odom, in words
+    memory_mb: float = 0.0  # resident, MB
+    clock: str = ""  # what is wrong with simulated time, in words; empty if nothing is
+    solver_alive: bool = True  # the solver's thread works
 
 
 @dataclass

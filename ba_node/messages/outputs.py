@@ -22,13 +22,8 @@ from ba_node.messages.topics import OUTPUT_TYPES
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rms_px", "<f4"), ("views", "<u4")])
 
 
-class _Everything(Container[str]):
-    def __contains__(self, item: object) -> bool:
-        return True
-
-
 def output_messages(
-    factory: MessageFactory, estimate: Estimate, config: OutputConfig, wanted: Container[str] = _Everything()
+    factory: MessageFactory, estimate: Estimate, config: OutputConfig, wanted: Container[str] = OUTPUT_TYPES
 ) -> list[tuple[str, str, Any]]:
     """Return what a node publishes after a solve; of a failed or skipped one the report only, unless the map is empty.
 

@@ -20,12 +20,7 @@ from ba_node.messages.topics import OUTPUT_TYPES
 
 @dataclass(frozen=True)
 class QueueReport:
-    """What became of the keyframes that came in (fields of ``ba_msgs/SolverReport``), and what the node adds.
-
-    Attributes:
-        rejected: what the node itself turned away, by reason.
-        warnings: what the node has to say.
-    """
+    """What became of the keyframes that came in (fields of ``ba_msgs/SolverReport``), and what the node adds."""
 
     queue_wait_s: float = 0.0
     dropped: int = 0
@@ -35,8 +30,8 @@ class QueueReport:
     dropped_keyframes: int = 0
     rejected_keyframes: int = 0
     waiting: int = 0
-    rejected: Mapping[str, int] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    rejected: Mapping[str, int] = field(default_factory=dict)  # what the node itself turned away, by reason
+    warnings: tuple[str, ...] = ()  # what the node has to say
 
 
 @dataclass(frozen=True)

@@ -28,22 +28,14 @@ class Direction(enum.Enum):
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic.
+    """A topic."""
 
-    Attributes:
-        name: of an input relative to the namespace, of an output below the node's name; with a slash, shared by all of
-            ROS.
-        type_name: ``package/msg/Type``.
-        direction: seen from the node.
-        delivery: quality of service.
-        text: what it holds.
-    """
-
+    # of an input relative to the namespace, of an output below the node's name; with a slash, shared by all of ROS
     name: str
-    type_name: str
-    direction: Direction
-    delivery: Delivery
-    text: str
+    type_name: str  # ``package/msg/Type``
+    text: str  # what it holds
+    direction: Direction = Direction.TAKEN  # seen from the node
+    delivery: Delivery = Delivery.RELIABLE  # quality of service
 
     @property
     def is_shared(self) -> bool:
@@ -70,97 +62,68 @@ _RELIABLE, _LATCHED = Delivery.RELIABLE, Delivery.LATCHED
 TF, TF_STATIC, DIAGNOSTICS, CLOCK = "/tf", "/tf_static", "/diagnostics", "/clock"
 
 _ALL = (
-    Topic(
-        "keyframes",
-        "ba_msgs/msg/Keyframe",
-        _IN,
-        _RELIABLE,
-        "Pose of the body at every keyframe, as the front-end has it.",
-    ),
-    Topic(
-        "feature_tracks",
-        "ba_msgs/msg/FeatureTracks",
-        _IN,
-        _RELIABLE,
-        "What one camera saw in one keyframe; one message a camera.",
-    ),
-    Topic("landmark_guesses", "ba_msgs/msg/LandmarkGuesses", _IN, _RELIABLE, "Optional: first positions of points."),
+    Topic("keyframes", "ba_msgs/msg/Keyframe", "Pose of the body at every keyframe, as the front-end has it."),
+    Topic("feature_tracks", "ba_msgs/msg/FeatureTracks", "What one camera saw in one keyframe; one message a camera."),
+    Topic("landmark_guesses", "ba_msgs/msg/LandmarkGuesses", "Optional: first positions of points."),
     Topic(
         "camera_rig",
         "ba_msgs/msg/CameraRig",
+        "Cameras and where they sit on the body. Sent once is enough.",
         _IN,
         _LATCHED,
-        "Cameras and where they sit on the body. Sent once is enough.",
     ),
     Topic(
         "camera_info",
         "sensor_msgs/msg/CameraInfo",
+        "Instead of a rig: one camera at the body's origin.",
         _IN,
         Delivery.LATCHED_OR_NOT,
-        "Instead of a rig: one camera at the body's origin.",
     ),
-    Topic(
-        "refined_keyframes",
-        "ba_msgs/msg/RefinedKeyframes",
-        _OUT,
-        _RELIABLE,
-        "Poses of the window after each solve, by id.",
-    ),
-    Topic(
-        "pose",
-        "geometry_msgs/msg/PoseStamped",
-        _OUT,
-        _RELIABLE,
-        "The same, one message a keyframe with the keyframe's stamp.",
-    ),
-    Topic("path", "nav_msgs/msg/Path", _OUT, _LATCHED, "Poses of all keyframes kept, newest `output.path_max_poses`."),
+    Topic("refined_keyframes", "ba_msgs/msg/RefinedKeyframes", "Poses of the window after each solve, by id.", _OUT),
+    Topic("pose", "geometry_msgs/msg/PoseStamped", "The same, one message a keyframe with the keyframe's stamp.", _OUT),
+    Topic("path", "nav_msgs/msg/Path", "Poses of all keyframes kept, newest `output.path_max_poses`.", _OUT, _LATCHED),
     Topic(
         "points",
         "sensor_msgs/msg/PointCloud2",
+        "The map: x, y, z (m), rms_px (float32), views (uint32).",
         _OUT,
         _LATCHED,
-        "The map: x, y, z (m), rms_px (float32), views (uint32).",
     ),
     Topic(
         "report",
         "ba_msgs/msg/SolverReport",
-        _OUT,
-        _RELIABLE,
         "How each solve went, failed and skipped ones too; without a solve, what was turned away.",
+        _OUT,
     ),
     Topic(
         "pose_with_covariance",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "As `~/pose`, with a covariance against what the solve held fixed; with a robust loss its standard"
+        " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed.",
         _SIDE,
-        _RELIABLE,
-        (
-            "As `~/pose`, with a covariance against what the solve held fixed; with a robust loss its standard"
-            " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed."
-        ),
     ),
     Topic(
         "markers",
         "visualization_msgs/msg/MarkerArray",
+        "Frusta, links between keyframes, residual colours. Only while subscribed.",
         _SIDE,
         _LATCHED,
-        "Frusta, links between keyframes, residual colours. Only while subscribed.",
     ),
-    Topic(TF, "tf2_msgs/msg/TFMessage", _OUT, _RELIABLE, "`map -> odom`, see docs/frames.md. Needs tf2_msgs."),
+    Topic(TF, "tf2_msgs/msg/TFMessage", "`map -> odom`, see docs/frames.md. Needs tf2_msgs.", _OUT),
     Topic(
         DIAGNOSTICS,
         "diagnostic_msgs/msg/DiagnosticArray",
-        _OUT,
-        _RELIABLE,
         "How the node fares, once a second, see docs/diagnostics.md.",
+        _OUT,
     ),
     Topic(
         TF_STATIC,
         "tf2_msgs/msg/TFMessage",
+        "Where the cameras sit on the body, with `frames.extrinsics: tf_static`. Needs tf2_msgs.",
         _IN,
         _LATCHED,
-        "Where the cameras sit on the body, with `frames.extrinsics: tf_static`. Needs tf2_msgs.",
     ),
-    Topic(CLOCK, "rosgraph_msgs/msg/Clock", _IN, Delivery.BEST_EFFORT, "The time, with `use_sim_time: true`."),
+    Topic(CLOCK, "rosgraph_msgs/msg/Clock", "The time, with `use_sim_time: true`.", _IN, Delivery.BEST_EFFORT),
 )
 TOPICS = {topic.name: topic for topic in _ALL}
 # What a recording holds for a replay, and what a solve gives: type by name.

@@ -55,7 +55,6 @@ class StaticTree:
     """What /tf_static says: where each frame sits in its parent."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._parents: dict[str, tuple[str, Transform]] = {}
 
     def add(self, message: Any) -> None:

@@ -22,21 +22,13 @@ class CheckError(ValueError):
 
 @dataclass(frozen=True)
 class CheckedSession:
-    """What a session of a recording tells.
+    """What a session of a recording tells."""
 
-    Attributes:
-        session_id: the session; several may have the same.
-        keyframe_ids: of the first and the last keyframe, by time.
-        stamps_ns: of the same, ns.
-        found: what the tracks tell.
-        warnings: what else somebody has to know: stamps that jump, messages that were turned away.
-    """
-
-    session_id: int
-    keyframe_ids: tuple[int, int]
-    stamps_ns: tuple[int, int]
-    found: Diagnosis
-    warnings: tuple[str, ...]
+    session_id: int  # the session; several may have the same
+    keyframe_ids: tuple[int, int]  # of the first and the last keyframe, by time
+    stamps_ns: tuple[int, int]  # of the same, ns
+    found: Diagnosis  # what the tracks tell
+    warnings: tuple[str, ...]  # what else somebody has to know: stamps that jump, messages that were turned away
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for a JSON file."""

@@ -45,25 +45,15 @@ class DemoError(ValueError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a demo.
+    """What came of a demo."""
 
-    Attributes:
-        before: front-end's poses.
-        after: refined poses.
-        truth: true poses.
-        cloud: the map.
-        reports: ``ba_msgs/SolverReport`` of every solve.
-        frame_id: name of the frame of the refined poses and the map.
-        duration_s: from the start of the node to its end.
-    """
-
-    before: Poses
-    after: Poses
-    truth: Poses
-    cloud: Cloud
-    reports: list[Any]
-    frame_id: str
-    duration_s: float
+    before: Poses  # front-end's poses
+    after: Poses  # refined poses
+    truth: Poses  # true poses
+    cloud: Cloud  # the map
+    reports: list[Any]  # ``ba_msgs/SolverReport`` of every solve
+    frame_id: str  # name of the frame of the refined poses and the map
+    duration_s: float  # from the start of the node to its end
 
 
 def shipped_bag() -> Path:
@@ -158,12 +148,9 @@ _running: list[_Process] = []
 
 
 class _Process:
-    """A process of the demo, with a log. Use it as a context manager: it is over when the block is.
+    """A Python module that runs with a log of its output. Use it as a context manager: it is over when the block is.
 
-    Args:
-        module: Python module to run, with its arguments.
-        log: where its output goes.
-        interrupt: end it with SIGINT, as Ctrl-C does; otherwise it ends by itself.
+    It ends by itself, unless ``interrupt`` asks for a SIGINT, as of Ctrl-C.
     """
 
     def __init__(self, module: list[str], log: Path, *, interrupt: bool) -> None:

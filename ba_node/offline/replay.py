@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
-from ba_node.messages.topics import LATCHED_OUTPUTS
+from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.session_record import SessionRecord
@@ -44,41 +44,23 @@ class ReplayError(ValueError):
     """A recording that leaves nothing to write."""
 
 
-def _no_clock() -> float:
-    return 0.0
-
-
-def _nothing(_done: int, _total: int) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class Watch:
-    """What a replay takes from outside.
+    """What a replay takes from outside."""
 
-    Attributes:
-        clock: seconds, for the times in report.json alone.
-        progress: called with the number of messages read and of all messages.
-    """
-
-    clock: Callable[[], float] = _no_clock
-    progress: Callable[[int, int], None] = _nothing
+    clock: Callable[[], float] = lambda: 0.0  # seconds, for the times in report.json alone
+    # called with the number of messages read and of all messages
+    progress: Callable[[int, int], None] = lambda _done, _total: None
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """What is done before and after the recording.
+    """What is done before and after the recording."""
 
-    Attributes:
-        load: map to begin with; the recording must go on in its session.
-        optimize: refine everything of the newest session at the end.
-        save: file for the map of the newest session.
-        topics: which topics of the recording are taken, where several are possible.
-    """
-
-    load: Path | None = None
-    optimize: bool = False
-    save: Path | None = None
+    load: Path | None = None  # map to begin with; the recording must go on in its session
+    optimize: bool = False  # refine everything of the newest session at the end
+    save: Path | None = None  # file for the map of the newest session
+    # which topics of the recording are taken, where several are possible
     topics: TopicChoice = field(default_factory=TopicChoice)
 
 
@@ -203,9 +185,9 @@ class _Run:
         self.sessions[-1].add(estimate, self.backend.map.refined_keyframes())
         if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
             self._written = len(estimate.trajectory)
-            self._write(estimate, _AllTopics())
+            self._write(estimate, OUTPUT_TYPES)
         else:
-            self._write(estimate, _AllTopics(without=LATCHED_OUTPUTS))
+            self._write(estimate, OUTPUT_TYPES.keys() - set(LATCHED_OUTPUTS))
 
     def _begin(self, estimate: Estimate) -> None:
         session_id = self.backend.map.session_id
@@ -221,21 +203,11 @@ class _Run:
                 self._write(record.last, LATCHED_OUTPUTS)
         self._inputs = {}
 
-    def _write(self, estimate: Estimate, wanted: Any) -> None:
-        timeless = dataclasses.replace(estimate, report=estimate.report.without_times())
+    def _write(self, estimate: Estimate, wanted: Container[str]) -> None:
+        timeless = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, solve_time_s=0.0))
         for topic, kind, message in output_messages(ROSBAGS_FACTORY, timeless, self._config.output, wanted):
             time_ns = max(0, estimate.stamp_ns)
             self._writer.write(f"/{NODE_NAME}/{topic}", kind, message, time_ns, latched=topic in LATCHED_OUTPUTS)
-
-
-class _AllTopics:
-    """Contain every topic but some."""
-
-    def __init__(self, without: tuple[str, ...] = ()) -> None:
-        self._without = without
-
-    def __contains__(self, topic: object) -> bool:
-        return topic not in self._without
 
 
 def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def facts(backend: Backend) -> list[tuple[str, str]]:
         ("observations", f"{summary.observations}, {summary.outliers} outliers"),
         ("rms, all observations", f"{backend.map.rms_px():.3f} px"),
         ("solves", f"{backend.solve_count}, the last: {report.status.name.lower()}, {report.reason}"),
-        ("rejected", ", ".join(f"{n} {reason}" for reason, n in backend.rejected.items()) or "nothing"),
+        ("rejected", ", ".join(f"{n} {reason}" for reason, n in backend.map.rejected.items()) or "nothing"),
     ]
     if backend.finished:
         rows.append(("older sessions", ", ".join(str(key) for key, _ in backend.finished)))

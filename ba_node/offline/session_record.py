@@ -20,35 +20,20 @@ _IDS_SHOWN = 6
 
 @dataclass
 class SessionRecord:
-    """One session of a replay.
+    """One session of a replay."""
 
-    Attributes:
-        session_id: the session.
-        last: newest estimate.
-        forgotten: last values of the keyframes that the back-end has forgotten.
-        inputs: accepted keyframe messages by id.
-        refined: ids of the keyframes that took part in a usable solve.
-        statuses: solves by status.
-        solver_time_s: in all, s.
-        slowest: time and keyframe of the slowest solve.
-        iterations: outer iterations in all.
-        reasons: why a solve gave nothing, by its newest keyframe.
-        unrefined: which keyframes were not refined and why, empty if all were; see :meth:`close`.
-        closed: summary of the map at its end, None before :meth:`close`.
-    """
-
-    session_id: int
-    last: Estimate
-    forgotten: list[Poses] = field(default_factory=list)
-    inputs: dict[int, Keyframe] = field(default_factory=dict)
-    refined: set[int] = field(default_factory=set)
-    statuses: Counter[str] = field(default_factory=Counter)
-    solver_time_s: float = 0.0
-    slowest: tuple[float, int] = (0.0, 0)
-    iterations: int = 0
-    reasons: dict[int, str] = field(default_factory=dict)
-    unrefined: str = ""
-    closed: MapSummary | None = None
+    session_id: int  # the session
+    last: Estimate  # newest estimate
+    forgotten: list[Poses] = field(default_factory=list)  # last values of the keyframes that the back-end has forgotten
+    inputs: dict[int, Keyframe] = field(default_factory=dict)  # accepted keyframe messages by id
+    refined: set[int] = field(default_factory=set)  # ids of the keyframes that took part in a usable solve
+    statuses: Counter[str] = field(default_factory=Counter)  # solves by status
+    solver_time_s: float = 0.0  # in all, s
+    slowest: tuple[float, int] = (0.0, 0)  # time and keyframe of the slowest solve
+    iterations: int = 0  # outer iterations in all
+    reasons: dict[int, str] = field(default_factory=dict)  # why a solve gave nothing, by its newest keyframe
+    unrefined: str = ""  # which keyframes were not refined and why, empty if all were; see :meth:`close`
+    closed: MapSummary | None = None  # summary of the map at its end, None before :meth:`close`
 
     @property
     def map_index(self) -> int:

@@ -31,27 +31,17 @@ _MANY_BEHIND = 0.01
 
 @dataclass(frozen=True)
 class Solution:
-    """A solved file.
+    """A solved file."""
 
-    Attributes:
-        source: the file.
-        bal: its content, moved by minus the origin.
-        problem: the same in our terms.
-        origin: (3,) of the coordinates in which it was solved, in those of the file; zeros if they are the same.
-        result: state and trace.
-        options: with which it was solved.
-        setup_s: time to read and prepare it, s.
-        solve_s: time in the solver, s.
-    """
-
-    source: str
-    bal: BalProblem
-    problem: Problem
+    source: str  # the file
+    bal: BalProblem  # its content, moved by minus the origin
+    problem: Problem  # the same in our terms
+    # (3,) of the coordinates in which it was solved, in those of the file; zeros if they are the same
     origin: FloatArray
-    result: Result
-    options: SolverOptions
-    setup_s: float
-    solve_s: float
+    result: Result  # state and trace
+    options: SolverOptions  # with which it was solved
+    setup_s: float  # time to read and prepare it, s
+    solve_s: float  # time in the solver, s
 
     def refined(self) -> BalProblem:
         """Return the problem with the solution as start, in the coordinates of the file."""

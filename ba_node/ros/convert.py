@@ -7,12 +7,10 @@ from __future__ import annotations
 import array
 import functools
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 
 @functools.cache

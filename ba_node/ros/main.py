@@ -8,8 +8,9 @@ import gc
 import signal
 import sys
 import traceback
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from types import FrameType
 
 import rclpy
 from rclpy.exceptions import InvalidNamespaceException, InvalidNodeNameException
@@ -22,10 +23,6 @@ from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
 from ba_node.ros.rclpy_compat.executor import NodeExecutor
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from types import FrameType
 
 USAGE_ERROR = 2
 # One after the other: then it is not a single message or request that is at fault.

@@ -18,11 +18,12 @@ from __future__ import annotations
 import time
 import traceback
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
 from ba_node.backend import Backend
+from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.components.diagnostics import Diagnostics
@@ -40,9 +41,6 @@ from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.worker import Notice, Outcome, Worker
-
-if TYPE_CHECKING:
-    from ba_node.config import Config
 
 NODE_NAME = "ba_node"
 # In the order in which they are made and get estimates; destroyed in reverse. What feeds the worker comes last.

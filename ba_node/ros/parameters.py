@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter as RclpyParameter
@@ -13,9 +14,6 @@ from rclpy.parameter import Parameter as RclpyParameter
 from ba_node.config import Config, ConfigError, Parameter, declarations, unknown
 from ba_node.ros import qos
 from ba_node.ros.rclpy_compat.private import part
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _TYPES = {
     bool: RclpyParameter.Type.BOOL,

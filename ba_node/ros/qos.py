@@ -8,7 +8,8 @@ resolved name of the topic and the policies history, depth, reliability and dura
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -18,7 +19,6 @@ from rclpy.qos import (
     QoSCompatibility,
     QoSPolicyKind,
     QoSProfile,
-    ReliabilityPolicy,
     qos_check_compatible,
     qos_policy_name_from_kind,
     qos_profile_sensor_data,
@@ -27,9 +27,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from ba_node.messages.topics import CAMERAS, Delivery, Topic
 from ba_node.ros.worker.worker import Notice
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 # Bursts that one solve sends: one pose for each keyframe of a window.
 OUTPUT_DEPTH = 1000
@@ -41,29 +38,17 @@ _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIAB
 
 def reliable(depth: int) -> Any:
     """Return a profile that repeats lost messages and keeps nothing for late subscribers."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=depth)
 
 
 def lossless() -> Any:
     """Return a profile that keeps every message until all subscribers have acknowledged it."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
-    )
+    return QoSProfile(history=HistoryPolicy.KEEP_ALL)
 
 
 def latched(depth: int = 1) -> Any:
     """Return a profile whose last messages reach subscribers that come later."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def profile(topic: Topic, depth: int = OUTPUT_DEPTH) -> Any:

@@ -44,17 +44,11 @@ _REASON = {
 
 @dataclass(frozen=True)
 class Begin:
-    """A session begins.
+    """A session begins."""
 
-    Attributes:
-        kind: of the warning, from ``WARNINGS``; empty where the front-end asked for it with a higher session id.
-        text: of the warning.
-        replaces: the session before was one keyframe with an absurd stamp, and counts for nothing.
-    """
-
-    kind: str = ""
-    text: str = ""
-    replaces: bool = False
+    kind: str = ""  # of the warning, from ``WARNINGS``; empty where the front-end asked for it with a higher session id
+    text: str = ""  # of the warning
+    replaces: bool = False  # the session before was one keyframe with an absurd stamp, and counts for nothing
 
 
 @dataclass(frozen=True)
@@ -67,21 +61,13 @@ class Admitted:
 
 @dataclass(frozen=True)
 class Candidate:
-    """What is held.
+    """What is held."""
 
-    Attributes:
-        kind: what it is.
-        items: keyframes in order, and tracks and guesses that would be lost otherwise.
-        text: what is odd about the first keyframe.
-        run: keyframes in a row that agree.
-        against: keyframes that went on as before.
-    """
-
-    kind: Kind
-    items: tuple[Measurement, ...]
-    text: str
-    run: int = 1
-    against: int = 0
+    kind: Kind  # what it is
+    items: tuple[Measurement, ...]  # keyframes in order, and tracks and guesses that would be lost otherwise
+    text: str  # what is odd about the first keyframe
+    run: int = 1  # keyframes in a row that agree
+    against: int = 0  # keyframes that went on as before
 
     @property
     def is_error(self) -> bool:
@@ -106,21 +92,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class State:
-    """What is remembered between messages.
+    """What is remembered between messages."""
 
-    Attributes:
-        candidate: what is held.
-        waiting: tracks and guesses of sessions that no keyframe has begun.
-        lower: session and number of the keyframes in a row that are of a session before the current one.
-        distrust: added to what is needed.
-        calm: keyframes that went on as before, since distrust changed.
-    """
-
-    candidate: Candidate | None = None
+    candidate: Candidate | None = None  # what is held
+    # tracks and guesses of sessions that no keyframe has begun
     waiting: tuple[FeatureTracks | LandmarkGuesses, ...] = ()
+    # session and number of the keyframes in a row that are of a session before the current one
     lower: tuple[int, int] = (-1, 0)
-    distrust: int = 0
-    calm: int = 0
+    distrust: int = 0  # added to what is needed
+    calm: int = 0  # keyframes that went on as before, since distrust changed
 
 
 @dataclass(frozen=True)

@@ -25,15 +25,10 @@ class MapError(ValueError):
 
 @dataclass(frozen=True)
 class MapContent:
-    """A map: what docs/map_format.md describes.
+    """A map: what docs/map_format.md describes."""
 
-    Attributes:
-        arrays: by name, for example ``keyframes/position``.
-        facts: what JSON can hold.
-    """
-
-    arrays: dict[str, NDArray[Any]] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, NDArray[Any]] = field(default_factory=dict)  # by name, for example ``keyframes/position``
+    facts: dict[str, Any] = field(default_factory=dict)  # what JSON can hold
 
     def fact(self, name: str, kind: type | tuple[type, ...]) -> Any:
         """Return a fact.

@@ -22,23 +22,14 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 class MapTables:
-    """Keyframes, landmarks and who saw what.
-
-    Attributes:
-        config: how much is kept.
-        keyframes: table, in order of arrival; see ``order``.
-        landmarks: table, in order of arrival.
-        observations: table, in order of arrival.
-        blocks: per keyframe row, its rows in ``observations``.
-    """
+    """Keyframes, landmarks and who saw what."""
 
     def __init__(self, config: SceneConfig) -> None:
-        """Start empty."""
-        self.config = config
-        self.keyframes = Keyframes()
-        self.landmarks = Landmarks()
-        self.observations = ObservationTable()
-        self.blocks: list[list[Block]] = []
+        self.config = config  # how much is kept
+        self.keyframes = Keyframes()  # table, in order of arrival; see ``order``
+        self.landmarks = Landmarks()  # table, in order of arrival
+        self.observations = ObservationTable()  # table, in order of arrival
+        self.blocks: list[list[Block]] = []  # per keyframe row, its rows in ``observations``
         self._keyframe_rows: dict[int, int] = {}
         self._landmark_rows = IdIndex()
         self._order: IntArray | None = None
@@ -94,9 +85,8 @@ class MapTables:
         What was known of a landmark stays with its older views, under an id that nobody has; the track keeps the newer
         ones and has no position.
 
-        Args:
-            landmarks: (n,) rows, all different, each with older views.
-            since: (n,) place in the order of time of the first keyframe whose views stay.
+        Landmarks are (n,) rows, all different, each with older views; ``since`` is the place in the order of time of
+        the first keyframe whose views stay.
 
         Returns:
             (n,) rows of the landmarks of the older views.

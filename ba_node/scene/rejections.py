@@ -80,23 +80,15 @@ class Refusal:
 
 
 class RejectionLog:
-    """Counts by reason, and notes that name ids and values.
-
-    Attributes:
-        rejected: what was turned away; keys from REASONS. Whole messages count as one, observations one by one.
-        notices: what was unusual but used; keys from NOTICES.
-        notes: the last cases in words, oldest first.
-        firsts: the first case of each reason in words.
-        warnings: the newest case of each kind in words; keys from WARNINGS.
-    """
+    """Counts by reason, and notes that name ids and values."""
 
     def __init__(self) -> None:
-        """Start with nothing counted."""
+        # what was turned away; keys from REASONS. Whole messages count as one, observations one by one.
         self.rejected: Counter[str] = Counter()
-        self.notices: Counter[str] = Counter()
-        self.notes: deque[str] = deque(maxlen=NOTES_KEPT)
-        self.firsts: dict[str, str] = {}
-        self.warnings: dict[str, str] = {}
+        self.notices: Counter[str] = Counter()  # what was unusual but used; keys from NOTICES
+        self.notes: deque[str] = deque(maxlen=NOTES_KEPT)  # the last cases in words, oldest first
+        self.firsts: dict[str, str] = {}  # the first case of each reason in words
+        self.warnings: dict[str, str] = {}  # the newest case of each kind in words; keys from WARNINGS
 
     def reject(self, reason: str, what: str, count: int = 1) -> None:
         """Count a rejection; ``what`` names the first case: thing, id, value, what was expected."""

@@ -21,25 +21,16 @@ from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
 
 
 class Scene(MapTables):
-    """What is known in one session. All methods leave it consistent; none raises on bad data.
-
-    Attributes:
-        session_id: the session, None before the first message that names one.
-        frame_id: name of the fixed frame.
-        cameras: the rig, None before it came.
-        refused_rig: why the last rig that was refused was, empty if none was.
-        log: what was turned away.
-    """
+    """What is known in one session. All methods leave it consistent; none raises on bad data."""
 
     def __init__(self, config: SceneConfig, session_id: int | None = None) -> None:
-        """Start empty."""
         super().__init__(config)
-        self.session_id = session_id
-        self.frame_id = ""
-        self.cameras: Cameras | None = None
+        self.session_id = session_id  # the session, None before the first message that names one
+        self.frame_id = ""  # name of the fixed frame
+        self.cameras: Cameras | None = None  # the rig, None before it came
         self.next_cameras: Cameras | None = None
-        self.refused_rig = ""
-        self.log = RejectionLog()
+        self.refused_rig = ""  # why the last rig that was refused was, empty if none was
+        self.log = RejectionLog()  # what was turned away
         self.pending: list[FeatureTracks] = []
         self._reused: set[int] = set()
 

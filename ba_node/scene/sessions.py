@@ -62,7 +62,6 @@ class Sessions:
     """The decisions of one back-end."""
 
     def __init__(self) -> None:
-        """Start with nothing held."""
         self.state = State()
         self._loaded: set[int] = set()
 

@@ -44,7 +44,6 @@ class Table:
         cls.COLUMNS = {name: value for name, value in vars(cls).items() if isinstance(value, Column)}
 
     def __init__(self) -> None:
-        """Start empty."""
         self._size = 0
         self._buffers: dict[str, NDArray[Any]] = {
             name: np.empty((0, *column.shape), column.dtype) for name, column in self.COLUMNS.items()
@@ -52,7 +51,6 @@ class Table:
         self._expose()
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return self._size
 
     def append(self, count: int, **values: object) -> IntArray:
@@ -87,25 +85,18 @@ class IdIndex:
     """Row numbers by id: sorted ids, searched by bisection."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._ids: IdArray = np.empty(0, np.uint64)
-        self._rows: IntArray = np.empty(0, np.intp)
+        self.rows: IntArray = np.empty(0, np.intp)
 
     def __len__(self) -> int:
-        """Return the number of ids."""
         return len(self._ids)
-
-    @property
-    def rows(self) -> IntArray:
-        """Return all rows in the order of their ids."""
-        return self._rows
 
     def find(self, ids: IdArray) -> IntArray:
         """Return the row of each id, -1 where it is not known."""
         if not len(self._ids):
             return np.full(len(ids), -1)
         at = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
-        return np.where(self._ids[at] == ids, self._rows[at], -1)
+        return np.where(self._ids[at] == ids, self.rows[at], -1)
 
     def insert(self, ids: IdArray, rows: IntArray) -> None:
         """Add ids that are not known yet and differ from each other."""
@@ -113,12 +104,12 @@ class IdIndex:
         ids, rows = ids[order], rows[order]
         if len(self._ids) and len(ids) and ids[0] < self._ids[-1]:
             at = np.searchsorted(self._ids, ids)
-            self._ids, self._rows = np.insert(self._ids, at, ids), np.insert(self._rows, at, rows)
+            self._ids, self.rows = np.insert(self._ids, at, ids), np.insert(self.rows, at, rows)
         else:
             # Most front-ends count: new ids come last.
-            self._ids, self._rows = np.concatenate([self._ids, ids]), np.concatenate([self._rows, rows])
+            self._ids, self.rows = np.concatenate([self._ids, ids]), np.concatenate([self.rows, rows])
 
     def renumber(self, renumbered: IntArray) -> None:
         """Follow :meth:`Table.keep`: take over the new row numbers and drop ids whose row is gone."""
-        rows = renumbered[self._rows]
-        self._ids, self._rows = self._ids[rows >= 0], rows[rows >= 0]
+        rows = renumbered[self.rows]
+        self._ids, self.rows = self._ids[rows >= 0], rows[rows >= 0]

@@ -24,27 +24,17 @@ _OUTLIER_PX = (10.0, 60.0)
 
 @dataclass(frozen=True)
 class SyntheticData:
-    """A recording and the truth about it.
+    """A recording and the truth about it."""
 
-    Attributes:
-        rig: the cameras.
-        keyframes: with the drifted poses, by time.
-        tracks: of each keyframe, one entry a camera.
-        guesses: of each keyframe, for the tracks that begin there; None when there are none.
-        truth: true poses of the keyframes; the first is also the first published one.
-        landmarks: (n, 3) all points of the world in the fixed frame, m.
-        track_id: (n_tracks,) ids of the published tracks, in order of appearance.
-        track_landmark: (n_tracks,) which point each of them follows.
-    """
-
-    rig: CameraRig
-    keyframes: tuple[Keyframe, ...]
-    tracks: tuple[tuple[FeatureTracks, ...], ...]
+    rig: CameraRig  # the cameras
+    keyframes: tuple[Keyframe, ...]  # with the drifted poses, by time
+    tracks: tuple[tuple[FeatureTracks, ...], ...]  # of each keyframe, one entry a camera
+    # of each keyframe, for the tracks that begin there; None when there are none
     guesses: tuple[LandmarkGuesses | None, ...]
-    truth: Poses
-    landmarks: FloatArray
-    track_id: IdArray
-    track_landmark: IntArray
+    truth: Poses  # true poses of the keyframes; the first is also the first published one
+    landmarks: FloatArray  # (n, 3) all points of the world in the fixed frame, m
+    track_id: IdArray  # (n_tracks,) ids of the published tracks, in order of appearance
+    track_landmark: IntArray  # (n_tracks,) which point each of them follows
 
     @property
     def odometry(self) -> Poses:

@@ -52,21 +52,13 @@ def build_rig(options: SyntheticOptions) -> CameraRig:
 
 @dataclass(frozen=True)
 class Lens:
-    """One camera of the rig, ready to project.
+    """One camera of the rig, ready to project."""
 
-    Attributes:
-        rotation: (3, 3) body from camera optical frame.
-        position: (3,) camera in the body, m.
-        model: see ``cameras.Model``.
-        params: (12,) see ``cameras``.
-        image_size: (2,) width and height, px.
-    """
-
-    rotation: FloatArray
-    position: FloatArray
-    model: cameras.Model
-    params: FloatArray
-    image_size: FloatArray
+    rotation: FloatArray  # (3, 3) body from camera optical frame
+    position: FloatArray  # (3,) camera in the body, m
+    model: cameras.Model  # see ``cameras.Model``
+    params: FloatArray  # (12,) see ``cameras``
+    image_size: FloatArray  # (2,) width and height, px
 
     def eye(self, path: Path, k: int) -> FloatArray:
         """Return where the camera is at keyframe ``k``, in the fixed frame: (3,) m."""

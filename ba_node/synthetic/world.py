@@ -23,17 +23,11 @@ _BODY_HEIGHT = 1.2
 
 @dataclass(frozen=True)
 class World:
-    """Structure with points on it.
+    """Structure with points on it."""
 
-    Attributes:
-        points: (n, 3).
-        normals: (n, 3) unit, out of the surface a point lies on.
-        boxes: (k, 2, 3) lowest and highest corner of the solid blocks that hide what is behind them.
-    """
-
-    points: FloatArray
-    normals: FloatArray
-    boxes: FloatArray
+    points: FloatArray  # (n, 3)
+    normals: FloatArray  # (n, 3) unit, out of the surface a point lies on
+    boxes: FloatArray  # (k, 2, 3) lowest and highest corner of the solid blocks that hide what is behind them
 
     def visible(self, eye: FloatArray, max_range_m: float) -> BoolArray:
         """Return which points can be seen from ``eye``: (3,) -> (n,).
@@ -60,17 +54,11 @@ class World:
 
 @dataclass(frozen=True)
 class Path:
-    """True poses of the body, x forward, y left, z up.
+    """True poses of the body, x forward, y left, z up."""
 
-    Attributes:
-        position: (n, 3) in the fixed frame.
-        rotation: (n, 3, 3) fixed frame from body.
-        distance: (n,) travelled since the first.
-    """
-
-    position: FloatArray
-    rotation: FloatArray
-    distance: FloatArray
+    position: FloatArray  # (n, 3) in the fixed frame
+    rotation: FloatArray  # (n, 3, 3) fixed frame from body
+    distance: FloatArray  # (n,) travelled since the first
 
 
 def build(options: SyntheticOptions, rng: np.random.Generator) -> tuple[World, Path]:

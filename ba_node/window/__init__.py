@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choose what a solve refines, fix the rest, put the solution back, and say how well it fits."""
 
-from ba_node.window.determined import MIN_OBSERVATIONS
 from ba_node.window.merging import Merged, apply, merge, outcome
-from ba_node.window.problems import problem_of
+from ba_node.window.problems import MIN_OBSERVATIONS, problem_of
 from ba_node.window.selection import Selection, moved_guesses, rows_of, select
 
 __all__ = [

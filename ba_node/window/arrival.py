@@ -64,19 +64,12 @@ def strays(
 
 
 class Stray(NamedTuple):
-    """A keyframe that began in the wrong place.
+    """A keyframe that began in the wrong place."""
 
-    Attributes:
-        row: in the scene.
-        found: its tracks have shown its place.
-        off_m: how far the front-end had put it from there; 0 where it is not its own pose that is wrong.
-        off_rad: by how much it had turned it.
-    """
-
-    row: int
-    found: bool
-    off_m: float = 0.0
-    off_rad: float = 0.0
+    row: int  # in the scene
+    found: bool  # its tracks have shown its place
+    off_m: float = 0.0  # how far the front-end had put it from there; 0 where it is not its own pose that is wrong
+    off_rad: float = 0.0  # by how much it had turned it
 
     def text(self, keyframe_id: int) -> str:
         """Return what to say of it, empty if nothing."""

@@ -40,25 +40,15 @@ _FADING = ("cauchy", "geman_mcclure")
 
 
 class Attempt(NamedTuple):
-    """A solved window.
+    """A solved window."""
 
-    Attributes:
-        selection: what was solved.
-        result: what came of it.
-        found: the same in the scale of the map, without a state where it is of no use.
-        health: figures for the report.
-        held: why it is not to be taken, empty if it is, or of no use anyway.
-        without: rows of keyframes that were left out as they alone were wrong.
-        solve_time_s: time in the solver, s.
-    """
-
-    selection: Selection
-    result: Result
-    found: Merged
-    health: dict[str, float]
-    held: str
-    without: tuple[int, ...]
-    solve_time_s: float
+    selection: Selection  # what was solved
+    result: Result  # what came of it
+    found: Merged  # the same in the scale of the map, without a state where it is of no use
+    health: dict[str, float]  # figures for the report
+    held: str  # why it is not to be taken, empty if it is, or of no use anyway
+    without: tuple[int, ...]  # rows of keyframes that were left out as they alone were wrong
+    solve_time_s: float  # time in the solver, s
 
 
 def attempt(

@@ -38,14 +38,11 @@ class Move:
 
 
 class MapCorrection:
-    """The correction of one session.
-
-    Attributes:
-        published: map from odom, gated and smoothed; None before the first update.
-    """
+    """The correction of one session."""
 
     def __init__(self, transforms: tuple[Transform, ...] = (), agreeing: int = 0, stamp_ns: int = 0) -> None:
         """Start without one, or with what :meth:`state` gave."""
+        # map from odom, gated and smoothed; None before the first update
         self.published: Transform | None = transforms[0] if transforms else None
         self._target: Transform | None = transforms[1] if transforms else None
         self._candidate: Transform | None = transforms[2] if len(transforms) > 2 else None

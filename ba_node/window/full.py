@@ -74,24 +74,15 @@ def options(config: SolverConfig, method: str = "", max_iterations: int = 0) -> 
 
 @dataclass
 class Optimization:
-    """A solve of everything that was kept at a moment, with the ids by which to find its parts again.
+    """A solve of everything that was kept at a moment, with the ids by which to find its parts again."""
 
-    Attributes:
-        scene: where it is from; asked only whether it is still the current one.
-        selection: the problem. Its rows hold at that moment only.
-        keyframe_id: (n_kf,) uint64.
-        track_id: (n_pt,) uint64.
-        placed: (n_pt,) True where the point had a position.
-        position: (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it.
-        solved: result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`.
-    """
-
-    scene: Scene
-    selection: Selection
-    keyframe_id: IdArray
-    track_id: IdArray
-    placed: BoolArray
-    position: FloatArray
+    scene: Scene  # where it is from; asked only whether it is still the current one
+    selection: Selection  # the problem. Its rows hold at that moment only.
+    keyframe_id: IdArray  # (n_kf,) uint64
+    track_id: IdArray  # (n_pt,) uint64
+    placed: BoolArray  # (n_pt,) True where the point had a position
+    position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
+    # result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`
     solved: tuple[Result, FloatArray] | None = None
 
     def solve(
@@ -265,11 +256,7 @@ def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
 
 
 def _anchors(member: IntArray) -> IntArray:
-    """Return for each keyframe, oldest first, the last member before it; before the first member, that one.
-
-    Args:
-        member: (n,) number of each keyframe in the copy, -1 for others.
-    """
+    """Return for each keyframe, oldest first, the last ``member`` (number in the copy, -1: none), or the first."""
     at = np.maximum.accumulate(np.where(member >= 0, np.arange(len(member)), -1))
     return np.asarray(member[np.where(at < 0, int(np.argmax(member >= 0)), at)])
 

@@ -33,15 +33,10 @@ _MIN_BASELINE_M = 1e-6
 
 @dataclass(frozen=True)
 class Gauge:
-    """What holds a problem.
+    """What holds a problem."""
 
-    Attributes:
-        fixed: (n_kf,) keyframes whose pose is held.
-        unscaled: (n_kf,) for a keyframe of a part whose scale floats the number of its fixed keyframe, else -1.
-    """
-
-    fixed: BoolArray
-    unscaled: IntArray
+    fixed: BoolArray  # (n_kf,) keyframes whose pose is held
+    unscaled: IntArray  # (n_kf,) for a keyframe of a part whose scale floats the number of its fixed keyframe, else -1
 
 
 def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:

@@ -52,21 +52,14 @@ _MAX_HELD_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to become of a solution.
+    """What is to become of a solution."""
 
-    Attributes:
-        reason: why it is held, in words; empty if it may be taken.
-        health: what ``ba_msgs/SolverReport`` tells of it, by name.
-        keyframes: rows in the scene of keyframes that alone are wrong: without them it may be worth another solve.
-        odd: steps that need another solve to agree.
-        systematic: a window that is wrong as a whole, not a part of it.
-    """
-
-    reason: str = ""
-    health: dict[str, float] = field(default_factory=dict)
+    reason: str = ""  # why it is held, in words; empty if it may be taken
+    health: dict[str, float] = field(default_factory=dict)  # what ``ba_msgs/SolverReport`` tells of it, by name
+    # rows in the scene of keyframes that alone are wrong: without them it may be worth another solve
     keyframes: tuple[int, ...] = ()
-    odd: Odd | None = None
-    systematic: bool = False
+    odd: Odd | None = None  # steps that need another solve to agree
+    systematic: bool = False  # a window that is wrong as a whole, not a part of it
 
 
 def decide(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:

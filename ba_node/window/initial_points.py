@@ -49,17 +49,11 @@ class _Fit:
 
 @dataclasses.dataclass(frozen=True)
 class Agreed:
-    """What the views of points agree on.
+    """What the views of points agree on."""
 
-    Attributes:
-        points: (n_pt, 3), m.
-        good: (n_pt,) True where that is a place to believe in.
-        measured: (n_pt,) True where a distance was measured by one that agrees.
-    """
-
-    points: FloatArray
-    good: BoolArray
-    measured: BoolArray
+    points: FloatArray  # (n_pt, 3), m
+    good: BoolArray  # (n_pt,) True where that is a place to believe in
+    measured: BoolArray  # (n_pt,) True where a distance was measured by one that agrees
 
 
 def initial_points(

@@ -12,7 +12,7 @@ import numpy as np
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import TracksConfig
 from ba_node.core import geometry, native_kernels
-from ba_node.core.problem import Problem, State
+from ba_node.core.problem import Observations, Problem, State
 from ba_node.core.result import Result
 from ba_node.scene.scene import Scene
 from ba_node.window import gauge
@@ -32,17 +32,12 @@ _MANY_MOVING = 0.2
 
 
 class Merged(NamedTuple):
-    """What came of a result.
+    """What came of a result."""
 
-    Attributes:
-        norms: (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these.
-        state: the solution in the scale that it has in the map; None without a usable result.
-        explained: how well its poses explain the tracks that they are tried on; None likewise.
-    """
-
+    # (n_all,) the sizes of the residuals after it, as ``Selection.norms``; without a usable result these
     norms: FloatArray
-    state: State | None
-    explained: Explained | None = None
+    state: State | None  # the solution in the scale that it has in the map; None without a usable result
+    explained: Explained | None = None  # how well its poses explain the tracks that they are tried on; None likewise
 
 
 def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
@@ -83,7 +78,10 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     whole, point, n = selection.whole, selection.observations.point, selection.problem.n_points
     limit = _noticed_m(selection, state)
     centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
-    away, began = (np.abs(points - centre).max(axis=1) > limit for points in (state.points, whole.start.points))
+    measured = _has_depth(whole.observations, n)
+    away, began = (
+        (np.abs(points - centre).max(axis=1) > limit) & ~measured for points in (state.points, whole.start.points)
+    )
     agreeing = np.bincount(point[norms <= gate], minlength=n)
     moved = np.abs(state.points - whole.start.points).max(axis=1)
     leapt = moved > _LEAP * np.abs(whole.start.points - centre).max(axis=1)
@@ -104,6 +102,14 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     points = state.points.copy()
     points[np.flatnonzero(doubted)[back]] = whole.start.points[doubted][back]
     return dataclasses.replace(state, points=points)
+
+
+def _has_depth(observations: Observations, n: int) -> BoolArray:
+    """Return of which of ``n`` points a distance was measured, which tells it however little keyframes are apart."""
+    found = np.zeros(n, bool)
+    if len(observations.depth_m):
+        found[observations.point[np.isfinite(observations.depth_m)]] = True
+    return found
 
 
 def _noticed_m(selection: Selection, state: State) -> float:

@@ -54,21 +54,13 @@ _MEDIAN_NORM = 1.538
 
 @dataclass(frozen=True)
 class _Steps:
-    """Steps of the front-end between keyframes of a problem and the next ones.
+    """Steps of the front-end between keyframes of a problem and the next ones."""
 
-    Attributes:
-        first: (n,) the earlier keyframe of each.
-        rotation: (n, 3, 3) body at the earlier one from body at the later one.
-        translation: (n, 3) the same, m.
-        sigma_rad: (n,) standard deviation about each axis.
-        sigma_m: (n,) along each axis.
-    """
-
-    first: IntArray
-    rotation: FloatArray
-    translation: FloatArray
-    sigma_rad: FloatArray
-    sigma_m: FloatArray
+    first: IntArray  # (n,) the earlier keyframe of each
+    rotation: FloatArray  # (n, 3, 3) body at the earlier one from body at the later one
+    translation: FloatArray  # (n, 3) the same, m
+    sigma_rad: FloatArray  # (n,) standard deviation about each axis
+    sigma_m: FloatArray  # (n,) along each axis
 
     def factors(self, kept: BoolArray, loss_scale: float) -> tuple[RelativePoses, ...]:
         """Return the factors of some steps."""

@@ -26,9 +26,9 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, determined, gauge, moving, odometry, trial, turns
+from ba_node.window import arrival, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
-from ba_node.window.problems import part_of, problem_of, some_observations
+from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
 # Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
 _VIEWS = 400
@@ -43,49 +43,27 @@ _BULK = 100
 
 @dataclass(frozen=True)
 class Selection:
-    """A problem and where its parts stand in the scene.
+    """A problem and where its parts stand in the scene."""
 
-    Attributes:
-        problem: with the inlier observations.
-        observations: all observations of its points by its keyframes, inliers or not, sorted by point.
-        norms: (n_all,) their residuals at the start, sigmas, inf behind the camera.
-        rows: (n_all,) row in the scene of each of these.
-        inlier: (n_all,) True where it is in the problem.
-        keyframes: (n_kf,) row of each keyframe in the scene, oldest first.
-        landmarks: (n_pt,) row of each point, by track id.
-        window: rows of all keyframes of the window, those held out included, oldest first.
-        lost: rows of landmarks that have a position which their views contradict; they sit this solve out.
-        moving: (n_pt,) points on objects that move, see ``moving.py``; not in the problem, but for their start.
-        much_moves: they are a large share of what is seen.
-        origin: (3,) of the problem in the map, m.
-        unscaled: see ``gauge.Gauge``.
-        tried: points whose tracks a solution is tried on, see ``trial.py``.
-        held_out: (n_pt,) those of them that are not in the problem, but for their start.
-        keyframe_id: (n_kf,) uint64.
-        place: (n_kf,) of each keyframe in the order of time.
-        measured: the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m.
-        strays: keyframes that began in the wrong place.
-    """
-
-    problem: Problem
-    observations: Observations
-    norms: FloatArray
-    rows: IntArray
-    inlier: BoolArray
-    keyframes: IntArray
-    landmarks: IntArray
-    window: IntArray
-    lost: IntArray
-    moving: BoolArray
-    much_moves: bool
-    origin: FloatArray
-    unscaled: IntArray
-    tried: IntArray
-    held_out: BoolArray
-    keyframe_id: IdArray
-    place: IntArray
-    measured: tuple[FloatArray, FloatArray]
-    strays: tuple[arrival.Stray, ...]
+    problem: Problem  # with the inlier observations
+    observations: Observations  # all observations of its points by its keyframes, inliers or not, sorted by point
+    norms: FloatArray  # (n_all,) their residuals at the start, sigmas, inf behind the camera
+    rows: IntArray  # (n_all,) row in the scene of each of these
+    inlier: BoolArray  # (n_all,) True where it is in the problem
+    keyframes: IntArray  # (n_kf,) row of each keyframe in the scene, oldest first
+    landmarks: IntArray  # (n_pt,) row of each point, by track id
+    window: IntArray  # rows of all keyframes of the window, those held out included, oldest first
+    lost: IntArray  # rows of landmarks that have a position which their views contradict; they sit this solve out
+    moving: BoolArray  # (n_pt,) points on objects that move, see ``moving.py``; not in the problem, but for their start
+    much_moves: bool  # they are a large share of what is seen
+    origin: FloatArray  # (3,) of the problem in the map, m
+    unscaled: IntArray  # see ``gauge.Gauge``
+    tried: IntArray  # points whose tracks a solution is tried on, see ``trial.py``
+    held_out: BoolArray  # (n_pt,) those of them that are not in the problem, but for their start
+    keyframe_id: IdArray  # (n_kf,) uint64
+    place: IntArray  # (n_kf,) of each keyframe in the order of time
+    measured: tuple[FloatArray, FloatArray]  # the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m
+    strays: tuple[arrival.Stray, ...]  # keyframes that began in the wrong place
 
     @cached_property
     def whole(self) -> Problem:
@@ -140,7 +118,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     moves = _moving(scene, part, norms, config)
     much_moves = moving.much(part.problem, moves)
     least = config.guard.min_points if config.guard.enabled else 2
-    kept, keyframes, points = determined.determined(part.problem, usable, moves, config.window.max_landmarks, least)
+    kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]
     usable &= ~moves.take(part.problem.observations.point)

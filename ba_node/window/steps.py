@@ -52,21 +52,13 @@ def angle_of(turn: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far steps are off those of the front-end.
+    """How far steps are off those of the front-end."""
 
-    Attributes:
-        sigmas: (n,) the larger of the error of the move and of the turn, each by its standard deviation.
-        move_m: (n,) error of the move.
-        turn_rad: (n,) error of the turn.
-        sigma_m: (n,) what the front-end's move is worth.
-        sigma_rad: (n,) what its turn is worth.
-    """
-
-    sigmas: FloatArray
-    move_m: FloatArray
-    turn_rad: FloatArray
-    sigma_m: FloatArray
-    sigma_rad: FloatArray
+    sigmas: FloatArray  # (n,) the larger of the error of the move and of the turn, each by its standard deviation
+    move_m: FloatArray  # (n,) error of the move
+    turn_rad: FloatArray  # (n,) error of the turn
+    sigma_m: FloatArray  # (n,) what the front-end's move is worth
+    sigma_rad: FloatArray  # (n,) what its turn is worth
 
 
 def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:

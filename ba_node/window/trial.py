@@ -60,19 +60,12 @@ def choose(track_id: IdArray, point: IntArray, wanted: int) -> tuple[IntArray, I
 
 @dataclass(frozen=True)
 class Explained:
-    """How well two sets of poses explain the tracks: of all cameras together, then of each alone.
+    """How well two sets of poses explain the tracks: of all cameras together, then of each alone."""
 
-    Attributes:
-        held_out: (2,) median of the residuals of the tracks that took no part, sigmas; 0 without any.
-        mean: (2, 1 + n_cam) of the residuals of all, each bounded, sigmas; NaN where there are too few.
-        parallax_rad: median over the tracks of the largest angle between two rays, by the second set of poses.
-        points: (n_out, 3) those that took no part, by the second set of poses, m.
-    """
-
-    held_out: FloatArray
-    mean: FloatArray
-    parallax_rad: float
-    points: FloatArray
+    held_out: FloatArray  # (2,) median of the residuals of the tracks that took no part, sigmas; 0 without parallax
+    mean: FloatArray  # (2, 1 + n_cam) of the residuals of all, each bounded, sigmas; NaN where there are too few
+    parallax_rad: float  # median over the tracks of the largest angle between two rays, by the second set of poses
+    points: FloatArray  # (n_out, 3) those that took no part, by the second set of poses, m
 
     def worse(self, share: float) -> IntArray:
         """Return which residuals the second set raises by more than a share: 0 for all cameras, 1 + camera."""
@@ -147,7 +140,7 @@ class Trial:
         count = np.bincount(self._of[rows], minlength=n)
         sums = [np.bincount(self._of[rows], np.minimum(norm[rows], _BOUND), n) for norm in norms]
         mean = np.where(count >= _MIN_RESIDUALS, np.array(sums) / np.maximum(count, 1), np.nan)
-        out = np.flatnonzero(self._counts.take(self._group) & (self._group < self._n_out))
+        out = rows[self._group[rows] < self._n_out]
         return Explained(
             np.array([min(median(norm[out]), _BEHIND) if len(out) else 0.0 for norm in norms]),
             mean,

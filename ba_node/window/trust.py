@@ -21,15 +21,10 @@ _NARROW = 0.8
 
 @dataclass(frozen=True)
 class Odd:
-    """Steps far off the front-end's that tracks bear out: the first solves that find them are held until others agree.
+    """Steps far off the front-end's that tracks bear out: solves that find them are held until others agree."""
 
-    Attributes:
-        keys: rows in the scene of the two keyframes of each.
-        steps: as the solution has them.
-    """
-
-    keys: tuple[tuple[int, int], ...]
-    steps: steps.Steps
+    keys: tuple[tuple[int, int], ...]  # rows in the scene of the two keyframes of each
+    steps: steps.Steps  # as the solution has them
 
 
 def agree(found: Odd, earlier: Odd, config: Config, keys: list[tuple[int, int]]) -> BoolArray:
@@ -50,22 +45,14 @@ class Trust:
     """What the solves before are worth to the next: doubt grows with each that is held and falls with each that passes.
 
     After several held ones as many that pass are held too, until they have proved that the data are good again.
-
-    Attributes:
-        doubt: 0: the next solution that passes is taken.
-        odd: steps that the last solve found odd, and that tracks bear out.
-        agreeing: solves in a row that found them.
-        blamed: rows of keyframes that the last solve was made without.
-        cause: why the last one was held, or made without them.
     """
 
     def __init__(self) -> None:
-        """Start without doubt."""
-        self.doubt = 0
-        self.odd: Odd | None = None
-        self.agreeing = 0
-        self.blamed: set[int] = set()
-        self.cause = ""
+        self.doubt = 0  # 0: the next solution that passes is taken
+        self.odd: Odd | None = None  # steps that the last solve found odd, and that tracks bear out
+        self.agreeing = 0  # solves in a row that found them
+        self.blamed: set[int] = set()  # rows of keyframes that the last solve was made without
+        self.cause = ""  # why the last one was held, or made without them
 
     @property
     def lost(self) -> bool:

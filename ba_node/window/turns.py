@@ -42,17 +42,11 @@ _MAX_ANCHORS = 4
 
 @dataclass(frozen=True)
 class Turns:
-    """What was found, by keyframe of a problem.
+    """What was found, by keyframe of a problem."""
 
-    Attributes:
-        anchor: (n_kf,) row in the scene of the keyframe that it differs from by a rotation alone, -1 for none.
-        rotation: (n_kf, 3, 3) body of the anchor from body.
-        sigma_rad: (n_kf,) standard deviation of the rotation about each axis: that of one ray.
-    """
-
-    anchor: IntArray
-    rotation: FloatArray
-    sigma_rad: FloatArray
+    anchor: IntArray  # (n_kf,) row in the scene of the keyframe that it differs from by a rotation alone, -1 for none
+    rotation: FloatArray  # (n_kf, 3, 3) body of the anchor from body
+    sigma_rad: FloatArray  # (n_kf,) standard deviation of the rotation about each axis: that of one ray
 
     def take(self, keyframes: BoolArray) -> Turns:
         """Return what was found of some keyframes."""
@@ -98,21 +92,13 @@ class Turns:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays of a problem, sorted by keyframe and track.
+    """Rays of a problem, sorted by keyframe and track."""
 
-    Attributes:
-        key: (n,) camera and point.
-        keyframe: (n,).
-        direction: (n, 3) unit vector in the body.
-        sigma_rad: (n,) standard deviation across it.
-        n_keys: keys are below this.
-    """
-
-    key: IntArray
-    keyframe: IntArray
-    direction: FloatArray
-    sigma_rad: FloatArray
-    n_keys: int
+    key: IntArray  # (n,) camera and point
+    keyframe: IntArray  # (n,)
+    direction: FloatArray  # (n, 3) unit vector in the body
+    sigma_rad: FloatArray  # (n,) standard deviation across it
+    n_keys: int  # keys are below this
 
 
 def find(problem: Problem, rows: IntArray, used: BoolArray, placed: BoolArray) -> Turns | None:

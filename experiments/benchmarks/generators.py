@@ -26,23 +26,14 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors of measurements and of the start.
+    """Errors of measurements and of the start."""
 
-    Attributes:
-        pixel: standard deviation of u and v, px.
-        outliers: share of observations that are moved by up to 20 px.
-        rotation: of the start, rad.
-        position: of the start, m.
-        point: of the start, m.
-        intrinsics: of the start, f (relative), k1, k2.
-    """
-
-    pixel: float = 1.0
-    outliers: float = 0.0
-    rotation: float = 0.01
-    position: float = 0.05
-    point: float = 0.2
-    intrinsics: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pixel: float = 1.0  # standard deviation of u and v, px
+    outliers: float = 0.0  # share of observations that are moved by up to 20 px
+    rotation: float = 0.01  # of the start, rad
+    position: float = 0.05  # of the start, m
+    point: float = 0.2  # of the start, m
+    intrinsics: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the start, f (relative), k1, k2
 
 
 def window(n_keyframes: int, seed: int = 1) -> Case:

@@ -27,8 +27,8 @@ from ba_node.config import OutputConfig
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import FeatureTracks
 from ba_node.messages import conversion
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES, output_messages
-from ba_node.messages.topics import TOPICS
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.tools.domain import free_domain, isolation
@@ -43,21 +43,13 @@ _CALL_PERIOD_S = 0.03
 
 @dataclass(frozen=True)
 class Case:
-    """What the front-end sees, and how much of it a window holds.
+    """What the front-end sees, and how much of it a window holds."""
 
-    Attributes:
-        about: in words.
-        tracks: points that each image of the stereo pair sees.
-        track_keyframes: keyframes after which a track ends; 0: it goes on, and comes back when its point does.
-        landmarks: points of the world, for each keyframe.
-        fixed: older keyframes that take part with fixed poses.
-    """
-
-    about: str
-    tracks: int
-    track_keyframes: int
-    landmarks: int
-    fixed: int
+    about: str  # in words
+    tracks: int  # points that each image of the stereo pair sees
+    track_keyframes: int  # keyframes after which a track ends; 0: it goes on, and comes back when its point does
+    landmarks: int  # points of the world, for each keyframe
+    fixed: int  # older keyframes that take part with fixed poses
 
 
 CASES = {

@@ -25,17 +25,11 @@ MAGIC = 0x4241_4C31
 
 @dataclass(frozen=True)
 class Case:
-    """A problem to solve.
+    """A problem to solve."""
 
-    Attributes:
-        bal: start values and observations, sorted by point.
-        n_fixed: the first so many cameras are held.
-        size: free parameters a camera: 6 (pose) or 9 (pose, f, k1, k2).
-    """
-
-    bal: BalProblem
-    n_fixed: int
-    size: int
+    bal: BalProblem  # start values and observations, sorted by point
+    n_fixed: int  # the first so many cameras are held
+    size: int  # free parameters a camera: 6 (pose) or 9 (pose, f, k1, k2)
 
 
 def sorted_by_point(bal: BalProblem) -> BalProblem:

@@ -28,25 +28,15 @@ _DUBROVNIK = "gtsam-dubrovnik-small/"
 
 @dataclass(frozen=True)
 class Problem:
-    """One problem under one loss.
+    """One problem under one loss."""
 
-    Attributes:
-        name: unique.
-        source: file or name that the case is made from; cases with the same source share their file.
-        make: from the data folder to the case.
-        loss: squared or huber (1 px).
-        sets: of quick, default, large.
-        family: with others of which the growth with size is fitted, or empty.
-        needs: file in the data folder, or empty.
-    """
-
-    name: str
-    source: str
-    make: Callable[[Path], Case]
-    loss: str
-    sets: tuple[str, ...] = ("default",)
-    family: str = ""
-    needs: str = ""
+    name: str  # unique
+    source: str  # file or name that the case is made from; cases with the same source share their file
+    make: Callable[[Path], Case]  # from the data folder to the case
+    loss: str  # squared or huber (1 px)
+    sets: tuple[str, ...] = ("default",)  # of quick, default, large
+    family: str = ""  # with others of which the growth with size is fitted, or empty
+    needs: str = ""  # file in the data folder, or empty
 
 
 def _window(n: int, loss: str, *sets: str) -> Problem:

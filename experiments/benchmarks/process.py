@@ -29,25 +29,15 @@ class Limits:
 
 @dataclass(frozen=True)
 class Run:
-    """What one run gave.
+    """What one run gave."""
 
-    Attributes:
-        trace: (seconds since the start of the set-up, objective); empty on failure.
-        total_s: until the solver returned.
-        start_mb: memory of the process with the problem loaded.
-        peak_mb: the most memory it had.
-        checked: objective of its solution, recomputed by ba_node's numpy kernels; NaN on failure.
-        version: of the solver.
-        reason: why it stopped, or why it failed.
-    """
-
-    trace: tuple[tuple[float, float], ...] = ()
-    total_s: float = math.nan
-    start_mb: float = math.nan
-    peak_mb: float = math.nan
-    checked: float = math.nan
-    version: str = ""
-    reason: str = ""
+    trace: tuple[tuple[float, float], ...] = ()  # (seconds since the start of the set-up, objective); empty on failure
+    total_s: float = math.nan  # until the solver returned
+    start_mb: float = math.nan  # memory of the process with the problem loaded
+    peak_mb: float = math.nan  # the most memory it had
+    checked: float = math.nan  # objective of its solution, recomputed by ba_node's numpy kernels; NaN on failure
+    version: str = ""  # of the solver
+    reason: str = ""  # why it stopped, or why it failed
 
 
 def run(solver: Solver, file: Path, case: Case, loss: str, limits: Limits) -> Run:

@@ -22,29 +22,17 @@ ROOT = FOLDER.parents[1]
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver in one configuration.
+    """A solver in one configuration."""
 
-    Attributes:
-        name: for tables.
-        command: what starts it, without the arguments of trace.py.
-        config: its --config.
-        threads: its --threads.
-        max_observations: larger problems are left out (None: none are).
-        sizes: parameters a camera that it can leave free.
-        needs_in_front: it drops points behind a camera, so it takes part only where none starts there.
-        quick: takes part in --quick.
-        printed: its trace is what it prints, with fewer digits.
-    """
-
-    name: str
-    command: tuple[str, ...]
-    config: str = ""
-    threads: int = 1
-    max_observations: int | None = None
-    sizes: tuple[int, ...] = (6, 9)
-    needs_in_front: bool = False
-    quick: bool = True
-    printed: bool = False
+    name: str  # for tables
+    command: tuple[str, ...]  # what starts it, without the arguments of trace.py
+    config: str = ""  # its --config
+    threads: int = 1  # its --threads
+    max_observations: int | None = None  # larger problems are left out (None: none are)
+    sizes: tuple[int, ...] = (6, 9)  # parameters a camera that it can leave free
+    needs_in_front: bool = False  # it drops points behind a camera, so it takes part only where none starts there
+    quick: bool = True  # takes part in --quick
+    printed: bool = False  # its trace is what it prints, with fewer digits
 
     def refuses(self, case: Case, behind: bool) -> str:
         """Return why it takes no part in a problem, or an empty string."""

@@ -36,19 +36,12 @@ _LONG_AFTER_THREE_S = 0.5
 
 @dataclass
 class Result:
-    """What one solver gave on one problem.
+    """What one solver gave on one problem."""
 
-    Attributes:
-        solver: its name.
-        runs: one a repeat; those that failed have no trace.
-        refused: why it took no part, or empty.
-        faults: how its objectives differ from ours.
-    """
-
-    solver: str
-    runs: list[Run] = field(default_factory=list)
-    refused: str = ""
-    faults: list[str] = field(default_factory=list)
+    solver: str  # its name
+    runs: list[Run] = field(default_factory=list)  # one a repeat; those that failed have no trace
+    refused: str = ""  # why it took no part, or empty
+    faults: list[str] = field(default_factory=list)  # how its objectives differ from ours
 
     @property
     def good(self) -> list[Run]:

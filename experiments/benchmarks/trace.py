@@ -16,16 +16,11 @@ from experiments.benchmarks.problem_file import Case, read_case
 
 @dataclass
 class Recorder:
-    """The clock, the memory and the trace of one run. It starts when the problem is in memory.
+    """The clock, the memory and the trace of one run. It starts when the problem is in memory."""
 
-    Attributes:
-        began: clock at the start of the set-up, s.
-        start_mb: memory of the process then.
-        trace: (seconds since began, objective) after each iteration; the first row is the start.
-    """
-
-    began: float = field(default_factory=time.perf_counter)
-    start_mb: float = field(default_factory=lambda: memory_mb("VmRSS"))
+    began: float = field(default_factory=time.perf_counter)  # clock at the start of the set-up, s
+    start_mb: float = field(default_factory=lambda: memory_mb("VmRSS"))  # memory of the process then
+    # (seconds since began, objective) after each iteration; the first row is the start
     trace: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, objective: float) -> None:

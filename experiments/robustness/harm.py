@@ -31,23 +31,14 @@ _WORDS = (
 
 @dataclass(frozen=True)
 class SessionResult:
-    """The error of one session's trajectory, before and after.
+    """The error of one session's trajectory, before and after."""
 
-    Attributes:
-        folder: the files that it was read from.
-        keyframes: poses published.
-        input_m: translation RMSE of the front-end's poses after se3 alignment, m.
-        published_m: the same of what was published.
-        input_deg: rotation RMSE as it stands, deg: a path that is nearly straight aligns its roll badly.
-        published_deg: the same of what was published.
-    """
-
-    folder: Path
-    keyframes: int
-    input_m: float
-    published_m: float
-    input_deg: float
-    published_deg: float
+    folder: Path  # the files that it was read from
+    keyframes: int  # poses published
+    input_m: float  # translation RMSE of the front-end's poses after se3 alignment, m
+    published_m: float  # the same of what was published
+    input_deg: float  # rotation RMSE as it stands, deg: a path that is nearly straight aligns its roll badly
+    published_deg: float  # the same of what was published
 
     @property
     def harmless(self) -> bool:

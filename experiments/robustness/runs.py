@@ -51,21 +51,13 @@ class NameChoiceError(ValueError):
 
 @dataclass(frozen=True)
 class Task:
-    """A recording to be replayed.
+    """A recording to be replayed."""
 
-    Attributes:
-        table: FAULT_TABLE or OUTLIER_TABLE.
-        fault: name in FAULTS, or ``sound``.
-        rig: name in RIGS.
-        amount: of the fault.
-        seed: of world, noise and fault.
-    """
-
-    table: str
-    fault: str
-    rig: str
-    amount: float
-    seed: int
+    table: str  # FAULT_TABLE or OUTLIER_TABLE
+    fault: str  # name in FAULTS, or ``sound``
+    rig: str  # name in RIGS
+    amount: float  # of the fault
+    seed: int  # of world, noise and fault
 
     @property
     def key(self) -> str:

@@ -30,13 +30,9 @@ _WORST_OF = ("condition_c", "condition_b", "condition_s", "lone_points")
 
 
 class Watched(NumpyKernels):
-    """The kernels in numpy, and a row of metrics for every linear system.
+    """The kernels in numpy, and a row of metrics for every linear system."""
 
-    Attributes:
-        rows: the metrics, by name.
-    """
-
-    rows: list[dict[str, float]]
+    rows: list[dict[str, float]]  # the metrics, by name
 
     def damp(self, kind: str, mu: float) -> NumpySystem:
         """Add damping and eliminate, as ever; look at what is inverted."""

@@ -24,21 +24,13 @@ class DataError(ValueError):
 
 @dataclass(frozen=True)
 class DataSet:
-    """One data set.
+    """One data set."""
 
-    Attributes:
-        files: where it may be below the folder of data sets; the first one that is there is read.
-        sha256: of the text as it is published, of the first file.
-        sizes: cameras, points, observations; of KITTI keyframes, points, stereo observations.
-        source: where to get it.
-        needed: False if experiments go on without it.
-    """
-
-    files: tuple[str, ...]
-    sha256: str
-    sizes: tuple[int, int, int]
-    source: str
-    needed: bool = False
+    files: tuple[str, ...]  # where it may be below the folder of data sets; the first one that is there is read
+    sha256: str  # of the text as it is published, of the first file
+    sizes: tuple[int, int, int]  # cameras, points, observations; of KITTI keyframes, points, stereo observations
+    source: str  # where to get it
+    needed: bool = False  # False if experiments go on without it
 
     def path(self, folder: Path) -> Path | None:
         """Return the file, None if it is not there."""

@@ -12,44 +12,26 @@ from experiments.thesis.tasks import Task
 
 @dataclass(frozen=True)
 class Case:
-    """A row of a table, a curve of a picture.
+    """A row of a table, a curve of a picture."""
 
-    Attributes:
-        label: as in the thesis where it has the same.
-        task: what is run.
-        thesis: its figures, by metric (metrics.py).
-        note: what departs from the thesis.
-        versus: label of the case that its times are compared with; empty for the first.
-    """
-
-    label: str
-    task: Task
-    thesis: Mapping[str, float | str] = field(default_factory=dict)
-    note: str = ""
-    versus: str = ""
+    label: str  # as in the thesis where it has the same
+    task: Task  # what is run
+    thesis: Mapping[str, float | str] = field(default_factory=dict)  # its figures, by metric (metrics.py)
+    note: str = ""  # what departs from the thesis
+    versus: str = ""  # label of the case that its times are compared with; empty for the first
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table of the thesis with the figures that belong to it, or figures alone.
+    """A table of the thesis with the figures that belong to it, or figures alone."""
 
-    Attributes:
-        name: ``3.8`` for a table, ``fig-3.1`` for figures alone, a word for what the thesis does not have.
-        title: what is compared.
-        cases: rows.
-        columns: metrics of the table.
-        figures: of the thesis that it repeats.
-        plots: names in plots.PLOTS.
-        note: what is to be known.
-    """
-
-    name: str
-    title: str
-    cases: tuple[Case, ...]
-    columns: tuple[str, ...]
-    figures: tuple[str, ...] = ()
-    plots: tuple[str, ...] = ()
-    note: str = ""
+    name: str  # ``3.8`` for a table, ``fig-3.1`` for figures alone, a word for what the thesis does not have
+    title: str  # what is compared
+    cases: tuple[Case, ...]  # rows
+    columns: tuple[str, ...]  # metrics of the table
+    figures: tuple[str, ...] = ()  # of the thesis that it repeats
+    plots: tuple[str, ...] = ()  # names in plots.PLOTS
+    note: str = ""  # what is to be known
 
     def case(self, label: str) -> Case:
         """Return the case of a label, the first one for an empty label."""

@@ -15,17 +15,11 @@ Record = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Metric:
-    """What a column shows.
+    """What a column shows."""
 
-    Attributes:
-        title: head of the column.
-        form: format of a number.
-        is_time: compared as a ratio to the first row, as absolute times differ by machine.
-    """
-
-    title: str
-    form: str = ".3g"
-    is_time: bool = False
+    title: str  # head of the column
+    form: str = ".3g"  # format of a number
+    is_time: bool = False  # compared as a ratio to the first row, as absolute times differ by machine
 
 
 METRICS: dict[str, Metric] = {

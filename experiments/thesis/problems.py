@@ -48,15 +48,10 @@ NAMES = (LADYBUG, LADYBUG_PART, LADYBUG_ONE, *(name for name in DATA_SETS if nam
 
 @dataclass(frozen=True)
 class Posed:
-    """A problem, and the truth about it where it is known.
+    """A problem, and the truth about it where it is known."""
 
-    Attributes:
-        problem: with its start.
-        truth: true state, None for real data.
-    """
-
-    problem: Problem
-    truth: State | None
+    problem: Problem  # with its start
+    truth: State | None  # true state, None for real data
 
 
 class Library:

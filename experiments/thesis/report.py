@@ -39,15 +39,10 @@ _STYLE = (
 
 @dataclass(frozen=True)
 class Section:
-    """An experiment that has been run.
+    """An experiment that has been run."""
 
-    Attributes:
-        experiment: what it is.
-        records: of its cases, by label.
-    """
-
-    experiment: Experiment
-    records: Mapping[str, Record]
+    experiment: Experiment  # what it is
+    records: Mapping[str, Record]  # of its cases, by label
 
     @property
     def metrics(self) -> dict[str, dict[str, float | str | None]]:

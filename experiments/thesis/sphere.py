@@ -34,27 +34,16 @@ _TRIES = 200
 
 @dataclass(frozen=True)
 class SphereData:
-    """A problem and the truth about it.
+    """A problem and the truth about it."""
 
-    Attributes:
-        cameras: (n, 9) true rotation vector, translation, f (px), k1, k2.
-        points: (m, 3) true.
-        start_cameras: (n, 9) where a solver begins.
-        start_points: (m, 3) where a solver begins.
-        camera_index: (l,) image of each observation.
-        point_index: (l,) point of each observation, ascending.
-        uv: (l, 2) measured, px from the centre of the image, u to the right, v upwards.
-        outlier: (l,) True where an observation was displaced.
-    """
-
-    cameras: FloatArray
-    points: FloatArray
-    start_cameras: FloatArray
-    start_points: FloatArray
-    camera_index: IntArray
-    point_index: IntArray
-    uv: FloatArray
-    outlier: BoolArray
+    cameras: FloatArray  # (n, 9) true rotation vector, translation, f (px), k1, k2
+    points: FloatArray  # (m, 3) true
+    start_cameras: FloatArray  # (n, 9) where a solver begins
+    start_points: FloatArray  # (m, 3) where a solver begins
+    camera_index: IntArray  # (l,) image of each observation
+    point_index: IntArray  # (l,) point of each observation, ascending
+    uv: FloatArray  # (l, 2) measured, px from the centre of the image, u to the right, v upwards
+    outlier: BoolArray  # (l,) True where an observation was displaced
 
 
 def project(cameras: FloatArray, points: FloatArray, camera: IntArray, point: IntArray) -> FloatArray:

@@ -35,15 +35,10 @@ _LINEAR = 1e-9
 
 @dataclass(frozen=True)
 class StepErrors:
-    """What the search found for one kind of parameter.
+    """What the search found for one kind of parameter."""
 
-    Attributes:
-        kind: of KINDS.
-        errors: (len(POWERS),) relative error of forward differences with each step.
-    """
-
-    kind: str
-    errors: FloatArray
+    kind: str  # of KINDS
+    errors: FloatArray  # (len(POWERS),) relative error of forward differences with each step
 
     @property
     def linear(self) -> bool:

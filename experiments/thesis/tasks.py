@@ -28,23 +28,14 @@ _NAMES_IN_KEYS = {"loss_scale_px": "loss_scale", "kernels": "backend", "inner_it
 
 @dataclass(frozen=True)
 class Run:
-    """A solve.
+    """A solve."""
 
-    Attributes:
-        problem: name in problems.py.
-        method: name in core/methods.py.
-        settings: changes to it, as of ``--set``.
-        iterations: steps that are taken, as the thesis counts; rejected ones come on top, up to as many again.
-        images: of these the reprojections before and after are kept.
-        kernels: name in variants.VARIANTS, empty for the solver's own.
-    """
-
-    problem: str
-    method: str
-    settings: tuple[str, ...] = ()
-    iterations: int = 50
-    images: tuple[int, ...] = ()
-    kernels: str = ""
+    problem: str  # name in problems.py
+    method: str  # name in core/methods.py
+    settings: tuple[str, ...] = ()  # changes to it, as of ``--set``
+    iterations: int = 50  # steps that are taken, as the thesis counts; rejected ones come on top, up to as many again
+    images: tuple[int, ...] = ()  # of these the reprojections before and after are kept
+    kernels: str = ""  # name in variants.VARIANTS, empty for the solver's own
 
     def options(self) -> SolverOptions:
         """Return the method with its changes."""
@@ -71,17 +62,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Measure:
-    """Something that is measured beside the loop.
+    """Something that is measured beside the loop."""
 
-    Attributes:
-        problem: name in problems.py.
-        what: name in measures.MEASURES.
-        settings: for it.
-    """
-
-    problem: str
-    what: str
-    settings: tuple[str, ...] = ()
+    problem: str  # name in problems.py
+    what: str  # name in measures.MEASURES
+    settings: tuple[str, ...] = ()  # for it
 
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""

@@ -122,19 +122,12 @@ class Breaks:
 
 @dataclass(frozen=True)
 class Claim:
-    """What the thesis says.
+    """What the thesis says."""
 
-    Attributes:
-        text: the claim.
-        where: in the thesis.
-        checks: what has to be so.
-        remark: what is to be known about it.
-    """
-
-    text: str
-    where: str
-    checks: tuple[Check, ...]
-    remark: str = ""
+    text: str  # the claim
+    where: str  # in the thesis
+    checks: tuple[Check, ...]  # what has to be so
+    remark: str = ""  # what is to be known about it
 
 
 @dataclass(frozen=True)

@@ -164,9 +164,9 @@ def test_silence_completes_the_newest_and_keeps_what_waits() -> None:
     assert not ready(backend)
     backend.flush()
     assert ready(backend)
-    assert not backend.rejected
+    assert not backend.map.rejected
     backend.flush(final=True)
-    assert backend.rejected == {"unknown_keyframe": 1}
+    assert backend.map.rejected == {"unknown_keyframe": 1}
 
 
 def test_keyframes_that_came_while_solving_are_solved_together() -> None:
@@ -237,7 +237,7 @@ def test_a_higher_session_begins_a_new_map_and_keeps_the_rig() -> None:
     assert len(backend.scene.keyframes) == 12
     assert second[-1].trajectory.position.tobytes() == first[-1].trajectory.position.tobytes()
     backend.add(stream[1])
-    assert backend.rejected == {"stale_session": 1}
+    assert backend.map.rejected == {"stale_session": 1}
 
 
 def test_an_unsolved_keyframe_is_solved_before_its_session_ends() -> None:
@@ -271,7 +271,7 @@ def test_a_malformed_message_does_not_end_a_session() -> None:
     assert not backend.completes(bad)
     backend.add(bad)
     assert len(backend.scene.keyframes) == 12
-    assert sum(backend.rejected.values()) == 1
+    assert sum(backend.map.rejected.values()) == 1
 
 
 def test_another_rig_is_used_from_the_next_session_on() -> None:
@@ -282,7 +282,7 @@ def test_another_rig_is_used_from_the_next_session_on() -> None:
     backend = Backend(Config())
     for measurement in (*stream, other):
         backend.add(measurement)
-    assert backend.rejected == {"rig_changed": 1}
+    assert backend.map.rejected == {"rig_changed": 1}
     for keyframe in [m for m in stream if isinstance(m, Keyframe)][:2]:
         backend.add(in_session(keyframe, 1))
     assert backend.scene.cameras is not None
@@ -334,7 +334,7 @@ def test_stamps_that_jump_back_begin_a_new_session_with_the_same_result() -> Non
     assert words in backend.scene.log.warnings["clock_jump"]
     assert [session for session, _ in backend.finished] == [backend.scene.session_id], "the front-end's id stays"
     assert len(backend.scene.keyframes) == SMALL["keyframes"]
-    assert not backend.rejected
+    assert not backend.map.rejected
     np.testing.assert_array_equal(again[-1].trajectory.position, first[-1].trajectory.position)
 
 
@@ -344,7 +344,7 @@ def test_stamps_within_the_bound_are_sorted(limit_s: float) -> None:
     keyframes = [m for m in stream if isinstance(m, Keyframe)]
     backend = Backend(Config().with_values({"scene.max_reorder_s": limit_s}))
     replay(backend, [m for m in stream if m is not keyframes[2]] + [keyframes[2]])
-    assert backend.map_index == 0
+    assert backend.map.index == 0
     assert backend.notices["reordered"] == 1
     stamps = backend.scene.keyframes.stamp_ns[backend.scene.order]
     assert (np.diff(stamps) > 0).all()

@@ -120,7 +120,7 @@ def test_a_rig_that_cannot_be_used_is_counted_also_with_poses_of_the_camera() ->
     backend = Backend(Config().with_values({"frames.poses_of": "camera"}))
     rig = data_of().rig
     backend.add(dataclasses.replace(rig, position=np.full_like(rig.position, np.nan)))
-    assert backend.rejected == {"bad_rig": 1}
+    assert backend.map.rejected == {"bad_rig": 1}
 
 
 @pytest.mark.parametrize("baseline_m", [0.2, 0.0], ids=["stereo", "one camera"])

@@ -232,7 +232,7 @@ def test_what_another_version_adds_or_lacks_is_passed_over(known: Backend) -> No
     del content.facts["report"]["reason"]
     target = backend()
     target.take_over(unpack(content, target.config.scene))
-    assert "no_such_reason" not in target.rejected
+    assert "no_such_reason" not in target.map.rejected
 
 
 def test_a_map_that_is_larger_than_allowed_is_cut_when_more_comes(known: Backend) -> None:

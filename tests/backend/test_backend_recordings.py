@@ -60,7 +60,7 @@ def test_real_stereo_recording(shared_data: Path) -> None:
     backend = Backend(Config())
     with BagReader(shared_data / "kitti-stereo-vo" / "kitti_stereo.mcap") as bag:
         last = replay(backend, (measurement for _, _, measurement in bag.measurements()))
-    assert not backend.rejected
+    assert not backend.map.rejected
     assert len(last.trajectory) == 26
     assert backend.scene.keyframes.refined.all()
     # 1/2 sum |r|^2 = 17069.622 over 32756 coordinates, as another library computes it from the data behind the bag.

@@ -52,7 +52,7 @@ def test_one_message_of_a_higher_session_does_not_end_the_map(what: str, session
     parts[6] += changed([USELESS[what]()], session_id=session)
     played = Played(joined(parts))
     assert (played.ids, played.finished) == (all_ids(), [])
-    assert played.rejected.total() == 1, played.rejected
+    assert played.map.rejected.total() == 1, played.map.rejected
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
@@ -61,7 +61,7 @@ def test_one_message_of_a_higher_session_does_not_open_the_first_one(what: str) 
     stray = changed([USELESS[what]()], session_id=7)
     played = Played([data().rig, *stray, *messages()[1:]])
     assert (played.ids, played.scene.session_id) == (all_ids(), 0)
-    assert played.rejected.total() == 1, played.rejected
+    assert played.map.rejected.total() == 1, played.map.rejected
 
 
 def test_tracks_and_guesses_that_come_before_the_first_keyframe_of_their_session_are_used() -> None:
@@ -70,16 +70,16 @@ def test_tracks_and_guesses_that_come_before_the_first_keyframe_of_their_session
     for stream in (backwards, [*messages(), *changed(backwards[1:], session_id=4)]):
         played = Played(stream)
         assert played.ids == all_ids()
-        assert not played.rejected
+        assert not played.map.rejected
         assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
 def test_what_waits_for_a_session_is_bounded() -> None:
     ahead = changed([t for both in data().tracks for t in both], session_id=9)
     played = Played([*messages(), *ahead], final=False, settings={"scene.max_pending": 10})
-    assert played.rejected["unknown_keyframe"] == len(ahead) - 10
+    assert played.map.rejected["unknown_keyframe"] == len(ahead) - 10
     played.flush(final=True)
-    assert played.rejected["unknown_keyframe"] == len(ahead)
+    assert played.map.rejected["unknown_keyframe"] == len(ahead)
     assert "of session 9, which no keyframe began" in played.rejection_notes[-1]
 
 
@@ -98,7 +98,7 @@ def test_messages_of_a_session_before_are_refused_while_the_current_goes_on() ->
     old, new = groups(), [changed(part, session_id=5) for part in groups()]
     played = Played(joined([*new[:6], old[3], new[6], old[4], old[5], *new[7:]]))
     assert (played.ids, played.finished, played.scene.session_id) == (all_ids(), [], 5)
-    assert set(played.rejected) == {"stale_session"}
+    assert set(played.map.rejected) == {"stale_session"}
 
 
 @pytest.mark.parametrize("frame", ["map", "/map", "odom2"])
@@ -107,7 +107,7 @@ def test_a_keyframe_in_another_frame_is_turned_away(frame: str) -> None:
     parts[5] = changed(parts[5], frame_id=frame)
     played = Played(joined(parts))
     assert (played.ids, played.finished) == (all_ids()[:5] + all_ids()[6:], [])
-    assert played.rejected == {"frame_changed": 1, "unknown_keyframe": 2}
+    assert played.map.rejected == {"frame_changed": 1, "unknown_keyframe": 2}
     assert f"is in frame '{frame.lstrip('/')}', those before in 'odom'" in played.scene.log.warnings["frame_changed"]
 
 
@@ -116,7 +116,7 @@ def test_a_frame_that_changes_for_good_begins_a_session() -> None:
     played = Played(joined([*parts[:8], *(changed(part, frame_id="map") for part in parts[8:])]))
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [8]
     assert (played.ids, played.scene.frame_id) == (all_ids()[8:], "map")
-    assert not played.rejected
+    assert not played.map.rejected
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_frame_without_a_name_for_tf2_is_said(frame: str, words: str) -> None:
 def test_frames_that_are_named_with_and_without_a_slash_are_one() -> None:
     parts = [changed(part, frame_id=("odom", "/odom", "")[i % 3]) for i, part in enumerate(groups())]
     played = Played(joined(parts))
-    assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
+    assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
 
 
 def test_an_empty_frame_is_no_fault_where_a_parameter_names_it() -> None:
@@ -184,7 +184,7 @@ def test_silence_begins_a_session_where_the_first_keyframe_comes_again_with_its_
         played = Played([*messages(), *again], final=False, settings=near)
         played.flush()
         assert len(played.scene.keyframes) == (1 if begins else N)
-        assert not played.rejected
+        assert not played.map.rejected
 
 
 def test_the_same_stream_gives_the_same_bits_though_keyframes_are_held() -> None:

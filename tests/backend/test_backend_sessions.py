@@ -35,7 +35,7 @@ def test_a_clock_that_is_set_back_begins_a_session_with_nothing_lost(first: str)
     played = Played(joined([*parts[:8], *(stamped(part, -HOUR) for part in parts[8:])]))
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [8]
     assert played.ids == all_ids()[8:]
-    assert not played.rejected
+    assert not played.map.rejected
     assert len(played.scene.observations) == sum(len(t.track_id) for both in data().tracks[8:] for t in both)
     assert len(played.estimates) == N, "one solve for each keyframe"
     alone = Played(joined(parts[8:]))
@@ -69,7 +69,7 @@ def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
         return
     assert played.ids == all_ids()[:at] + all_ids()[at + 1 :]
     assert played.finished == []
-    assert played.rejected == {"bad_stamp": 1, "unknown_keyframe": 2}
+    assert played.map.rejected == {"bad_stamp": 1, "unknown_keyframe": 2}
     assert f"keyframe {all_ids()[at]} is" in played.scene.log.warnings["bad_stamp"]
     before, after = played.errors_m
     assert after < 0.6 * before, f"{before:.4f} -> {after:.4f} m"
@@ -85,7 +85,7 @@ def test_a_first_keyframe_with_an_absurd_stamp_costs_itself_alone(name: str) -> 
         return
     assert played.ids == all_ids()[1:]
     assert played.finished == []
-    assert played.rejected == {"bad_stamp": 1}
+    assert played.map.rejected == {"bad_stamp": 1}
 
 
 @pytest.mark.parametrize("at_ns", [0, -5 * S, -(2**63)])
@@ -94,14 +94,14 @@ def test_a_first_keyframe_from_before_the_clock_was_set_costs_itself_alone(at_ns
     parts[0] = stamped(parts[0], at_ns=at_ns)
     played = Played(joined(parts))
     assert (played.ids, played.finished) == (all_ids()[1:], [])
-    assert played.rejected == {"bad_stamp": 1}
+    assert played.map.rejected == {"bad_stamp": 1}
 
 
 @pytest.mark.parametrize("pause_ns", [9 * S, 15 * S, HOUR, YEAR])
 def test_after_a_pause_the_map_goes_on(pause_ns: int) -> None:
     parts = groups()
     played = Played(joined([*parts[:8], *(stamped(part, pause_ns) for part in parts[8:])]))
-    assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
+    assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
     assert not played.scene.log.warnings
     same = undisturbed().scene.keyframes
     assert played.scene.keyframes.position.tobytes() == same.position.tobytes(), "what is held does not change a replay"
@@ -110,7 +110,7 @@ def test_after_a_pause_the_map_goes_on(pause_ns: int) -> None:
 def test_keyframes_that_are_always_far_apart_are_a_map() -> None:
     parts = groups()
     played = Played(joined(stamped(part, 60 * S * i) for i, part in enumerate(parts)))
-    assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
+    assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
 
 
 def test_two_clocks_by_turns_do_not_tear_the_map_to_pieces() -> None:
@@ -118,7 +118,7 @@ def test_two_clocks_by_turns_do_not_tear_the_map_to_pieces() -> None:
     played = Played(joined(part if i % 2 == 0 else stamped(part, -HOUR) for i, part in enumerate(parts)))
     assert played.finished == []
     assert played.ids == all_ids()[::2]
-    assert played.rejected["bad_stamp"] == N // 2
+    assert played.map.rejected["bad_stamp"] == N // 2
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -135,7 +135,7 @@ def test_two_clocks_mixed_at_random_give_few_sessions(seed: int) -> None:
 def test_a_keyframe_that_comes_late_by_less_than_the_bound_is_sorted_in() -> None:
     parts = groups()
     played = Played(joined([*parts[:4], *parts[5:9], parts[4], *parts[9:]]))
-    assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
+    assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
     assert played.notices["reordered"] == 1
 
 
@@ -156,14 +156,14 @@ def test_a_repeated_keyframe_changes_nothing(how: str, when: int, count: int) ->
         parts[when].append(REPEATS[how](keyframe))
     played = Played(joined(parts), settings={"scene.max_reorder_s": 1.0})
     assert (played.ids, played.finished) == (all_ids(), [])
-    assert played.rejected == {"duplicate_keyframe": count}
+    assert played.map.rejected == {"duplicate_keyframe": count}
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
 def test_every_message_twice_changes_nothing() -> None:
     played = Played([m for m in messages() for _ in range(2)])
     assert (played.ids, played.finished) == (all_ids(), [])
-    assert set(played.rejected) == {"duplicate_keyframe", "duplicate_observation"}
+    assert set(played.map.rejected) == {"duplicate_keyframe", "duplicate_observation"}
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
@@ -172,7 +172,7 @@ def test_a_recording_that_plays_again_begins_a_session_each_time(times: int) -> 
     played = Played([m for _ in range(times) for m in messages()], settings={"scene.max_reorder_s": 1.0})
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [N] * (times - 1)
     assert played.ids == all_ids()
-    assert not played.rejected
+    assert not played.map.rejected
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
     assert "plays again" in played.scene.log.warnings["clock_jump"]
 
@@ -184,7 +184,7 @@ def test_an_id_that_is_used_again_is_named_and_its_tracks_do_no_harm() -> None:
     parts[10] += [dataclasses.replace(data().keyframes[11], keyframe_id=reused), *others]
     played = Played(joined(parts))
     assert (played.ids, played.finished) == (all_ids(), [])
-    assert played.rejected["duplicate_keyframe"] == 1
+    assert played.map.rejected["duplicate_keyframe"] == 1
     assert f"keyframe {reused} is known already, " in played.scene.log.warnings["reused_id"]
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
@@ -200,7 +200,7 @@ def test_a_front_end_that_restarts_under_the_same_ids_is_not_refused_for_ever(sh
     played = Played([*messages(), *again])
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [N]
     assert played.ids == all_ids()
-    assert not played.rejected
+    assert not played.map.rejected
     assert "has the id of another keyframe: a new session begins" in played.scene.log.warnings["reused_id"]
 
 
@@ -211,13 +211,13 @@ def test_a_clock_that_is_set_back_by_less_than_the_bound_does_not_mix_two_maps(b
     played = Played(joined([*parts[:12], *(stamped(part, -back_ns) for part in parts[12:])]))
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [12]
     assert played.ids == all_ids()[12:]
-    assert not played.rejected
+    assert not played.map.rejected
 
 
 def test_a_block_of_keyframes_that_comes_late_is_sorted_in() -> None:
     parts = groups()
     played = Played(joined([*parts[:1], *parts[4:], *parts[1:4]]))
-    assert (played.ids, played.finished, dict(played.rejected)) == (all_ids(), [], {})
+    assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
 
 
 def test_a_short_recording_that_plays_again_is_no_duplicate() -> None:
@@ -225,7 +225,7 @@ def test_a_short_recording_that_plays_again_is_no_duplicate() -> None:
     played = Played([*messages(), *messages()])
     assert [len(estimate.trajectory) for _, estimate in played.finished] == [N]
     assert played.ids == all_ids()
-    assert not played.rejected
+    assert not played.map.rejected
 
 
 @pytest.mark.parametrize("count", [1, 4])
@@ -233,7 +233,7 @@ def test_keyframes_that_come_again_long_after_change_nothing(count: int) -> None
     again = [m for part in groups()[:count] for m in part]
     played = Played([*messages(), *again])
     assert (played.ids, played.finished) == (all_ids(), [])
-    assert played.rejected["duplicate_keyframe"] == count
+    assert played.map.rejected["duplicate_keyframe"] == count
     assert not played.scene.log.warnings
 
 

@@ -62,7 +62,7 @@ def test_sizes_stay_within_bounds_over_thousands_of_keyframes() -> None:
             estimate = backend.solve()
             assert estimate is not None
             assert np.isfinite(estimate.trajectory.position).all()
-        rejected += backend.rejected.total()
+        rejected += backend.map.rejected.total()
         largest.append(sizes(backend))
     assert rejected > ROUNDS * LENGTH / 2, f"{rejected} messages turned away: the test is to have many"
     n_obs = 2 * 40 * LIMITS["scene.max_keyframes"]

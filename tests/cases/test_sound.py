@@ -63,3 +63,13 @@ def test_drives_of_every_rig_and_lens(rig: str, lens: str, tmp_path: Path, run: 
     outcome = run(write(tmp_path, recording))
     is_silent(outcome)
     harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
+
+
+@pytest.mark.parametrize(("motion", "amount", "seed"), [("stands_still", 35.0, 39), ("hardly_moves", 1.0, 37)])
+def test_depths_tell_where_keyframes_are_not_apart(
+    motion: str, amount: float, seed: int, tmp_path: Path, run: Replay
+) -> None:
+    recording = spoiled(motion, "rgbd", amount, seed)
+    outcome = run(write(tmp_path, recording))
+    is_silent(outcome)
+    harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))

@@ -139,6 +139,15 @@ def test_warnings_that_follow_from_the_set_up_go() -> None:
     assert set(backend.scene.log.warnings) == {"setup"}
 
 
+def test_solutions_that_are_given_up_leave_a_correction() -> None:
+    """map -> odom goes on to be published: the identity, as the front-end's poses stand."""
+    backend = Backend(Config().with_values({"guard.check_setup": False}))
+    data = recording(wrong="turned 1 about x")
+    estimates = play(backend, data, keyframes=30)
+    assert estimates[-1].report.status is Status.HELD
+    same_as_input(estimates[-1], data)
+
+
 def test_elsewhere() -> None:
     """Work that is handed over blocks nothing, and its result counts for the session that it is of."""
     backend = Backend(Config())

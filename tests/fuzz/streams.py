@@ -18,13 +18,13 @@ from ba_node.io import ros_types
 from ba_node.io.mcap import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.conversion import (
-    INPUT_TYPES,
     guesses_message,
     keyframe_message,
     measurement_from_message,
     rig_message,
     tracks_message,
 )
+from ba_node.messages.topics import INPUT_TYPES
 from experiments.robustness.faults import RIGS, SOUND, spoiled
 
 _SETTINGS = {"solver.max_iterations": 3, "window.max_keyframes": 3, "scene.max_pending": 5, "scene.max_landmarks": 100}

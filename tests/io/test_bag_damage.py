@@ -17,7 +17,8 @@ from ba_node.io import ros_types
 from ba_node.io.bag_index import MAGIC
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
-from ba_node.messages.conversion import INPUT_TYPES, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import keyframe_message, rig_message, tracks_message
+from ba_node.messages.topics import INPUT_TYPES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -139,6 +140,22 @@ def test_a_recording_without_messages_is_an_error(tmp_path: Path) -> None:
     writer.finish()  # type: ignore[no-untyped-call]
     with pytest.raises(BagError, match="no message can be read: it was closed before anything was recorded"):
         read(tmp_path / "t.mcap", stream.getvalue())
+
+
+@pytest.mark.parametrize(
+    ("begin", "words"),
+    [
+        (b"\x28\xb5\x2f\xfd", "packed with zstd: unpack it, or name it .mcap.zstd"),
+        (b"\x1f\x8b\x08", "packed with gzip"),
+        (b"PK\x03\x04", "a zip archive"),
+        (b"#ROSBAG V2.0\n", "a recording of ROS 1: convert it"),
+        (b"something else", "magic bytes$"),
+    ],
+)
+def test_what_a_file_is_instead_is_named(begin: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "other.mcap").write_bytes(begin + bytes(100))
+    with pytest.raises(BagError, match=words), BagReader(tmp_path / "other.mcap"):
+        pass
 
 
 def test_unknown_compression_is_named(tmp_path: Path) -> None:

@@ -25,15 +25,14 @@ from ba_node.io import ros_types
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import (
-    INPUT_TYPES,
-    OUTPUT_TYPES,
     guesses_message,
     keyframe_message,
     measurement_from_message,
-    output_messages,
     rig_message,
     tracks_message,
 )
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate

@@ -16,7 +16,8 @@ from ba_node.config import Config
 from ba_node.io.bag_topics import NO_CHOICE, Chooser, TopicChoice, parse_topic
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses
-from ba_node.messages.conversion import INPUT_TYPES, guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.topics import INPUT_TYPES
 from ba_node.offline.replay import MapOptions, replay
 from ba_node.synthetic import SyntheticOptions, generate
 

@@ -19,14 +19,9 @@ from ba_node.io import ros_types
 from ba_node.io.bag_index import read_index
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.messages.conversion import (
-    INPUT_TYPES,
-    guesses_message,
-    keyframe_message,
-    output_messages,
-    rig_message,
-    tracks_message,
-)
+from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import INPUT_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Callable

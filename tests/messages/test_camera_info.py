@@ -12,7 +12,7 @@ import pytest
 
 from ba_node.core import cameras
 from ba_node.messages.camera_info import lens_of
-from ba_node.messages.conversion import ConversionError
+from ba_node.messages.factory import ConversionError
 
 K = [700.0, 0.0, 630.0, 0.0, 710.0, 390.0, 0.0, 0.0, 1.0]
 D = [-0.1, 0.02, 0.001, -0.002, 0.0]

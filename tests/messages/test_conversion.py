@@ -19,19 +19,16 @@ from ba_node.estimate import Cloud, Estimate, Poses, Status
 from ba_node.io.ros_types import decode
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import (
-    INPUT_TYPES,
-    OUTPUT_TYPES,
-    ConversionError,
     guesses_message,
     keyframe_message,
     measurement_from_message,
-    output_messages,
     rig_message,
-    stamp_ns_from_message,
     tracks_message,
 )
-from ba_node.messages.outputs import POINT_DTYPE
+from ba_node.messages.factory import ConversionError, stamp_ns_from_message
+from ba_node.messages.outputs import POINT_DTYPE, output_messages
 from ba_node.messages.report import Report, report_message
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,8 +20,8 @@ from ba_node.io.bal import read_bal
 from ba_node.io.mcap import BagReader
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.conversion import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.messages.outputs import POINT_DTYPE
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.offline.bal_timeline import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay

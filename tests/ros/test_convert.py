@@ -12,14 +12,14 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import (
-    INPUT_TYPES,
     guesses_message,
     keyframe_message,
     measurement_from_message,
-    output_messages,
     rig_message,
     tracks_message,
 )
+from ba_node.messages.outputs import output_messages
+from ba_node.messages.topics import INPUT_TYPES
 from ba_node.ros.convert import RclpyFactory, message_class
 
 FACTORY = RclpyFactory()

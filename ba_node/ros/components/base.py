@@ -23,64 +23,47 @@ in ``messages/topics.py``::
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ba_node.config import Config
+from ba_node.estimate import Estimate
+from ba_node.measurements import CameraRig
+from ba_node.messages.report import Report
+from ba_node.messages.topics import Topic
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.config import Config
-    from ba_node.estimate import Estimate
-    from ba_node.measurements import CameraRig
-    from ba_node.messages.report import Report
-    from ba_node.messages.topics import Topic
-    from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
-    from ba_node.ros.worker.inbox import Inbox
-    from ba_node.ros.worker.worker import Notice, Outcome, Worker
+from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
+from ba_node.ros.worker.inbox import Inbox
+from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 
 @dataclass
 class Host:
-    """What the node lends its components, from configure to cleanup.
+    """What the node lends its components, from configure to cleanup."""
 
-    Attributes:
-        node: the rclpy node: names, clock, logger. Entities are made with the methods of Component.
-        config: the parameters as they are now.
-        inbox: where measurements and commands for the back-end go.
-        worker: the solver's thread.
-        deferred: brings work to the executor's thread, and knows the answers that clients wait for.
-        log: log a Notice, the same one not more often than every few seconds.
-        active: True between activate and deactivate.
-        ignoring: why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken.
-        counted: what this side of the inbox turned away, by reason; it goes into the report.
-        arrived: messages that came in, by topic; ignored ones too.
-        place_cameras: gives cameras the places that the parameters ask for; None: they have to wait.
-        tf: what becomes of the transform map -> odom, in words.
-        clock: what is wrong with simulated time, in words; empty if nothing is.
-        at_cleanup: what is undone when the node is cleaned up, last made first.
-        after_cleanup: what is undone a moment later: who was answered at cleanup must still hear it.
-        report: the last one, with its latency; None before the first.
-    """
-
-    node: Any
-    config: Config
-    inbox: Inbox
-    worker: Worker
-    deferred: DeferredAnswers
-    log: Callable[[Notice], None]
-    active: bool = False
+    node: Any  # the rclpy node: names, clock, logger. Entities are made with the methods of Component.
+    config: Config  # the parameters as they are now
+    inbox: Inbox  # where measurements and commands for the back-end go
+    worker: Worker  # the solver's thread
+    deferred: DeferredAnswers  # brings work to the executor's thread, and knows the answers that clients wait for
+    log: Callable[[Notice], None]  # log a Notice, the same one not more often than every few seconds
+    active: bool = False  # True between activate and deactivate
+    # why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken
     ignoring: set[str] = field(default_factory=lambda: {"inactive"})
+    # what this side of the inbox turned away, by reason; it goes into the report
     counted: Counter[str] = field(default_factory=Counter)
-    arrived: Counter[str] = field(default_factory=Counter)
+    arrived: Counter[str] = field(default_factory=Counter)  # messages that came in, by topic; ignored ones too
+    # gives cameras the places that the parameters ask for; None: they have to wait
     place_cameras: Callable[[CameraRig], CameraRig | None] = lambda rig: rig
-    tf: str = ""
-    clock: str = ""
-    report: Report | None = None
+    tf: str = ""  # what becomes of the transform map -> odom, in words
+    clock: str = ""  # what is wrong with simulated time, in words; empty if nothing is
+    report: Report | None = None  # the last one, with its latency; None before the first
+    # what is undone when the node is cleaned up, last made first
     at_cleanup: ExitStack = field(default_factory=ExitStack)
+    # what is undone a moment later: who was answered at cleanup must still hear it
     after_cleanup: ExitStack = field(default_factory=ExitStack)
 
 
@@ -106,19 +89,15 @@ class Component:
     def take(self, estimate: Estimate, newest: bool) -> None:
         """Take an estimate as it leaves the worker, after the report on it, oldest first; only while active.
 
-        Args:
-            estimate: of every solve, failed and skipped ones too (``estimate.report.status.usable``).
-            newest: the last one of those that came together that replaces the map (``estimate.replaces_map``): what
-                replaces the ones before needs only this.
+        Failed and skipped solves give one too. ``newest`` is the last of those that came together that replaces the
+        map: what replaces the ones before needs only this.
         """
 
     def publisher(self, topic: Topic, profile: Any = None, **options: Any) -> Any:
         """Make a publisher that is destroyed at cleanup. Its profile can be overridden by parameters.
 
-        Args:
-            topic: of messages/topics.py.
-            profile: quality of service; None for that of the topic.
-            options: ``matched``, called when a subscriber comes or goes; others as of rclpy.
+        Its quality of service is ``profile``, or that of the topic. Options are ``matched``, called when a subscriber
+        comes or goes, and those of rclpy.
 
         Raises:
             LookupError: there is no message class of its type.

@@ -30,7 +30,6 @@ class Diagnostics(Component):
     """Publishes in every state but unconfigured: that data is ignored is worth knowing too."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise and start the timer."""
         super().__init__(host)
         self._factory = RclpyFactory()
         self._keyframes, self._heard_s = 0, time.monotonic()

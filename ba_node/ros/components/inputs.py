@@ -21,7 +21,6 @@ class Inputs(Component):
     """The inputs of the node. Cameras are taken at any time: they may be sent only once, before the node is active."""
 
     def __init__(self, host: Host) -> None:
-        """Subscribe."""
         super().__init__(host)
         self._rigs: dict[str, bytes] = {}
         self._last: dict[str, Any] = {}

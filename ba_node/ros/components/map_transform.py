@@ -4,19 +4,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from rclpy.clock import Clock, ClockType
 
+from ba_node.estimate import Estimate
 from ba_node.messages.topics import TF, TOPICS
 from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, log
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Estimate
 
 _DEPTH = 100
 _NS = 1e9

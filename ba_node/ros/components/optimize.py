@@ -14,22 +14,19 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.action import CancelResponse, GoalResponse
 
+from ba_node.backend import Backend, Optimization
 from ba_node.config import find
-from ba_node.estimate import Status
+from ba_node.estimate import Estimate, Iteration, Status
 from ba_node.messages.topics import ACTIONS
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.rclpy_compat.actions import DeferredAction
 from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Answer
-
-if TYPE_CHECKING:
-    from ba_node.backend import Backend, Optimization
-    from ba_node.estimate import Estimate, Iteration
 
 _NAME = "optimize"
 _METHODS = find("solver.method").choices
@@ -59,7 +56,6 @@ class Optimize(Component):
     """The action of the node."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise."""
         super().__init__(host)
         self._goal: _Goal | None = None
         self._type = message_class(ACTIONS[_NAME].type_name)

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ba_node.estimate import Status
+from ba_node.estimate import Estimate, Status
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.report import LatencyReport, Report, report_message
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS
@@ -16,10 +16,7 @@ from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, Throttle, log
 from ba_node.ros.worker.latency import Sliding
-
-if TYPE_CHECKING:
-    from ba_node.estimate import Estimate
-    from ba_node.ros.worker.worker import Outcome
+from ba_node.ros.worker.worker import Outcome
 
 _LOG_PERIOD_S = 5.0
 # Leave first; their age is in the report that follows.
@@ -32,18 +29,11 @@ class Activity:
     """Say in one line every few seconds how it goes: rate, residuals, latency, and what became of the solutions."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._since_s: float | None = None
         self._counts: Counter[str] = Counter()
 
     def line(self, report: Report, now_s: float, period_s: float) -> str:
-        """Take in the report of a solve; return the line if one is due, else an empty text.
-
-        Args:
-            report: with latencies.
-            now_s: by a clock that does not jump, s.
-            period_s: time between two lines; 0 for none.
-        """
+        """Take in the report of a solve; return the line if one is due, every ``period_s`` (0: never), else nothing."""
         if self._since_s is None:
             self._since_s = now_s
         self._counts[_WORDS.get(report.solve.status, "taken")] += 1
@@ -70,7 +60,6 @@ class Publishing(Component):
     """
 
     def __init__(self, host: Host) -> None:
-        """Advertise."""
         super().__init__(host)
         self._factory = RclpyFactory()
         self._throttle, self._activity = Throttle(_LOG_PERIOD_S), Activity()

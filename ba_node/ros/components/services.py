@@ -9,21 +9,18 @@ Files are written and read by a thread of their own, one at a time.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ba_node.backend import Backend, MapContent
+from ba_node.estimate import Estimate
 from ba_node.io.map_file import MapFileError, load_map, write_map
 from ba_node.io.map_folder import MapPathError, path_in_folder
 from ba_node.messages.topics import SERVICES
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import message_class
 from ba_node.ros.rclpy_compat.deferred import Answer, DeferredService
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.backend import Backend, MapContent
-    from ba_node.estimate import Estimate
 
 _PAUSED = "paused"
 
@@ -32,7 +29,6 @@ class Services(Component):
     """The services of the node."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise."""
         super().__init__(host)
         self._busy: Answer | None = None
         begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}

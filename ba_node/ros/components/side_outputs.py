@@ -4,25 +4,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ba_node.estimate import Extras
+from ba_node.backend import Backend
+from ba_node.estimate import Estimate, Extras
 from ba_node.messages.markers import marker_array, no_markers
 from ba_node.messages.topics import ON_DEMAND, TOPICS
 from ba_node.messages.transforms import covariance_messages
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
 
-if TYPE_CHECKING:
-    from ba_node.backend import Backend
-    from ba_node.estimate import Estimate
-
 
 class SideOutputs(Component):
     """The topics of ``ON_DEMAND``. Who subscribes gets the next solve; the last markers are kept for those after."""
 
     def __init__(self, host: Host) -> None:
-        """Advertise, and be told who comes and goes."""
         super().__init__(host)
         self._factory = RclpyFactory()
         self._asked = Extras()

@@ -49,7 +49,6 @@ class Silence(Component):
     """Warn when ``node.silence_s`` has passed without keyframes or tracks."""
 
     def __init__(self, host: Host) -> None:
-        """Begin to wait."""
         super().__init__(host)
         self._waits = {topic: _Wait() for topic in _NEEDED}
         # Silence is silence also while /clock stands still.
@@ -86,7 +85,6 @@ class SimulatedTime(Component):
     """Warn when the node is to go by simulated time (``use_sim_time``) and none comes, or it stands still."""
 
     def __init__(self, host: Host) -> None:
-        """Begin to watch, by a clock that never stands still."""
         super().__init__(host)
         self._wait = _Wait()
         self.timer(_CHECK_S, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))

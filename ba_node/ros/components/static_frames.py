@@ -5,17 +5,15 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ba_node.measurements import CameraRig
 from ba_node.messages.topics import TF_STATIC, TOPICS
 from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.log import Severity, log
 from ba_node.ros.worker.worker import Notice
-
-if TYPE_CHECKING:
-    from ba_node.measurements import CameraRig
 
 _DEPTH = 100
 
@@ -24,7 +22,6 @@ class StaticFrames(Component):
     """Places cameras. A rig waits until the way from the body to every camera of it is known."""
 
     def __init__(self, host: Host) -> None:
-        """Subscribe, if the places are to come from there."""
         super().__init__(host)
         self._tree = StaticTree()
         self._waiting: CameraRig | None = None

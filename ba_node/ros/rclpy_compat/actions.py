@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rclpy.action import ActionServer
 from rclpy.action.server import GoalEvent, GoalStatus
@@ -14,9 +15,6 @@ from rclpy.task import Future
 
 from ba_node.ros.rclpy_compat.private import part
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 # Feedback comes in bursts where iterations are short.
 _FEEDBACK_DEPTH = 100
 
@@ -24,13 +22,8 @@ _FEEDBACK_DEPTH = 100
 class DeferredAction:
     """An action server; all its callbacks, and its methods, are for the executor's thread.
 
-    Args:
-        node: whose action it is.
-        kind: type of the action.
-        name: its name.
-        decide: called with each request; returns whether it becomes a goal.
-        accept: called with the handle of each goal, which it passes to :meth:`begin`, and later to :meth:`finish`.
-        cancel: called with the handle of a goal that is to end.
+    ``decide`` returns whether a request becomes a goal; ``accept`` gets the handle of each goal, which it passes to
+    :meth:`begin`, and later to :meth:`finish`; ``cancel`` that of a goal that is to end.
     """
 
     def __init__(

@@ -17,6 +17,7 @@ import contextlib
 import threading
 import traceback
 from collections import deque
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
@@ -25,12 +26,10 @@ from ba_node.ros.log import Severity, fault, log, printable
 from ba_node.ros.rclpy_compat.private import RCLError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from ba_node.ros.components.base import Component, Host
 
-    # Sends success, message and further fields of an answer, on the executor's thread.
-    Send = Callable[[bool, str, dict[str, Any]], None]
+# Sends success, message and further fields of an answer, on the executor's thread.
+Send = Callable[[bool, str, dict[str, Any]], None]
 
 CLEANED_UP = "the node was cleaned up meanwhile"
 DEAD = "the solver's thread has ended: start the node anew"
@@ -39,35 +38,25 @@ _LOOK_S = 0.5
 
 
 class DeferredAnswers:
-    """Runs things on the executor's thread, in order, and keeps the answers that clients wait for; until cleanup.
-
-    Attributes:
-        left_waiting: clients that were answered because of a cleanup, when that was.
-    """
+    """Runs things on the executor's thread, in order, and keeps the answers that clients wait for; until cleanup."""
 
     def __init__(self, node: Any, solver_lives: Callable[[], bool]) -> None:
-        """Make what wakes the executor."""
         self._node = node
         self._solver_lives = solver_lives
         self._actions: deque[Callable[[], None]] = deque()
         self._expected: dict[Answer, None] = {}
         self._lock = threading.Lock()
-        self._open = True
-        self.left_waiting = 0
+        self.open = True
+        self.left_waiting = 0  # clients that were answered because of a cleanup, when that was
         self._guard = node.create_guard_condition(self._run)
         # Silence is no reason not to look, and /clock may stand still.
         self._timer = node.create_timer(_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    @property
-    def open(self) -> bool:
-        """Return False once the node was cleaned up."""
-        return self._open
 
     def expect(self, send: Send) -> Answer:
         """Return an answer that a client waits for; at cleanup and after it is sent at once."""
         answer = Answer(self, self._node, send)
         self._expected[answer] = None
-        if not self._open:
+        if not self.open:
             answer.send(success=False, message=CLEANED_UP)
         return answer
 
@@ -78,7 +67,7 @@ class DeferredAnswers:
     def call(self, action: Callable[[], None]) -> None:
         """Have something run on the executor's thread. May be called from any; after cleanup it does nothing."""
         with self._lock:
-            if not self._open:
+            if not self.open:
                 return
             self._actions.append(action)
             with contextlib.suppress(RCLError):  # then the timer finds it
@@ -87,7 +76,7 @@ class DeferredAnswers:
     def close(self) -> None:
         """Answer all who still wait, and go."""
         with self._lock:
-            self._open = False
+            self.open = False
         self._run()
         self.left_waiting = len(self._expected)
         self._give_up(CLEANED_UP)
@@ -158,13 +147,9 @@ class Answer:
 
 
 class DeferredService:
-    """A service that answers later.
+    """A service that answers later; its response has ``success`` and ``message``.
 
-    Args:
-        component: whose service it is.
-        kind: type of the service; its response has ``success`` and ``message``.
-        name: its name.
-        begin: called with each request and the answer to it; must not block.
+    ``begin`` is called with each request and the answer to it, and must not block.
     """
 
     def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Answer], None]) -> None:

@@ -17,31 +17,22 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sized
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sized
+from typing import Any
 
+from rclpy.context import Context
 from rclpy.event_handler import EventHandler
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
 
 from ba_node.ros.rclpy_compat.private import part
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rclpy.context import Context
-
 # Also how long a wait may take at most: one without events must end for one with them.
 EVENT_PERIOD_S = 0.1
 
 
 class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is not typed
-    """The executor of the node.
-
-    Args:
-        context: of rclpy; None for the default one.
-        clock: steady clock, s.
-    """
+    """The executor of the node."""
 
     # rclpy's own attribute: what ends a wait.
     _guard: Any

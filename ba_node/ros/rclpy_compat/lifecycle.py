@@ -11,16 +11,14 @@ can be configured anew.
 from __future__ import annotations
 
 import traceback
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
 from ba_node.ros.log import Severity, fault, log, printable
 from ba_node.ros.rclpy_compat.private import RCLError, part
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _SET = "rcl_interfaces/SetParametersResult"
 
@@ -45,7 +43,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
     """A lifecycle node whose transitions are the methods below; each may raise."""
 
     def __init__(self, node_name: str, **node_options: Any) -> None:
-        """Make the node, unconfigured."""
         super().__init__(node_name, **node_options)
         self._machine = part(self, "_state_machine", object, "a refused transition is told without what is possible")
         for service in self.services:
@@ -109,14 +106,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]  # rclpy is not typed
 
 
 def answering(node: Any, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return a callback that answers with a refusal, as far as the type of the response can say one, when it raises.
-
-    Args:
-        node: whose log hears of it.
-        name: of the service.
-        kind: class of its responses.
-        callback: takes request and response, returns the response.
-    """
+    """Return a callback that answers with a refusal, as far as the type of the response can say one, when it raises."""
 
     def answer(request: Any, response: Any) -> Any:
         try:

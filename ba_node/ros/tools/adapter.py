@@ -15,7 +15,8 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -24,14 +25,11 @@ from rclpy.node import Node
 
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
-from ba_node.messages.conversion import stamp_ns_from_message
+from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Throttle
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 NODE_NAME = "ba_adapter"
 CHANNELS = ("id", "camera", "u", "v")
@@ -84,18 +82,12 @@ def keyframe_from_odometry(odometry: Any, session_id: int) -> Keyframe:
 
 
 class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
-    """The converter node.
-
-    Attributes:
-        sent: keyframes that were sent on.
-        counted: what was dropped, by reason.
-    """
+    """The converter node."""
 
     def __init__(self, **node_options: Any) -> None:
-        """Subscribe and advertise."""
         super().__init__(NODE_NAME, **node_options)
-        self.sent = 0
-        self.counted: Counter[str] = Counter()
+        self.sent = 0  # keyframes that were sent on
+        self.counted: Counter[str] = Counter()  # what was dropped, by reason
         self._session_id = 0
         # By stamp, ns; the newest of them.
         self._features: dict[int, Any] = {}

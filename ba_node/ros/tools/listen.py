@@ -25,24 +25,13 @@ _POLL_S = 0.05
 
 
 class NodeListener:
-    """Subscribe to the outputs of a node in a ROS context of its own. Use it as a context manager.
-
-    Args:
-        node_name: full name of the node.
-        domain: ROS_DOMAIN_ID; None for that of the environment.
-
-    Attributes:
-        reports: ``ba_msgs/SolverReport`` of every solve, oldest first.
-        points: newest cloud as ``POINT_DTYPE`` records.
-        points_stamp_ns: its stamp, ns.
-        points_frame: its frame.
-    """
+    """Subscribe to the outputs of a node in a ROS context of its own. Use it as a context manager."""
 
     def __init__(self, node_name: str, domain: int | None = None) -> None:
-        self.reports: list[Any] = []
-        self.points: NDArray[np.void] = np.empty(0, dtype=POINT_DTYPE)
-        self.points_stamp_ns: int | None = None
-        self.points_frame = ""
+        self.reports: list[Any] = []  # ``ba_msgs/SolverReport`` of every solve, oldest first
+        self.points: NDArray[np.void] = np.empty(0, dtype=POINT_DTYPE)  # newest cloud as ``POINT_DTYPE`` records
+        self.points_stamp_ns: int | None = None  # its stamp, ns
+        self.points_frame = ""  # its frame
         self._node_name = node_name
         self._domain = domain
         self._poses: dict[int, tuple[int, NDArray[np.float64], NDArray[np.float64]]] = {}

@@ -16,8 +16,10 @@ import itertools
 import math
 import time
 from collections import Counter
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
@@ -30,10 +32,6 @@ from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
-    from pathlib import Path
 
 _WRONG_OPTIONS = (*ARGUMENT_ERRORS, InvalidNamespaceException)
 _POLL_S = 0.02
@@ -51,26 +49,18 @@ class PlayError(ValueError):
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """How to play.
+    """How to play."""
 
-    Attributes:
-        rate: times real time; 0 for as fast as the middleware takes it.
-        start_s: where to begin, from the first message on, s; latched messages from before are sent all the same.
-        rounds: how often to play; 0 for ever.
-        clock_hz: publish the time of the recording on /clock, so often a second of real time; 0 for not at all.
-        wait_s: how long to wait for a subscriber of each input of the node before the first message, s.
-        namespace: put in front of every topic.
-        topics: play only these; all if None.
-        ros_args: as on the command line, for example ("--ros-args", "-r", "keyframes:=front/keyframes").
-    """
-
-    rate: float = 1.0
-    wait_s: float = 10.0
+    rate: float = 1.0  # times real time; 0 for as fast as the middleware takes it
+    wait_s: float = 10.0  # how long to wait for a subscriber of each input of the node before the first message, s
+    # where to begin, from the first message on, s; latched messages from before are sent all the same
     start_s: float = 0.0
-    rounds: int = 1
+    rounds: int = 1  # how often to play; 0 for ever
+    # publish the time of the recording on /clock, so often a second of real time; 0 for not at all
     clock_hz: float = 0.0
-    namespace: str = ""
-    topics: Collection[str] | None = None
+    namespace: str = ""  # put in front of every topic
+    topics: Collection[str] | None = None  # play only these; all if None
+    # as on the command line, for example ("--ros-args", "-r", "keyframes:=front/keyframes")
     ros_args: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -82,38 +72,22 @@ class PlayOptions:
 
 @dataclass(frozen=True)
 class PlaySummary:
-    """What was played.
+    """What was played."""
 
-    Attributes:
-        published: messages by topic, as resolved.
-        skipped: type by topic of what this Python environment has no message class for.
-        unheard: topics that had no subscriber when play began.
-        unconfirmed: topics with messages that were not acknowledged in time.
-        duration_s: from the first message to the last, s.
-    """
-
-    published: Mapping[str, int]
-    skipped: Mapping[str, str]
-    unheard: tuple[str, ...]
-    unconfirmed: tuple[str, ...]
-    duration_s: float
-
-
-def _nothing(*_: object) -> None:
-    pass
+    published: Mapping[str, int]  # messages by topic, as resolved
+    skipped: Mapping[str, str]  # type by topic of what this Python environment has no message class for
+    unheard: tuple[str, ...]  # topics that had no subscriber when play began
+    unconfirmed: tuple[str, ...]  # topics with messages that were not acknowledged in time
+    duration_s: float  # from the first message to the last, s
 
 
 @dataclass(frozen=True)
 class Listener:
-    """Who is told about the play.
+    """Who is told about the play."""
 
-    Attributes:
-        progress: called with the number of messages done and of all messages.
-        notice: called with a line of text.
-    """
-
-    progress: Callable[[int, int], None] = field(default=_nothing)
-    notice: Callable[[str], None] = field(default=_nothing)
+    # called with the number of messages done and of all messages
+    progress: Callable[[int, int], None] = lambda *_: None
+    notice: Callable[[str], None] = lambda *_: None  # called with a line of text
 
 
 def play(bag: Path | str, options: PlayOptions = PlayOptions(), listener: Listener = Listener()) -> PlaySummary:

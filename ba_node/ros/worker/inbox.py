@@ -8,16 +8,14 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from ba_node.backend import Backend
+from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
-if TYPE_CHECKING:
-    from ba_node.backend import Backend
-    from ba_node.estimate import Estimate
-
 # What it returns is published.
-Command = Callable[["Backend"], "Estimate | None"]
+Command = Callable[[Backend], Estimate | None]
 
 # What is given up first when the inbox is full. A keyframe without some of its tracks still moves;
 # tracks without their keyframe, or anything without cameras, are worth nothing.
@@ -56,7 +54,7 @@ class Inbox:
         self._dropped = 0
         self._keyframes_received = 0
         self._keyframes_dropped = 0
-        self._closed = False
+        self.closed = False
 
     @property
     def dropped(self) -> int:
@@ -65,7 +63,6 @@ class Inbox:
             return self._dropped
 
     def __len__(self) -> int:
-        """Return how many measurements wait."""
         with self._changed:
             return sum(len(lane) for lane in self._lanes.values())
 
@@ -74,11 +71,6 @@ class Inbox:
         """Return what became of the keyframes so far."""
         with self._changed:
             return KeyframeCounts(self._keyframes_received, self._keyframes_dropped, len(self._lanes[Keyframe]))
-
-    @property
-    def closed(self) -> bool:
-        """Return True once :meth:`close` was called."""
-        return self._closed
 
     def put(self, measurement: Measurement, time_s: float) -> None:
         """Add a measurement; if that is one too many, drop the oldest of the kind that can best be spared."""
@@ -101,13 +93,13 @@ class Inbox:
     def close(self) -> None:
         """Wake the reader and let it know that nothing more will be asked of it."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
 
     def drain(self, timeout_s: float | None) -> list[Arrival]:
         """Return everything in order of arrival, after waiting for something; empty on timeout or when closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._occupied(), timeout_s)
+            self._changed.wait_for(lambda: self.closed or self._occupied(), timeout_s)
             lanes = [*self._lanes.values(), self._commands]
             waiting = sorted((item for lane in lanes for item in lane), key=lambda item: item[0])
             for lane in lanes:

@@ -7,12 +7,9 @@ Those that the back-end holds until others tell what they are wait too.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection
 
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from ba_node.backend import CurrentMap
+from ba_node.backend import CurrentMap
 
 Key = tuple[int, int]
 
@@ -29,7 +26,6 @@ class KeyframeAccounts:
     """
 
     def __init__(self) -> None:
-        """Start with nothing."""
         self.solved = self.coalesced = self.rejected = self.forgotten = self.refined = 0
         # Arrival of each keyframe by session and id, s.
         self._unsolved: dict[Key, float] = {}
@@ -56,12 +52,10 @@ class KeyframeAccounts:
         self.rejected += 1
 
     def close(self, current: CurrentMap, refined: Collection[int], held: Collection[Key] = ()) -> None:
-        """Close the accounts of a solve.
+        """Close the accounts of a solve, after which the map is ``current``.
 
-        Args:
-            current: the map after it.
-            refined: ids of those that took part, if it is usable.
-            held: session and id of those that the map does not have yet.
+        ``refined`` are ids of those that took part, if it is usable, ``held`` session and id of those that the map does
+        not have yet.
         """
         n_solved = 0
         for key in [key for key in self._unsolved if key not in held]:

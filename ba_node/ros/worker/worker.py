@@ -14,22 +14,16 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from ba_node.estimate import Estimate, SolveReport, Status
+from ba_node.backend import Backend, Check
+from ba_node.estimate import Estimate, Iteration, SolveReport, Status
 from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
+from ba_node.ros.worker.inbox import Arrival, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
-from ba_node.ros.worker.lag import Lag
-from ba_node.ros.worker.latency import Budget
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ba_node.backend import Backend, Check
-    from ba_node.estimate import Iteration
-    from ba_node.ros.worker.inbox import Arrival, Inbox
+from ba_node.ros.worker.latency import Budget, Lag
 
 # Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
 _MAX_OUTPUTS = 20
@@ -43,50 +37,32 @@ _PATIENCE_S = 5.0
 
 @dataclass(frozen=True)
 class Notice:
-    """Something to log.
+    """Something to log."""
 
-    Attributes:
-        key: what it is about; the reader may limit how often each is logged.
-        text: one line, or several with a traceback.
-        is_error: a fault of ours, not of the input.
-    """
-
-    key: str
-    text: str
-    is_error: bool = False
+    key: str  # what it is about; the reader may limit how often each is logged
+    text: str  # one line, or several with a traceback
+    is_error: bool = False  # a fault of ours, not of the input
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solve gave; or what has been turned away since the last one, when there is no solve to tell it.
+    """What a solve gave; or what has been turned away since the last one, when there is no solve to tell it."""
 
-    Attributes:
-        report: of the solve, or of the last one.
-        queue: what has become of keyframes so far.
-        stamp_ns: of the newest keyframe, ns.
-        estimate: what the solve gave; None without one.
-        arrived_s: when its newest keyframe came in, by the worker's clock, s.
-    """
-
-    report: SolveReport
-    queue: QueueReport
-    stamp_ns: int
-    estimate: Estimate | None = None
-    arrived_s: float = 0.0
+    report: SolveReport  # of the solve, or of the last one
+    queue: QueueReport  # what has become of keyframes so far
+    stamp_ns: int  # of the newest keyframe, ns
+    estimate: Estimate | None = None  # what the solve gave; None without one
+    arrived_s: float = 0.0  # when its newest keyframe came in, by the worker's clock, s
 
 
 Output = Outcome | Notice
 
 
 class Worker:
-    """The solver's thread.
+    """The solver's thread; from :meth:`start` on the back-end is its alone.
 
-    Args:
-        backend: used by this thread alone from :meth:`start` on.
-        inbox: where measurements and commands come from.
-        settle_time_s: silence after which the newest keyframe is complete.
-        notify: called, on this thread, when :meth:`outputs` has something new.
-        clock: steady clock, s.
+    ``settle_time_s`` is the silence after which the newest keyframe is complete; ``notify`` is called, on this thread,
+    when :meth:`outputs` has something new; the clock (s) is a steady one.
     """
 
     def __init__(
@@ -257,29 +233,29 @@ class Worker:
 
     def _turned_away(self) -> object:
         """Return what a report says of things turned away."""
-        return self._backend.map_index, Counter(self._backend.rejected), tuple(self._backend.warnings)
+        return self._backend.map.index, Counter(self._backend.map.rejected), tuple(self._backend.map.warnings)
 
     def _report_rejections(self) -> None:
         """Report what was turned away since the last report, if no solve did."""
         now_s = self._clock()
         self._has_news = self._turned_away() != self._reported and bool(
-            self._backend.rejected or self._backend.warnings
+            self._backend.map.rejected or self._backend.map.warnings
         )
         if self._has_news and now_s - self._reported_s >= _REPORT_PERIOD_S:
             self._reported_s = now_s
-            self._put(Outcome(self._backend.report, self._queue(), self._backend.stamp_ns))
+            self._put(Outcome(self._backend.report, self._queue(), self._backend.map.stamp_ns))
 
     def _log_rejections(self) -> None:
-        rejected, notices = Counter(self._backend.rejected), []
-        if self._backend.map_index != self._logged_map:
-            self._logged_map, self._logged, self._warned = self._backend.map_index, Counter(), set()
+        rejected, notices = Counter(self._backend.map.rejected), []
+        if self._backend.map.index != self._logged_map:
+            self._logged_map, self._logged, self._warned = self._backend.map.index, Counter(), set()
         for reason in sorted(rejected - self._logged):
             notes = (note for note in reversed(self._backend.rejection_notes) if f"({reason} = " in note)
             notices.append(Notice(reason, next(notes, f"{reason} = {rejected[reason]}")))
         self._logged = rejected
         # What is a rejection too has been told with its count.
         heads = tuple(notice.text[:_HEAD] for notice in notices)
-        warnings = self._backend.warnings
+        warnings = self._backend.map.warnings
         news = [text for text in warnings if text not in self._warned]
         self._warned = set(warnings)
         notices += [Notice(f"warning {text[:_HEAD]}", text) for text in news if text[:_HEAD] not in heads]

@@ -45,30 +45,20 @@ _BASE: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One way in which a recording goes wrong.
+    """One way in which a recording goes wrong."""
 
-    Attributes:
-        about: what is wrong, for tables.
-        edit: what it does to the messages.
-        motion: what it does to the world and the path.
-        amounts: how much of it, the usual first.
-        rigs: the rigs that can have it, the usual first.
-        named: patterns (re, any case), each of which must be found in the messages to the user; none where the result
-            is to be as good as ever.
-        codes: exit codes of a replay that are right: 3 where there is something to look at, 2 where it may be refused.
-        least: share of the keyframe messages that have to be published.
-        changes: options of the recording that it needs.
-    """
-
-    about: str
-    edit: Edit | None = None
-    motion: Motion | None = None
-    amounts: tuple[float, ...] = (1.0,)
-    rigs: tuple[str, ...] = (STEREO, MONO)
+    about: str  # what is wrong, for tables
+    edit: Edit | None = None  # what it does to the messages
+    motion: Motion | None = None  # what it does to the world and the path
+    amounts: tuple[float, ...] = (1.0,)  # how much of it, the usual first
+    rigs: tuple[str, ...] = (STEREO, MONO)  # the rigs that can have it, the usual first
+    # patterns (re, any case), each of which must be found in the messages to the user; none where the result is to be
+    # as good as ever
     named: tuple[str, ...] = ()
+    # exit codes of a replay that are right: 3 where there is something to look at, 2 where it may be refused
     codes: tuple[int, ...] = (0, 3)
-    least: float = 1.0
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    least: float = 1.0  # share of the keyframe messages that have to be published
+    changes: Mapping[str, Any] = field(default_factory=dict)  # options of the recording that it needs
 
 
 _TWO = (STEREO,)

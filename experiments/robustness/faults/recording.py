@@ -28,17 +28,12 @@ M = TypeVar("M", CameraRig, Keyframe, FeatureTracks, LandmarkGuesses)
 
 @dataclass(frozen=True)
 class Recording:
-    """What a front-end published, and what was true.
+    """What a front-end published, and what was true."""
 
-    Attributes:
-        sound: the same recording without a fault.
-        timeline: topic (base name), time of recording in ns, measurement. A keyframe's own stamp may differ.
-        camera_info: fields of CameraInfo that a measurement does not have, for every camera; those of ``roi`` as a
-            mapping.
-    """
-
-    sound: SyntheticData
+    sound: SyntheticData  # the same recording without a fault
+    # topic (base name), time of recording in ns, measurement. A keyframe's own stamp may differ.
     timeline: tuple[Entry, ...]
+    # fields of CameraInfo that a measurement does not have, for every camera; those of ``roi`` as a mapping
     camera_info: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -27,6 +27,9 @@ class FakeMap:
 
     def __init__(self, backend: FakeBackend) -> None:
         self._backend = backend
+        self.rejected: Counter[str] = Counter()
+        self.index, self.stamp_ns = 0, 0
+        self.warnings: tuple[str, ...] = ()
 
     @property
     def solved_count(self) -> int:
@@ -44,9 +47,6 @@ class FakeBackend:
 
     def __init__(self) -> None:
         self.added: list[Measurement] = []
-        self.rejected: Counter[str] = Counter()
-        self.map_index, self.stamp_ns = 0, 0
-        self.warnings: tuple[str, ...] = ()
         self.refused: deque[Measurement] = deque(maxlen=5)
         self.held: list[Keyframe] = []
         self.report = SolveReport()
@@ -79,8 +79,8 @@ class FakeBackend:
             self.refused.append(self.refuses)
             self.refuses = None
         if any(measurement.keyframe_id == keyframe.keyframe_id for keyframe in self.window):
-            self.rejected["duplicate_keyframe"] += 1
-            note = f"keyframe {measurement.keyframe_id}; dropped (duplicate_keyframe = {self.rejected.total()})"
+            self.map.rejected["duplicate_keyframe"] += 1
+            note = f"keyframe {measurement.keyframe_id}; dropped (duplicate_keyframe = {self.map.rejected.total()})"
             self.rejection_notes.append(note)
             self.refused.append(measurement)
             return
