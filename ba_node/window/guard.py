@@ -8,7 +8,8 @@
   A step further off is taken where it is what the solve began with (an earlier solve found it, or the tracks did, see
   ``arrival.py``), or where several solves agree on it and the tracks that span it bear it out: so a loop may close.
   Where half the steps are off, or all are too long or turn too far by one factor, no track helps: the cameras or the
-  depths are not what they are said to be, and fit each other all the same.
+  depths are not what they are said to be, and fit each other all the same. Where much of what is seen moves, half as
+  much is too far.
 - **Better**: it explains some tracks, most of which took no part, no worse than the front-end's poses do, for all
   cameras together and for each alone (``trial.py``).
 
@@ -18,7 +19,7 @@ taken follow the front-end by the correction of the last one that was (``Scene.p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -43,6 +44,8 @@ _MIN_SPANNING = 10
 _SPANNING_SHARE = 0.5
 # A point that so many keyframes agree on ties them together.
 _TIED = 3
+# By how much bounds narrow where much of what is seen moves, or seems to.
+_NARROW = 0.5
 # If more of the keyframes would have to be held one by one, it is the solution that is wrong.
 _MAX_HELD_SHARE = 0.25
 
@@ -64,6 +67,8 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     assert found.state is not None and found.explained is not None
     trust = trust or Trust()
     config = trust.bounds(config)
+    if selection.much_moves:
+        config = _narrowed(config)
     gate = config.tracks.outlier_px or np.inf
     agrees = found.norms <= gate
     share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
@@ -83,6 +88,14 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     if reason:
         return Verdict(reason, health, systematic=True)
     return compared.verdict(health, trust.confirmed(config.frames.gate_confirmations))
+
+
+def _narrowed(config: Config) -> Config:
+    """Return parameters by which the steps as a whole have to be nearer to the front-end's."""
+    typical, scale = config.guard.max_typical_sigmas, config.guard.max_scale_error
+    return replace(
+        config, guard=replace(config.guard, max_typical_sigmas=_NARROW * typical, max_scale_error=_NARROW * scale)
+    )
 
 
 def _misfit(selection: Selection, state: State, agrees: BoolArray, config: Config) -> str:

@@ -15,6 +15,11 @@ somewhat off too, most of all those that were not refined yet: where the best th
 the window or of such a keyframe, its residuals are divided by how many times they do.
 
 What moves sits out the solve that it is found in, and is no point of the map. It is judged anew before each.
+
+Where much is found to move more does that is not found, as what moves slowly or was placed by few views. Then solutions
+follow it, and explain it well. Or nothing moves, and the calibration is wrong: what contradicts it is taken for moving.
+So there the front-end's steps count as they are stated (``odometry.py``), and a solution may differ less from them
+(``guard.py``).
 """
 
 from __future__ import annotations
@@ -41,6 +46,8 @@ _MANY = 50
 _RANK = 0.3
 _NOISE_AT_RANK = 0.845
 _KNOWN = 10
+# So large a share of the observations of points with a place is much.
+_MUCH = 0.1
 
 
 def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: str = "auto") -> BoolArray:
@@ -67,6 +74,13 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     again = native_kernels.residual_norms(doubted, at, kernels) / off.take(doubted.observations.keyframe)
     found[found] = _leaves_more_than_noise(doubted, again)
     return found
+
+
+def much(problem: Problem, moves: BoolArray) -> bool:
+    """Return True if a large share of what is seen moves; points without a place, (n_pt,) NaN, do not count."""
+    views = np.bincount(problem.observations.point, minlength=problem.n_points)
+    placed = ~np.isnan(problem.start.points[:, 0])
+    return bool(np.sum(views[moves & placed]) > _MUCH * np.sum(views[placed]))
 
 
 def _off(problem: Problem, norms: FloatArray, unrefined: BoolArray) -> FloatArray:

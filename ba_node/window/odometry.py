@@ -17,7 +17,9 @@ turns on the spot), and for the scale of one camera, the steps do. The loss is C
 images by far, as where the front-end has jumped, pulls at nothing. Once the standard deviations are known to be right
 the loss is wider, for all steps that are not wild belong to that distribution, and keep tracks on moving objects from
 carrying a keyframe along. It is widest in a young map that sees much: nothing but the steps tells there what moves.
-Rotation and translation have a loss each, so that a wrong one does not release the other.
+Where much of what is seen moves, refined steps may follow it and tell nothing; there the standard deviations are those
+stated, and the loss is the widest too, but where depths are measured. Rotation and translation have a loss each, so
+that a wrong one does not release the other.
 """
 
 from __future__ import annotations
@@ -77,12 +79,17 @@ def ties(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray
 
 
 def factors(
-    scene: Scene, config: OdometryConfig, problem: Problem, keyframes: IntArray, turned: Turns | None = None
+    scene: Scene,
+    config: OdometryConfig,
+    problem: Problem,
+    keyframes: IntArray,
+    turned: Turns | None = None,
+    much_moves: bool = False,
 ) -> tuple[RelativePoses, ...]:
     """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
 
     ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
-    beside the front-end's.
+    beside the front-end's; ``much_moves`` if a large share of what is seen does.
     """
     tied = np.flatnonzero(ties(scene, config, keyframes))
     free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
@@ -90,14 +97,15 @@ def factors(
         return ()
     many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= _MANY_OBSERVATIONS
     stated = _front_end(scene, config, keyframes, tied)
-    inflated = _inflated(scene, config, keyframes, many, stated)
+    much_moves = much_moves and not len(problem.observations.depth_m)
+    inflated = None if much_moves else _inflated(scene, config, keyframes, many, stated)
     steps = stated if inflated is None else inflated
     if turned is not None:
         rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
     width = 1.0 if inflated is None else _WIDE
-    if inflated is None and many.all():
+    if inflated is None and (much_moves or many.all()):
         width = _WIDEST
     return steps.factors(free, width * config.loss_scale)
 

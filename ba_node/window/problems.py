@@ -138,7 +138,7 @@ def determined(
     static = ~moves.take(obs.point)
     views = np.bincount(obs.point[first], minlength=n_pt)
     shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
-    known = np.bincount(obs.keyframe[first & usable & static & placed.take(obs.point)], minlength=n_kf)
+    known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
     # Several cameras, or depths, place points where nothing moves: if they place few, that is for the guard to say.
     metric = len(problem.cameras.model) > 1 or bool(np.isfinite(obs.depth_m).any())
     mostly = np.full(n_kf, True) if metric else known >= _LEAST_PLACED * shared

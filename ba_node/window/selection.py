@@ -55,6 +55,7 @@ class Selection:
     window: IntArray  # rows of all keyframes of the window, those held out included, oldest first
     lost: IntArray  # rows of landmarks that have a position which their views contradict; they sit this solve out
     moving: BoolArray  # (n_pt,) points on objects that move, see ``moving.py``; not in the problem, but for their start
+    much_moves: bool  # they are a large share of what is seen
     origin: FloatArray  # (3,) of the problem in the map, m
     unscaled: IntArray  # see ``gauge.Gauge``
     tried: IntArray  # points whose tracks a solution is tried on, see ``trial.py``
@@ -115,6 +116,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     moves = _moving(scene, part, norms, config)
+    much_moves = moving.much(part.problem, moves)
     least = config.guard.min_points if config.guard.enabled else 2
     kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
@@ -124,7 +126,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     is_new[window] = True
     is_old = ~is_new[part.keyframes]
     if is_old.all():
-        return "no keyframe of the window sees enough points that a second image sees from another place"
+        return "no keyframe of the window sees enough points that another image sees from elsewhere, by rays that meet"
     obs, table = part.problem.observations, scene.keyframes
     track_id = scene.landmarks.track_id[part.landmarks]
     tried, aside = trial.choose(track_id, obs.point[usable], config.guard.held_out_tracks)
@@ -134,7 +136,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     active = some_observations(part.problem, np.flatnonzero(inlier))
     held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
     active = dataclasses.replace(active, fixed=held.fixed)
-    factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned)
+    factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
     return Selection(
         problem=dataclasses.replace(active, factors=factors),
         observations=obs,
@@ -146,6 +148,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         window=window,
         lost=lost,
         moving=moves,
+        much_moves=much_moves,
         origin=part.origin,
         unscaled=held.unscaled,
         tried=tried,
