@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,15 +120,15 @@ def jumped(stream: Stream, at: int, shift: Iterable[float], turn: float, stays: 
 
 WRONG_RIGS: dict[str, tuple[str, Callable[[CameraRig], CameraRig], str]] = {
     "baseline reversed": ("stereo", reversed_baseline, "observations agree"),
-    "cameras swapped": ("stereo", swapped, "of the observations of camera 1 agree"),
+    "cameras swapped": ("stereo", swapped, "observations (of camera 1 )?agree"),
     "extrinsics inverted": ("stereo", inverted, "observations agree"),
     "extrinsics of one camera inverted": ("one camera", inverted, "by rays that meet"),
     "second camera pitched by 1 degree": ("stereo", turned(0, 1.0), "observations agree"),
     "second camera yawed by 0.3 degrees": ("stereo", turned(1, 0.3), "as long as the front-end's"),
     "second camera yawed by -1 degree": ("stereo", turned(1, -1.0), "as long as the front-end's"),
     "second camera rolled by 1 degree": ("stereo", turned(2, 1.0), "camera 0 alone"),
-    "focal length 20 % short, stereo": ("stereo", zoomed(0.8), "half its steps"),
-    "focal length 20 % long, stereo": ("stereo", zoomed(1.2), "half its steps"),
+    "focal length 20 % short, stereo": ("stereo", zoomed(0.8), "focal length|half its steps|off the front-end's"),
+    "focal length 20 % long, stereo": ("stereo", zoomed(1.2), "focal length|half its steps|off the front-end's"),
     "focal length 20 % short, one camera": ("one camera", zoomed(0.8), ""),
     "focal length 20 % long, one camera": ("one camera", zoomed(1.2), ""),
     "focal length 20 % short, depth": ("depth", zoomed(0.8), "off the front-end's"),
@@ -146,7 +147,7 @@ def test_a_wrong_rig_does_no_harm(name: str) -> None:
     assert after <= 1.001 * before, f"{before:.4f} -> {after:.4f} m"
     # Where hardly a track has a place there is no solution that could be held.
     text = backend.scene.log.warnings.get("held", last.report.reason)
-    assert words in text, text
+    assert re.search(words, text), text
 
 
 @pytest.mark.parametrize(("factor", "words"), [(1000.0, "measured depths agree"), (1.2, "as long as the front-end's")])
