@@ -16,8 +16,18 @@ import os
 import warnings
 from typing import Any
 
+
+def usable(module: Any) -> Any:
+    """Return the compiled kernels if they were built from this version of the sources; otherwise None, with a warning."""
+    if hasattr(module, "use_target"):
+        return module
+    text = f"{module.__file__} was built from another version of ba_node: install ba_node again (here: make setup)"
+    warnings.warn(f"{text}; numpy does its work, some ten times slower", RuntimeWarning, stacklevel=3)
+    return None
+
+
 try:
-    kernels: Any = importlib.import_module("ba_node.native._kernels")
+    kernels: Any = usable(importlib.import_module("ba_node.native._kernels"))
 except ImportError:
     kernels = None
 

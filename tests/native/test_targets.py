@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -211,3 +212,10 @@ def test_the_stub_has_what_the_module_has() -> None:
     for name, node in classes.items():
         stubbed = [each.name for each in node.body if isinstance(each, ast.FunctionDef)]
         assert public(dir(getattr(native.kernels, name))) == public(stubbed), name
+
+
+def test_kernels_of_another_version_are_left_alone() -> None:
+    old = types.ModuleType("_kernels")
+    old.__file__ = "_kernels.so"
+    with pytest.warns(RuntimeWarning, match=r"_kernels.so was built from another version .* install ba_node again"):
+        assert native.usable(old) is None
