@@ -18,7 +18,7 @@ from typing import Any
 
 
 def usable(module: Any) -> Any:
-    """Return the compiled kernels if they were built from this version of the sources; otherwise None, with a warning."""
+    """Return the compiled kernels if they were built from this version of the sources; else None, with a warning."""
     if hasattr(module, "use_target"):
         return module
     text = f"{module.__file__} was built from another version of ba_node: install ba_node again (here: make setup)"
