@@ -40,6 +40,8 @@ from ba_node.core.problem import Problem, State
 _ROUNDING = 1e-11
 # A keyframe with a larger share (unit vector) in an undetermined direction is unknown itself.
 _SHARE = 1e-4
+# So many of the last poses are looked at for the weakest: of the newest keyframes, where these are oldest first.
+_NEWEST = 5
 
 
 def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
@@ -69,7 +71,7 @@ def pose_covariances(problem: Problem, state: State, options: SolverOptions, con
 
 
 def weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
-    """Return the standard deviations of the least determined of the free poses, in their worst directions.
+    """Return the standard deviations of the least determined of the last free poses, in their worst directions.
 
     Each is that of a pose with all others held exact, and with noise as stated by sigma_px: a lower bound. Factors
     count.
@@ -89,9 +91,10 @@ def weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOpt
     system = kernels.damp("none", 0.0)
     if system.side != "points":
         return unknown
-    tangent = _inverses(system.diagonal_blocks()[0])
+    tangent = _inverses(system.diagonal_blocks()[0][-_NEWEST:])
+    newest = np.flatnonzero(~problem.fixed)[-_NEWEST:]
     # The body is at p = -R't, and moves by p x dphi - dt.
-    _, position = geometry.inverse(state.rotation[~problem.fixed], state.translation[~problem.fixed])
+    _, position = geometry.inverse(state.rotation[newest], state.translation[newest])
     moves = np.concatenate([geometry.hat(position), np.broadcast_to(-np.eye(3), (len(position), 3, 3))], axis=2)
     both = np.stack([moves @ tangent @ np.swapaxes(moves, 1, 2), tangent[:, :3, :3]])
     if not np.isfinite(both).all():

@@ -126,7 +126,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     is_new[window] = True
     is_old = ~is_new[part.keyframes]
     if is_old.all():
-        return "no keyframe of the window sees enough points that another image sees from elsewhere, by rays that meet"
+        return "no keyframe of the window sees enough points that others see from another place, by rays that meet"
     obs, table = part.problem.observations, scene.keyframes
     track_id = scene.landmarks.track_id[part.landmarks]
     tried, aside = trial.choose(track_id, obs.point[usable], config.guard.held_out_tracks)

@@ -316,7 +316,7 @@ def test_reasons_for_nothing_to_solve() -> None:
         "no camera rig yet: nothing is known about the cameras",
         "one keyframe only: nothing to refine against",
         "one keyframe only: nothing to refine against",
-        "no keyframe of the window sees enough points that another image sees from elsewhere, by rays that meet",
+        "no keyframe of the window sees enough points that others see from another place, by rays that meet",
     ]
 
 
