@@ -113,7 +113,7 @@ def _number(rows: IntArray, n: int) -> IntArray:
 MIN_OBSERVATIONS = 4
 # Of the tracks that a keyframe shares with others this share has to have a place where one camera sees them. If only
 # few have, nothing shows parallax, and they are mismatches or worse.
-_LEAST_PLACED = 0.3
+_LEAST_PLACED = 0.15
 
 
 def determined(
