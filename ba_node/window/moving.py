@@ -40,8 +40,10 @@ _LARGE = 3.0
 # So many residuals of a track, and that share of them, are larger.
 _LEAST_LARGE = 2
 _LARGE_SHARE = 0.4
-# With fewer observations a keyframe, poses are not known well enough to tell.
+# With fewer observations a keyframe, or fewer keyframes, poses are not known well enough to tell: most of what seems to
+# move in a young map stands.
 _MANY = 50
+_LEAST_KEYFRAMES = 8
 # The residual of this rank tells how far off a keyframe begins, if so many are known; and what noise has at this rank.
 _RANK = 0.3
 _NOISE_AT_RANK = 0.845
@@ -60,7 +62,8 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     """
     point = problem.observations.point
     # Where most poses are the front-end's alone, as after a burst of keyframes, none is known well enough to tell.
-    if len(point) < _MANY * problem.n_keyframes or np.count_nonzero(unrefined) > 1 + problem.n_keyframes // 2:
+    young = problem.n_keyframes < _LEAST_KEYFRAMES or np.count_nonzero(unrefined) > 1 + problem.n_keyframes // 2
+    if young or len(point) < _MANY * problem.n_keyframes:
         return np.zeros(problem.n_points, bool)
     norms = np.where(np.isnan(problem.start.points[:, 0]).take(point), np.inf, norms)
     off = _off(problem, norms, unrefined)
