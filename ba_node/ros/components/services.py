@@ -33,7 +33,9 @@ class Services(Component):
         self._busy: Answer | None = None
         begin = {"reset": self._reset, "pause": self._pause, "save_map": self._save, "load_map": self._load}
         for name, command in SERVICES.items():
-            DeferredService(self, message_class(command.type_name), f"~/{name}", begin[name])
+            service = DeferredService(host.deferred, message_class(command.type_name), f"~/{name}", begin[name])
+            # Who is answered at cleanup must still hear it.
+            host.after_cleanup.callback(service.destroy)
 
     def _reset(self, _request: Any, answer: Answer) -> None:
         def reset(backend: Backend) -> Estimate:

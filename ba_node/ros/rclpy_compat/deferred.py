@@ -18,15 +18,12 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
 from ba_node.ros.log import Severity, fault, log, printable
 from ba_node.ros.rclpy_compat.private import RCLError
-
-if TYPE_CHECKING:
-    from ba_node.ros.components.base import Component, Host
 
 # Sends success, message and further fields of an answer, on the executor's thread.
 Send = Callable[[bool, str, dict[str, Any]], None]
@@ -41,7 +38,7 @@ class DeferredAnswers:
     """Runs things on the executor's thread, in order, and keeps the answers that clients wait for; until cleanup."""
 
     def __init__(self, node: Any, solver_lives: Callable[[], bool]) -> None:
-        self._node = node
+        self.node = node
         self._solver_lives = solver_lives
         self._actions: deque[Callable[[], None]] = deque()
         self._expected: dict[Answer, None] = {}
@@ -54,7 +51,7 @@ class DeferredAnswers:
 
     def expect(self, send: Send) -> Answer:
         """Return an answer that a client waits for; at cleanup and after it is sent at once."""
-        answer = Answer(self, self._node, send)
+        answer = Answer(self, self.node, send)
         self._expected[answer] = None
         if not self.open:
             answer.send(success=False, message=CLEANED_UP)
@@ -80,8 +77,8 @@ class DeferredAnswers:
         self._run()
         self.left_waiting = len(self._expected)
         self._give_up(CLEANED_UP)
-        self._node.destroy_guard_condition(self._guard)
-        self._node.destroy_timer(self._timer)
+        self.node.destroy_guard_condition(self._guard)
+        self.node.destroy_timer(self._timer)
 
     def _run(self) -> None:
         """Do what was asked for; a fault in one action costs that one."""
@@ -92,7 +89,7 @@ class DeferredAnswers:
         try:
             action()
         except Exception as error:
-            log(self._node, Severity.ERROR, f"{fault(error)}; going on\n{traceback.format_exc()}")
+            log(self.node, Severity.ERROR, f"{fault(error)}; going on\n{traceback.format_exc()}")
 
     def _look(self) -> None:
         self._run()
@@ -152,27 +149,29 @@ class DeferredService:
     ``begin`` is called with each request and the answer to it, and must not block.
     """
 
-    def __init__(self, component: Component, kind: Any, name: str, begin: Callable[[Any, Answer], None]) -> None:
+    def __init__(self, answers: DeferredAnswers, kind: Any, name: str, begin: Callable[[Any, Answer], None]) -> None:
+        self._answers = answers
         self._begin = begin
         self._kind = kind
-        self._host: Host = component.host
-        self._service = self._host.node.create_service(kind, name, lambda request, _response: request)
+        self._service = answers.node.create_service(kind, name, lambda request, _response: request)
         self._send = self._service.send_response
         # The executor passes on to it what the callback returns, with the address of the caller.
         self._service.send_response = self._receive
-        # Who is answered at cleanup must still hear it.
-        self._host.after_cleanup.callback(self._host.node.destroy_service, self._service)
+
+    def destroy(self) -> None:
+        """End the service; nobody who still waits hears anything after that."""
+        self._answers.node.destroy_service(self._service)
 
     def _receive(self, request: Any, header: Any) -> None:
         def send(success: bool, message: str, fields: dict[str, Any]) -> None:
             self._send(self._kind.Response(success=success, message=message, **fields), header)
-            log(self._host.node, Severity.INFO if success else Severity.WARNING, message)
+            log(self._answers.node, Severity.INFO if success else Severity.WARNING, message)
 
-        answer = self._host.deferred.expect(send)
+        answer = self._answers.expect(send)
         if answer.sent:
             return
         try:
             with answer.guarded():
                 self._begin(request, answer)
         except Exception:
-            log(self._host.node, Severity.ERROR, f"{self._service.srv_name}: {traceback.format_exc()}")
+            log(self._answers.node, Severity.ERROR, f"{self._service.srv_name}: {traceback.format_exc()}")
