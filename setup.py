@@ -210,6 +210,16 @@ setup(
     # Exact versions for development are in requirements/.
     extras_require={
         "test": ["hypothesis", "mcap-ros2-support", "pytest", "pytest-timeout"],
+        # Optional parts, each of which says what to install where its library is missing.
+        "front_end": ["poselib"],
+        "report": ["plotly"],
+        "tune": ["optuna"],
+        "fleet": ["distributed", "fsspec"],
+        "geo": ["pymap3d"],
+        "mpi": ["mpi4py"],
+        "colmap": ["pycolmap"],
+        "view": ["foxglove-sdk"],
+        "docs": ["furo", "sphinx"],
         # Solvers that `make bench` compares with; each is left out where it is missing.
         "bench": ["g2opy", "gtsam", "pycolmap"],
         "lint": ["mypy", "ruff", "types-PyYAML", "types-tqdm"],
