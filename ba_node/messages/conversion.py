@@ -48,9 +48,9 @@ def measurement_from_message(type_name: str, msg: Any) -> Measurement:
     if type_name == INPUT_TYPES["landmark_guesses"]:
         return _guesses(msg)
     if type_name == INPUT_TYPES["camera_rig"]:
-        return _rig(str(msg.header.frame_id), msg.cameras, msg.body_from_camera)
+        return rig_from_parts(str(msg.header.frame_id), msg.cameras, msg.body_from_camera)
     if type_name == INPUT_TYPES["camera_info"]:
-        return _rig(str(msg.header.frame_id), [msg], None)
+        return rig_from_parts(str(msg.header.frame_id), [msg], None)
     raise ConversionError(f"type {type_name!r} is not an input: expected one of {', '.join(INPUT_TYPES.values())}")
 
 
@@ -106,7 +106,7 @@ def _guesses(msg: Any) -> LandmarkGuesses:
     return LandmarkGuesses(int(msg.session_id), track_id, position.reshape(-1, 3), malformed)
 
 
-def _rig(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
+def rig_from_parts(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
     """Return the rig; without poses the cameras sit at the origin of the body."""
     n = len(cameras)
     names = tuple(str(info.header.frame_id) for info in cameras)
