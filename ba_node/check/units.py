@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ba_node.arrays import FloatArray
@@ -19,9 +21,13 @@ _PARALLAX = 4.0
 _POINTS = 8
 _PAIRS = 4
 _MANY_PAIRS = 10
-# Factors of a depth and of a length beyond which they are wrong: the front-end's steps are no better.
+# Factors of a depth and of a length beyond which they are wrong, however few pairs of images tell.
 _DEPTH_FACTOR = 1.5
 _LENGTH_FACTOR = 1.3
+# Many pairs tell it beyond a smaller factor, where it is so many standard errors from 1: lengths that are wrong by that
+# much bend the whole way, and the steps of a robot that moves are known better.
+_SMALL_FACTOR = 1.06
+_STANDARD_ERRORS = 4.0
 # Factors beyond which they are wrong whatever the share of outliers.
 _GROSS = 5.0
 # A factor is named if depths agree on it to this share (median deviation of its logarithm).
@@ -39,6 +45,7 @@ _UNITS = (
 _CLEARLY = 3.0
 # A factor is named unless a shift leaves so much less.
 _SURELY = 0.7
+_STEPS = "the position in the keyframes, expected metres"
 # Image coordinates no larger than this are no pixels, where the focal length is at least this.
 _NO_PIXEL = 3.0
 _FOCAL = 30.0
@@ -144,16 +151,35 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         return Diagnosis([_depth_finding(cause, f"against {by}")], rows=rows)
     if spread_of > _AGREE:
         return Diagnosis(untold=[f"depths contradict {by}"], rows=rows)
-    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+    if _alike(ratio, _DEPTH_FACTOR):
         return Diagnosis(sound=[f"depths fit {by} (to {abs(factor - 1.0):.0%})"], rows=rows)
     if many_outliers and 1.0 / _GROSS < factor < _GROSS:
         return Diagnosis(untold=["too many outliers to compare depths with steps"], rows=rows)
+    evidence = f"over {len(pairs)} pairs of keyframes"
+    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+        finding = _depth_finding(f"scale of depth_m: it is {_times(factor)} what {by} tell", evidence)
+        steps = (f"scale of the front-end's steps: they are {_times(1.0 / factor)} what depth_m tells", _STEPS)
+        both = dataclasses.replace(
+            finding, causes=(*finding.causes, steps[0]), changes=("the factor from depth images to depth_m", steps[1])
+        )
+        return Diagnosis([both], rows=rows)
     cause = f"depth_m {_unit(factor) or 'in another unit'}: it is {_times(factor)} what {by} tell"
-    return Diagnosis([_depth_finding(cause, f"over {len(pairs)} pairs of keyframes")], rows=rows)
+    return Diagnosis([_depth_finding(cause, evidence)], rows=rows)
+
+
+def _alike(ratio: list[float], most: float) -> bool:
+    """Tell whether logarithms of ratios, one for each pair of images, are those of equal lengths.
+
+    They are not if their median is beyond a factor ``most``, or clearly beyond a small one.
+    """
+    middle = abs(float(np.median(ratio)))
+    error = 1.25 * 1.48 * _deviation(ratio) / np.sqrt(len(ratio))
+    clear = len(ratio) >= _MANY_PAIRS and middle > max(np.log(_SMALL_FACTOR), _STANDARD_ERRORS * error)
+    return middle < np.log(most) and not clear
 
 
 def _times(factor: float) -> str:
-    return f"{factor:.0f} times" if factor >= 10.0 else f"{factor:.2g} times"
+    return f"{factor:.0f} times" if factor >= 10.0 else f"{factor:.3g} times"
 
 
 def _unit(factor: float) -> str:
@@ -218,7 +244,7 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
     stereo, steps = (np.concatenate(part) for part in zip(*pairs, strict=True))
     factor = float(np.exp(_log_factor(pairs)))
     rows = [Row("lengths", f"baseline of camera {camera} over the front-end's steps: {factor:.3g}", 1.0)]
-    if 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
+    if _alike([float(np.median(np.log(one / other))) for one, other in pairs], _LENGTH_FACTOR):
         tell = f"the baseline of camera {camera} fits the steps (to {abs(factor - 1.0):.0%})"
         return Diagnosis(sound=[tell], rows=rows)
     evidence = f"depths of two cameras against those of the front-end's steps, over {len(pairs)} pairs of keyframes"
@@ -231,7 +257,7 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
     causes: dict[str, str] = {}
     if shifted < _CLEARLY * scaled and 1.0 / _GROSS < factor < _GROSS:
         causes |= _of_shift(tracks, camera, abs(shift) * baseline)
-    if not causes or scaled < shifted / _SURELY:
+    if not causes or scaled < shifted / _SURELY or 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
         causes |= _of_factor(camera, baseline, factor)
     return Diagnosis([Finding(tuple(causes), evidence, tuple(causes.values()))], rows=rows)
 
@@ -255,8 +281,15 @@ def _of_factor(camera: int, baseline: float, factor: float) -> dict[str, str]:
     size = _unit(factor) or f"is {_times(factor)} what the front-end's steps tell"
     return {
         f"baseline of camera {camera} {size}": (f"body_from_camera of camera {camera} in camera_rig {fitting}"),
-        f"poses {_unit(1.0 / factor) or 'in another unit'}": "the position in the keyframes, expected metres",
+        _scale_of_steps(factor): _STEPS,
     }
+
+
+def _scale_of_steps(factor: float) -> str:
+    """Return what is wrong with poses where lengths are ``factor`` times what these tell."""
+    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+        return f"scale of the front-end's steps: they are {_times(1.0 / factor)} what the cameras tell"
+    return f"poses {_unit(1.0 / factor) or 'in another unit'}"
 
 
 def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
