@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check what needs no geometry of its own once images are related: units of depths, lengths and stamps, and ids."""
+"""Check what needs no geometry of its own once images are related: units of depths, lengths and stamps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import as_given
-from ba_node.check.relations import AGREED, Relation, agreed, rays, relate, spread
+from ba_node.check.relations import Relation, agreed, rays
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 
@@ -52,13 +52,8 @@ _FOCAL = 30.0
 # Sensible distances between keyframes, s; and units that stamps may have been taken for.
 _SPACING_S = (5e-4, 600.0)
 _STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
-# Images that far apart, in keyframes, share tracks; where ids are used again, fewer of them are the same point.
-_FAR = 4
-_STARTS = 8
-_LOST = 0.9
-# Keyframes that are needed to judge ids and lengths; share of the ids of the last quarter that the first one had.
+# Keyframes that are needed to judge lengths.
 _KEYFRAMES = 10
-_PERSIST = 0.85
 
 
 def check_pixels(tracks: Tracks) -> Diagnosis:
@@ -85,50 +80,6 @@ def check_stamps(tracks: Tracks) -> Diagnosis:
     likely += [f"{name} taken for seconds" for factor, name in _STAMP_UNITS if 0.01 <= usual / factor <= 10.0]
     cause = f"stamps in another unit: keyframes are {usual:.3g} s apart" + (f", perhaps {likely[0]}" if likely else "")
     return Diagnosis([Finding((cause,), "median of their stamps", ("header.stamp of the keyframes",), harmful=False)])
-
-
-def check_ids(tracks: Tracks) -> Diagnosis:
-    """Look whether a track goes on being the same point: by consensus of neighbouring images, and of distant ones.
-
-    Where ids are used again, few new ones come, although tracks end.
-    """
-    near, far = [], []
-    if len(tracks) < _KEYFRAMES:
-        return Diagnosis(untold=["too few keyframes to judge ids"])
-    for k in spread(len(tracks) - _FAR, _STARTS):
-        camera = tracks.main_camera(k)
-        if camera is None:
-            continue
-        pairs = [
-            relate(tracks, (int(k), camera), (int(k + gap), camera), tracks.match((k, camera), (k + gap, camera)))
-            for gap in (1, _FAR)
-        ]
-        if pairs[0] is not None and len(tracks.match((k, camera), (k + _FAR, camera))[0]) >= two_view.MIN_PAIRS:
-            near.append(pairs[0].share)
-            far.append(0.0 if pairs[1] is None else pairs[1].share)
-    if len(near) < 3:
-        return Diagnosis(untold=["too few long tracks to judge ids"])
-    rows = [Row("ids", "images next to each other", float(np.median(near)))]
-    rows += [Row("ids", f"images {_FAR} keyframes apart", float(np.median(far)))]
-    quarter = max(1, len(tracks) // 4)
-    early = np.unique(tracks.track[tracks.keyframe < quarter])
-    persist = float(np.isin(tracks.track[tracks.keyframe >= len(tracks) - quarter], early).mean())
-    rows += [Row("ids", "of the last keyframes that the first had too", persist)]
-    if rows[1].share >= _LOST * rows[0].share or persist < _PERSIST:
-        return Diagnosis(sound=["tracks keep their ids"], rows=rows)
-    if rows[0].share < AGREED:
-        return Diagnosis(untold=["too many outliers to judge ids"], rows=rows)
-    evidence = (
-        f"{rows[0].share:.0%} of the tracks agree from one keyframe to the next, {rows[1].share:.0%} over {_FAR},"
-        f" and {persist:.0%} of the ids of the first keyframes are in the last"
-    )
-    finding = Finding(
-        ("ids reused: the same track_id stands for several points",),
-        evidence,
-        ("track_id in the feature_tracks: a new id for each point, never one of an ended track",),
-        harmful=False,
-    )
-    return Diagnosis([finding], rows=rows)
 
 
 def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
