@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from ba_node.io.bag_topics import absolute
@@ -42,9 +41,10 @@ def convert(
         if source in _INSTEAD and not kinds & set(reader.topics.values()) - {"nav_msgs/msg/Odometry"}:
             source = _INSTEAD[source]
         chosen = choose_topics(reader, SOURCES[source].inputs, topics, has_rig=options.rig is not None)
-        if options.rig is None:
-            options = replace(options, rig=_calibration(reader, SOURCES[source](cameras), chosen))
         adapter = Adapter(SOURCES[source](cameras), options)
+        rig = None if options.rig is not None else _calibration(reader, SOURCES[source](cameras), chosen)
+        if rig is not None:
+            adapter.calibrate(rig)
         record(target, _timeline(reader, adapter, chosen))
     return adapter
 
@@ -68,6 +68,8 @@ def choose_topics(
             named = same
         if one.name in given:
             named = [topic for topic in same if topic == absolute(given[one.name])]
+        if len(named) > 1 and not one.role and one.name not in given:
+            continue  # not needed, so that nothing is guessed
         if len(named) > 1:
             raise BagError(
                 f"{reader.path}: cannot tell which {one.name} is meant: {', '.join(named)}: say --topic"

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ba_node.arrays import FloatArray
-from ba_node.core import geometry
+from ba_node.core import cameras, geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.adapters.sources import Extrinsic, Features, LayoutError, Pose, Source
 
@@ -34,6 +34,8 @@ MAX_WAITING = 200
 _BACK_NS = 1_000_000_000
 # How far a calibration may move before it is said: focal length and principal point by fx; m; rad.
 _MOVED = (0.005, 0.01, 0.01)
+# Pixels that a camera_info of the source's own camera leaves between its points and its pixels, median, px.
+_MAX_DISAGREEMENT_PX = 2.0
 # Fewest points that tell a focal length, and the one that is taken where they do not, px.
 _FIT_POINTS, _FOCAL_PX = 8, 460.0
 
@@ -70,6 +72,7 @@ class Adapter:
         self._session, self._source_session = 0, 0
         self._extrinsic: Extrinsic | None = None
         self._lens: CameraRig | None = None
+        self._fixed = options.rig is not None  # what the source says of its cameras does not matter
         self._from_rays = False  # pixels are made from normalised points, as no lens is known
         self._rig_sent: CameraRig | None = None
         self._poses: dict[int, Pose] = {}
@@ -100,9 +103,14 @@ class Adapter:
                 else:
                     yield from self._learn(piece)
         except LayoutError as error:
-            self._leave(error.reason, f"{name}: {error}")
+            self.leave(error.reason, f"{name}: {error}")
         except (AttributeError, IndexError, TypeError, ValueError) as error:
-            self._leave("malformed", f"{name}: {error}")
+            self.leave("malformed", f"{name}: {error}")
+
+    def calibrate(self, rig: CameraRig) -> None:
+        """Take a rig for what the source says of its cameras, now and later."""
+        self.rig, self._fixed = rig, True
+        self._extrinsic = Extrinsic(rig.frame_id, rig.position[0], rig.orientation[0])
 
     def summary(self) -> str:
         """Return in words what came of the images so far."""
@@ -126,20 +134,21 @@ class Adapter:
         """Count what still waits when no more messages come."""
         for reason, waiting in (("no_features", self._poses), ("no_pose", self._features), ("no_rig", self._frames)):
             if waiting:
-                self._leave(reason, f"{len(waiting)} at the end", len(waiting))
+                self.leave(reason, f"{len(waiting)} at the end", len(waiting))
 
-    def _leave(self, reason: str, words: str, count: int = 1) -> None:
+    def leave(self, reason: str, words: str, count: int = 1) -> None:
+        """Count what is left out."""
         self.counted[reason] += count
         self.notes[reason] = words
 
     def _learn(self, piece: Extrinsic | CameraRig) -> Iterator[tuple[str, int, Measurement]]:
         """Take in what the source says of its cameras; once both lens and place are known, there is a rig."""
-        if self._options.rig is not None:
+        if self._fixed:
             return
         if isinstance(piece, Extrinsic):
             self._extrinsic = piece
         elif piece.malformed:
-            self._leave("bad_camera", piece.malformed)
+            self.leave("bad_camera", piece.malformed)
             return
         elif any(one.role == "extrinsic" for one in self._source.inputs):
             self._lens = None if self._from_rays else piece
@@ -151,7 +160,7 @@ class Adapter:
             self.rig = dataclasses.replace(self._lens, frame_id=at.frame_id, position=place[0], orientation=place[1])
         if self.rig is not None and self._rig_sent is not None and _moved(self._rig_sent, self.rig):
             words = "the calibration of the source has moved since it was sent: give a rig, or convert a recording"
-            self._leave("calibration_moved", words)
+            self.leave("calibration_moved", words)
         frames, self._frames = (self._frames, []) if self.rig is not None else ([], self._frames)
         for frame in frames:
             yield from self._frame(*frame)
@@ -169,7 +178,7 @@ class Adapter:
         if len(own) > MAX_WAITING:
             del own[next(iter(own))]
             gap = "none came" if nearest is None else f"the nearest is {abs(nearest - piece.stamp_ns) / 1e6:.3f} ms off"
-            self._leave(reason, f"{gap}; taken are up to {limit_ns / 1e6:g} ms")
+            self.leave(reason, f"{gap}; taken are up to {limit_ns / 1e6:g} ms")
 
     def _frame(self, pose: Pose, features: Features) -> Iterator[tuple[str, int, Measurement]]:
         """Send on an image with its pose, if it is a keyframe."""
@@ -180,13 +189,13 @@ class Adapter:
         self._newest_ns = max(pose.stamp_ns, self._newest_ns or pose.stamp_ns)
         key = pose.stamp_ns if pose.key is None else pose.key
         if key in self._keys:
-            self._leave("repeated_keyframe", f"keyframe {key} came again")
+            self.leave("repeated_keyframe", f"keyframe {key} came again")
             return
         features = self._usable(features)
         if not len(features.ids):
-            self._leave("no_tracks", "an image without a track that can be used")
+            self.leave("no_tracks", "an image without a track that can be used")
             return
-        if self.rig is None:
+        if self._rig_sent is None:
             self._invent_lens(features)
         if self.rig is None:
             self._frames = [*self._frames[1 - MAX_WAITING :], (pose, features)]
@@ -209,7 +218,7 @@ class Adapter:
         good = np.ones(len(ids), bool)
         for reason, wrong in reasons.items():
             if (good & wrong).any():
-                self._leave(
+                self.leave(
                     reason, f"{np.count_nonzero(good & wrong)} of {len(ids)}", int(np.count_nonzero(good & wrong))
                 )
             good &= ~wrong
@@ -217,9 +226,15 @@ class Adapter:
         return dataclasses.replace(features, wrong={}, **{name: getattr(features, name)[good] for name in names})
 
     def _invent_lens(self, features: Features) -> None:
-        """Make a camera without distortion, to whose pixels normalised points are taken, where only these are there."""
-        if self._extrinsic is None or not np.isfinite(features.normalised).all():
+        """Make a camera without distortion for the source's normalised points, where its lens is not known."""
+        if self._extrinsic is None or self._options.rig is not None or not np.isfinite(features.normalised).all():
             return
+        why = "no camera_info"
+        if self.rig is not None:
+            error_px = _disagreement_px(self.rig, features)
+            if error_px <= _MAX_DISAGREEMENT_PX:
+                return
+            why = f"camera_info is of another camera, its pixels are {error_px:.1f} px (median) off"
         fits = []
         for rays, pixels in zip(features.normalised.T, features.uv.T, strict=True):
             enough = len(rays) >= _FIT_POINTS and np.ptp(rays) > 0.1
@@ -231,7 +246,7 @@ class Adapter:
         self.rig = CameraRig(self._extrinsic.frame_id, ("camera0",), ("",), one, (np.empty(0),), size, *place)
         self._from_rays = True
         self.notes["camera"] = (
-            f"no camera_info: the source's undistorted points are taken, in a camera of fx = {fx:.1f}, fy = {fy:.1f} px"
+            f"{why}: the source's undistorted points are taken, in a camera of fx = {fx:.1f}, fy = {fy:.1f} px"
         )
 
     def _is_keyframe(self, pose: Pose, features: Features) -> bool:
@@ -292,6 +307,14 @@ class Adapter:
         offset = features.point - self.rig.position[features.camera]
         depth = np.einsum("ni,ni->n", rotation[:, :, 2], offset)
         return np.where(depth > 0.0, depth, np.nan)
+
+
+def _disagreement_px(rig: CameraRig, features: Features) -> float:
+    """Return how far the pixels of normalised points are from those that came, median, px."""
+    model, params = cameras.parameters(rig.models[0], rig.intrinsics[0], rig.distortion[0])
+    rays = np.column_stack([features.normalised, np.ones(len(features.ids))])
+    uv = cameras.project(rays, np.full(len(rays), int(model), np.uint8), np.tile(params, (len(rays), 1)))
+    return float(np.median(np.linalg.norm(uv - features.uv, axis=1)))
 
 
 def _moved(before: CameraRig, now: CameraRig) -> bool:

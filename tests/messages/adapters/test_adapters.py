@@ -141,6 +141,15 @@ def test_with_camera_info_the_pixels_are_raw() -> None:
     assert "camera" not in made.notes
 
 
+def test_a_camera_info_of_another_camera_is_not_taken() -> None:
+    data = layouts.scene()
+    info = layouts.camera_info(data.rig, 0, 0, "cam0")
+    info.k[0] *= 1.1
+    made, out = feed("vins_fusion", [Sent("/camera_info", layouts.CAMERA_INFO, info, 0), *layouts.vins_fusion(data)])
+    assert out[0].models == ("",) and made.sent == 9
+    assert "camera_info is of another camera" in made.notes["camera"]
+
+
 def test_ids_of_vins_mono_tell_the_camera() -> None:
     data = layouts.scene()
     rig = AdapterOptions(rig=data.rig)
