@@ -21,7 +21,7 @@ from ba_node import __version__
 from ba_node.cli import interrupts
 from ba_node.cli.checkout import CheckoutCommand
 
-_INSTALLED = ("replay", "check", "map", "play", "solve", "convert", "evaluate", "synth", "demo", "params")
+_INSTALLED = ("replay", "report", "check", "map", "play", "solve", "convert", "evaluate", "synth", "demo", "params")
 _IN_A_CHECKOUT = (
     CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
     CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
