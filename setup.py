@@ -219,7 +219,8 @@ setup(
         "mpi": ["mpi4py"],
         "colmap": ["pycolmap"],
         "view": ["foxglove-sdk"],
-        "docs": ["furo", "sphinx"],
+        "completion": ["argcomplete"],
+        "docs": ["furo", "myst-parser", "sphinx"],
         # Solvers that `make bench` compares with; each is left out where it is missing.
         "bench": ["g2opy", "gtsam", "pycolmap"],
         "lint": ["mypy", "ruff", "types-PyYAML", "types-tqdm"],
