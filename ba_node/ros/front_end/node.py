@@ -46,6 +46,7 @@ from ba_node.ros.front_end.streams import Frame, OdometryBuffer, Streams, transf
 from ba_node.ros.log import Severity, Throttle, log
 from ba_node.ros.parameters import declare
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
+from ba_node.ros.tools.adapter import PUBLISHED
 
 NODE_NAME = "ba_front_end"
 # Images of each mode, the leading one first; the camera_info of each lies beside it.
@@ -105,7 +106,7 @@ class FrontEndNode(ManagedNode):
         self._frames: list[Frame] = []
         self._state: State | None = None
         self._busy_s, self._said = 0.0, ""
-        kinds = {name: kind for name, kind in INPUT_TYPES.items() if name != "camera_info"}
+        kinds = {name: INPUT_TYPES[name] for name in PUBLISHED}
         self._out = {name: self._own("publisher", message_class(kind), name, qos.profile(TOPICS[name]))
                      for name, kind in kinds.items()}  # fmt: skip
         self._out["odometry"] = self._own("publisher", message_class(_ODOMETRY), "~/odometry", qos.reliable(100))

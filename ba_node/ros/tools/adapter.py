@@ -34,6 +34,7 @@ from ba_node.ros.log import Severity, log
 
 NODE_NAME = "ba_adapter"
 USAGE_ERROR = 2
+PUBLISHED = ("camera_rig", "keyframes", "landmark_guesses", "feature_tracks")
 _DEPTH = 1000
 _LOOK_S = 0.5
 _LOG_S = 5.0
@@ -62,7 +63,7 @@ class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
         self._out = {
             name: self.create_publisher(message_class(kind), name, qos.profile(TOPICS[name], _DEPTH))
             for name, kind in INPUT_TYPES.items()
-            if name != "camera_info"
+            if name in PUBLISHED
         }
         self.create_subscription(message_class("std_msgs/msg/Bool"), "restart", self._on_restart, qos.reliable(10))
         clock = Clock(clock_type=ClockType.STEADY_TIME)
