@@ -117,6 +117,7 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
     table = scene.keyframes
     rotation, position = geometry.inverse(best.rotation[0], best.translation[0])
     rotation, position = geometry.nearest_rotation(rotation), position + table.position[scene.order[0]]
+    scene.moved(np.array([row]))
     if max(near[-_ASKED:]) >= _AGREEING * len(problem.observations):
         # Its step from one of the keyframes before is right: it is another one that has jumped.
         table.rotation[row], table.position[row] = rotation, position

@@ -204,6 +204,8 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     table.refined[keyframes[here]] = True
     points.position[landmarks[kept]] = found[kept]
     points.has_position[landmarks[kept]] = True
+    points.changed()
+    scene.moved()
     scene.propagate_corrections()
     _classify(scene, config, taken.selection, keyframes[here], landmarks[kept])
     _join(scene, config, len(table) - 1 - int(scene.places()[keyframes[here]].max()))
