@@ -139,10 +139,15 @@ class CurrentMap:
         row = self.scene.find_keyframe(keyframe_id) if session_id == self.scene.session_id else None
         return None if row is None else bool(self.scene.keyframes.solved[row])
 
-    def refined_keyframes(self) -> set[int]:
-        """Return the ids of the keyframes that took part in a usable solve."""
-        table = self.scene.keyframes
-        return set(table.keyframe_id[table.refined].tolist())
+    @property
+    def refined_count(self) -> int:
+        """Return how many keyframes took part in a usable solve."""
+        return int(np.count_nonzero(self.scene.keyframes.refined))
+
+    def refined_among(self, keyframe_ids: Iterable[int]) -> set[int]:
+        """Return which of some keyframes took part in a usable solve."""
+        rows = ((key, self.scene.find_keyframe(key)) for key in keyframe_ids)
+        return {key for key, row in rows if row is not None and self.scene.keyframes.refined[row]}
 
     def input_keyframes(self) -> list[Keyframe]:
         """Return the keyframes as the front-end sent them, in order of arrival."""
@@ -247,7 +252,7 @@ class CurrentMap:
 
     def _young(self) -> bool:
         """Return True while no more was refined than two windows hold."""
-        return int(np.count_nonzero(self.scene.keyframes.refined)) <= 2 * self.config.window.max_keyframes
+        return self.refined_count <= 2 * self.config.window.max_keyframes
 
     def hold_all(self, solve_count: int, reason: str) -> None:
         """Report that the set-up is wrong; the front-end's poses stand, and its frame is the map's."""

@@ -184,7 +184,7 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     # The scale is given to the map by its steps, so they are stretched with it.
     snapshot = dataclasses.replace(snapshot, position=moved(position))
     state = scaled(snapshot.selection, snapshot.position, state)
-    late_ids = set(data.truth.keyframe_id[12:].tolist()) & backend.map.refined_keyframes()
+    late_ids = backend.map.refined_among(data.truth.keyframe_id[12:].tolist())
     assert len(late_ids) >= 6, f"{len(late_ids)} of the 8 later keyframes were refined"
     assert full.merge_snapshot(scene, backend.config, snapshot, state) == len(late_ids)
     after = backend.estimate()
