@@ -30,8 +30,8 @@ from ba_node.window import arrival, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
-# Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
-_VIEWS = 400
+# Views of a point are looked at, newest first, so many times as a solve may have: some keyframes are not refined.
+_SPARE = 2
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
 # the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
 _ABSURD = 25.0
@@ -208,7 +208,7 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     ranges = [np.arange(b.begin, b.end) for row in taking_part for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
     landmarks = scene.distinct(table.landmark[own])
-    rows = scene.views_of(landmarks, _views_needed(scene, window))
+    rows = scene.views_of(landmarks, _views_needed(scene, window, config.window.max_fixed_keyframes))
     keyframe = table.keyframe.take(rows)
     older = _older(scene, window, keyframe[~table.outlier.take(rows)])[: config.window.max_fixed_keyframes]
     keyframes = scene.by_time(np.concatenate([taking_part, older]))
@@ -220,15 +220,16 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     return _Part(problem, rows, keyframes, landmarks, origin)
 
 
-def _views_needed(scene: Scene, window: IntArray) -> int | None:
+def _views_needed(scene: Scene, window: IntArray, n_fixed: int) -> int | None:
     """Return how many of the newest views of a point may matter, None for all of them.
 
     Who stands still sees the same points in thousands of keyframes, and to gather all of these takes longer and longer.
-    Those before the newest few hundred keyframes share no more points with the window than these do.
+    Those before the newest few share no more points with the window than these do.
     """
     if not len(window) or window[-1] != scene.order[-1]:
         return None  # newer keyframes wait behind the window
-    return _VIEWS + sum(len(scene.blocks[row]) for row in window)
+    images = max(len(scene.blocks[row]) for row in window)
+    return _SPARE * images * (len(window) + n_fixed)
 
 
 def _older(scene: Scene, window: IntArray, keyframe: NDArray[np.int32]) -> IntArray:
