@@ -34,6 +34,16 @@ class Scene(MapTables):
         self.pending: list[FeatureTracks] = []
         self._reused: set[int] = set()
 
+    def clone(self) -> Scene:
+        """Return a scene of its own with the same content but for what waits and what was turned away."""
+        other = Scene(self.config, self.session_id)
+        other.frame_id, other.cameras = self.frame_id, self.cameras
+        other.refused_rig = self.refused_rig
+        other.keyframes, other.landmarks = self.keyframes.clone(), self.landmarks.clone()
+        other.observations, other.blocks = self.observations.clone(), [list(blocks) for blocks in self.blocks]
+        other._index_keyframes()
+        return other
+
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement of this session (or a rig); what cannot be used is counted."""
         if isinstance(measurement, CameraRig):

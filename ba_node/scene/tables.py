@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -117,6 +117,12 @@ class Table:
                 self._stale = np.append(self._stale, np.ones(missing, bool))
             self._stale[np.asarray(rows) // _PIECE] = True
 
+    def clone(self: _Table) -> _Table:
+        """Return a table of its own with the same rows."""
+        other = type(self)()
+        other.append(self._size, **{name: getattr(self, name) for name in self.COLUMNS})
+        return other
+
     def copy(self) -> Rows:
         """Return a copy of the columns in ``COPIED``; it costs as much as has changed since the last."""
         for k in np.flatnonzero(self._stale).tolist():
@@ -133,6 +139,9 @@ class Table:
     def _expose(self) -> None:
         for name, buffer in self._buffers.items():
             setattr(self, name, buffer[: self._size])
+
+
+_Table = TypeVar("_Table", bound=Table)
 
 
 class Growing:
