@@ -12,10 +12,10 @@ image as a keyframe, 0.1 s apart, its points as landmark guesses and its ids as 
 float32 in the messages. Pixels of COLMAP count from the corner of the image, those here from the middle of the first
 pixel: half a pixel is added and taken away.
 
-With --from, IN is a recording of what another front-end published, and OUT its keyframes and tracks: openvins (loop_pose,
-loop_feats, loop_extrinsic, loop_intrinsics), vins_fusion (keyframe_pose, keyframe_point, extrinsic), vins_mono (feature,
-keyframe_pose or odometry, extrinsic), rtabmap (odom, odom_info; without these mapData, which is rtabmap_map). --topic then
-names these. Exit code 3: messages were there that could not be read.
+With --from, IN is a recording of what another front-end published, and OUT its keyframes and tracks: openvins
+(loop_pose, loop_feats, loop_extrinsic, loop_intrinsics), vins_fusion (keyframe_pose, keyframe_point, extrinsic),
+vins_mono (feature, keyframe_pose or odometry, extrinsic), rtabmap (odom, odom_info; without these mapData, which is
+rtabmap_map). --topic then names these. Exit code 3: messages were there that could not be read.
 """
 
 from __future__ import annotations
@@ -43,14 +43,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", type=Path, metavar="OUT")
     parser.add_argument("--to", choices=_FORMATS, help="format of OUT, where its name does not tell it")
     add_topic_options(parser)
-    add_front_end_options(parser.add_argument_group("recordings of other front-ends"), required=False)
+    _add_front_end_options(parser.add_argument_group("recordings of other front-ends"))
 
 
-def add_front_end_options(parser: argparse._ActionsContainer, *, required: bool) -> None:
-    """Declare what is said of another front-end, here and to ba_adapter."""
+def _add_front_end_options(parser: argparse._ArgumentGroup) -> None:
     from ba_node.messages.adapters import SOURCES  # noqa: PLC0415  # slow to import
 
-    parser.add_argument("--from", dest="front_end", choices=SOURCES, required=required, help="which of them it is")
+    parser.add_argument("--from", dest="front_end", choices=SOURCES, help="which of them it is")
     parser.add_argument("--rig", type=Path, nargs="+", metavar="FILE", help="cameras, in any form that ba rig reads")
     parser.add_argument("--tolerance", type=float, default=1e-3, metavar="S", help="stamps pair within (%(default)s)")
     parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")
