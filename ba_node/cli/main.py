@@ -24,8 +24,8 @@ from ba_node.cli.checkout import CheckoutCommand
 # Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
 GROUPS: dict[str, tuple[str, ...]] = {
     "refine": ("replay", "solve", "map"),
-    "look": ("check", "evaluate"),
-    "recordings and files": ("convert", "synth"),
+    "look": ("check", "report", "evaluate"),
+    "recordings and files": ("convert", "rig", "synth"),
     "the running node": ("play", "demo", "params"),
     "in a checkout of the repository": ("steps", "robustness", "thesis"),
 }

@@ -115,6 +115,8 @@ def _move(scene: Scene, rotation: FloatArray, position: FloatArray) -> None:
     moved = full.Similarity(np.ones(len(table)), turn, position - (turn @ table.position[:, :, None])[..., 0])
     full.follow_points(scene, np.empty(0, np.intp), np.arange(len(table)), moved)
     table.rotation[:], table.position[:] = rotation, position
+    scene.moved()
+    scene.landmarks.changed()
 
 
 def _steps(scene: Scene, config: OdometryConfig) -> RelativePoses:
