@@ -60,7 +60,7 @@ NODE_NAME = "ba_front_end"
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _LOOK_S, _LOG_S = 0.5, 5.0
-# Frames that wait for the odometry of their time.
+# Frames that wait for cameras, or for the odometry of their time.
 _MAX_WAITING = 30
 # Share of the time that tracking may take before images get lost.
 _BUSY = 0.95
@@ -184,6 +184,7 @@ class FrontEndNode(ManagedNode):
         known = self._infos.setdefault(name, info)
         if self._front_end is None:
             self._infos[name] = info
+            self._go_on()
         elif any(list(getattr(known, key)) != list(getattr(info, key)) for key in ("k", "d", "p")):
             self._warn("camera_info", f"camera_info of {name} has changed: what came first stays, or configure anew")
 
@@ -221,10 +222,9 @@ class FrontEndNode(ManagedNode):
         self._go_on()
 
     def _go_on(self) -> None:
-        """Track the frames whose odometry is known."""
+        """Track the frames whose cameras and odometry are known, or that have waited long."""
         while self._frames and self._active:
-            waits = self.options.odometry != "none" and not self._odometry.covers(self._frames[0].stamp_ns)
-            if waits and len(self._frames) <= _MAX_WAITING:
+            if len(self._frames) <= _MAX_WAITING and not self._is_known(self._frames[0].stamp_ns):
                 return
             began = time.perf_counter()
             try:
@@ -233,6 +233,11 @@ class FrontEndNode(ManagedNode):
                 self.counted["unusable"] += 1
                 self._warn("unusable", f"{error} (images left out: {self.counted['unusable']})")
             self._busy_s += time.perf_counter() - began
+
+    def _is_known(self, stamp_ns: int) -> bool:
+        """Return True if the cameras are known, and the odometry of a time."""
+        cameras = self._rig is not None or all(name in self._infos for name in cameras_of(self._mode))
+        return cameras and (self.options.odometry == "none" or self._odometry.covers(stamp_ns))
 
     def _track(self, frame: Frame) -> None:
         """Track one frame, and publish what comes of it."""
