@@ -52,7 +52,7 @@ def test_without_local_bundle_adjustment_the_rig_is_given(tmp_path: Path, capsys
     bag = layouts.write(tmp_path / "bag", layouts.rtabmap(data, bundle=False))
     out, rig = tmp_path / "out.mcap", tmp_path / "rig.yaml"
     assert main(["convert", str(bag), str(out), "--from", "rtabmap"]) == 2
-    assert "give it as YAML" in capsys.readouterr().err
+    assert "give it as YAML (--rig FILE)" in capsys.readouterr().err
     assert not out.exists()
     rig.write_text(rig_yaml(data.rig)[0])
     assert main(["convert", str(bag), str(out), "--from", "rtabmap", "--rig", str(rig)]) == 0

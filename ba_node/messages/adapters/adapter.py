@@ -132,9 +132,10 @@ class Adapter:
 
     def finish(self) -> None:
         """Count what still waits when no more messages come."""
+        words = "nothing tells the cameras: give them with --rig FILE"
         for reason, waiting in (("no_features", self._poses), ("no_pose", self._features), ("no_rig", self._frames)):
             if waiting:
-                self.leave(reason, f"{len(waiting)} at the end", len(waiting))
+                self.leave(reason, words if reason == "no_rig" else f"{len(waiting)} at the end", len(waiting))
 
     def leave(self, reason: str, words: str, count: int = 1) -> None:
         """Count what is left out."""
