@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import add_parameter_options, parameters, require_folder, table
+from ba_node.cli.console import add_parameter_options, parameters, table, write_result
 
 if TYPE_CHECKING:
     from ba_node.backend import Diagnosis, Row
@@ -39,15 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", type=Path, metavar="RECORDING")
     add_parameter_options(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all of it as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    from ba_node.io.files import write_json  # noqa: PLC0415
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
-    require_folder(args.json)
     config = parameters(args)
     sessions = check_recording(args.bag, config)
     for number, session in enumerate(sessions, start=1):
@@ -60,8 +57,7 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         for text in session.warnings:
             print(f"ba: warning: {text}", file=sys.stderr)
-    if args.json is not None:
-        write_json(args.json, {"sessions": [session.as_dict() for session in sessions]})
+    write_result(args.json, {"sessions": [session.as_dict() for session in sessions]})
     if any(session.found.findings or session.warnings for session in sessions):
         return MISTAKE
     return 0 if any(session.found.sound for session in sessions) else TOO_LITTLE

@@ -5,15 +5,20 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.io.bag_topics import TopicChoice
+
+
+STANDARD_OUTPUT = Path("-")
+_out: list[IO[str]] = []
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -65,6 +70,37 @@ def require_mcap(path: Path, otherwise: str = "") -> None:
     require_folder(path)
     if path.suffix != ".mcap":
         raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so{otherwise}")
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Declare the option that has a command's result written for programs, unless the command has one of its own."""
+    if "--json" not in parser.format_usage():
+        words = "write the result as JSON; - for standard output, instead of the text"
+        parser.add_argument("--json", type=Path, metavar="FILE", help=words)
+
+
+def write_result(path: Path | None, content: Mapping[str, Any]) -> None:
+    """Write what a command found as JSON where it was asked for."""
+    from ba_node.io.files import json_text, write_json  # noqa: PLC0415
+
+    if path == STANDARD_OUTPUT:
+        _out[-1].write(json_text(content))
+    elif path is not None:
+        write_json(path, content)
+
+
+@contextmanager
+def json_alone(path: Path | None) -> Iterator[None]:
+    """Keep the text of a command from standard output while the block runs, if its JSON is to go there."""
+    if path != STANDARD_OUTPUT:
+        yield
+        return
+    _out.append(sys.stdout)
+    try:
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        _out.pop().flush()
 
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:

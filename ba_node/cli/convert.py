@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import add_topic_options, require_folder, require_mcap, topic_choice
+from ba_node.cli.console import add_topic_options, require_folder, require_mcap, topic_choice, write_result
 
 SUMMARY = "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY"
 EXAMPLE = (
@@ -47,4 +47,5 @@ def run(args: argparse.Namespace) -> int:
     what = convert.read(args.source, topic_choice(args))
     left_out = convert.write(args.target, what, form)
     print(f"{args.target}: {convert.counts(what)}{f', without {left_out}' if left_out else ''}")
+    write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})
     return 0

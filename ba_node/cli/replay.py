@@ -29,6 +29,7 @@ from ba_node.cli.console import (
     progress_bar,
     require_folder,
     topic_choice,
+    write_result,
 )
 from ba_node.offline.attention import HARMLESS
 
@@ -77,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     print(facts(_rows(report)))
     _tell(report)
     print(f"written to {args.out}")
+    write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
 
 
