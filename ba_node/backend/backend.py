@@ -253,7 +253,7 @@ class Backend:
 
     def begin_optimization(self) -> full.Optimization | str:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
-        return full.take_snapshot(self.scene, self.config)
+        return full.take_snapshot(self.scene, self.config, self.extras)
 
     def is_current(self, optimization: full.Optimization) -> bool:
         """Return True if a solve of everything is of the current map."""
@@ -284,7 +284,7 @@ class Backend:
         statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
-        return self.estimate(), followed
+        return self.map.with_covariances(self.estimate(), taken), followed
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ba_node import window
-from ba_node.arrays import BoolArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.backend.summary import MapSummary, summary_of
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis
@@ -24,7 +24,7 @@ from ba_node.core.problem import State
 from ba_node.estimate import Cloud, Correction, Estimate, Extras, Iteration, Poses, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import quality, view
+from ba_node.window import full, quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -300,6 +300,15 @@ class CurrentMap:
             map_index=self.index,
         )
 
+    def with_covariances(self, estimate: Estimate, taken: full.Optimization) -> Estimate:
+        """Return an estimate of everything with the covariances of a solve of everything that was merged."""
+        found = taken.covariances
+        if found is None:
+            return estimate
+        poses = _rows_by_id(estimate.refined.keyframe_id, taken.keyframe_id, found.poses)
+        points = None if found.points is None else _rows_by_id(estimate.cloud.track_id, taken.track_id, found.points)
+        return dataclasses.replace(estimate, covariance=poses, point_covariance=points)
+
     def _published(self) -> Correction | None:
         transform = self.correction.published
         if transform is None:
@@ -316,6 +325,14 @@ def _cloud_of(scene: Scene, rows: IntArray) -> Cloud:
     points = scene.landmarks
     rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
     return Cloud(points.track_id[rows], points.position[rows], points.rms_px[rows], points.views[rows])
+
+
+def _rows_by_id(wanted: IdArray, ids: IdArray, values: FloatArray) -> FloatArray:
+    """Return the values of some ids, NaN for those that have none."""
+    out = np.full((len(wanted), *values.shape[1:]), np.nan)
+    _, here, there = np.intersect1d(wanted, ids, return_indices=True)
+    out[here] = values[there]
+    return out
 
 
 def _poses_of(scene: Scene, rows: IntArray) -> Poses:

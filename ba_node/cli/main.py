@@ -24,11 +24,33 @@ from ba_node.cli.console import add_json_option, json_alone, require_folder
 
 # Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "refine": ("replay", "solve", "map"),
-    "look": ("info", "check", "evaluate"),
-    "recordings and files": ("cut", "merge", "convert", "synth"),
-    "the running node": ("play", "demo", "params"),
-    "in a checkout of the repository": ("steps", "robustness", "thesis"),
+    "refine": (
+        "replay",
+        "solve",
+        "map",
+    ),
+    "look": (
+        "info",
+        "check",
+        "report",
+        "evaluate",
+    ),
+    "recordings and files": (
+        "cut",
+        "merge",
+        "convert",
+        "synth",
+    ),
+    "the running node": (
+        "play",
+        "demo",
+        "params",
+    ),
+    "in a checkout of the repository": (
+        "steps",
+        "robustness",
+        "thesis",
+    ),
 }
 _IN_A_CHECKOUT = (
     CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),

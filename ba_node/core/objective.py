@@ -150,16 +150,6 @@ class Objective:
         """Return Psi of some observations, (n,)."""
         return self._evaluate(state, self._all.part(rows))[1]
 
-    def weighted_squares(self, state: State) -> tuple[float, int]:
-        """Return ``r' W r`` with the IRLS weights W, and the number of rows that count (not those behind a camera)."""
-        residual, _, root_weight, masked = self._evaluate(state, self._all)
-        weighted = residual * root_weight
-        rows = 2 * (len(residual) - len(masked))
-        if self._has_depth:
-            rows += int(np.count_nonzero(np.isfinite(np.delete(self.problem.observations.depth_m, masked))))
-        squares, more = (0.0, 0) if self.factors is None else self.factors.weighted_squares(state)
-        return float(np.sum(weighted * weighted)) + squares, rows + more
-
     def linearise(self, state: State, rows: PointRows | None = None) -> Linearisation:
         """Return residuals and Jacobians at a state; what is known of all rows there is not worked out again."""
         obs, intrinsics = self.problem.observations, self.problem.free_intrinsics

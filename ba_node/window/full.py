@@ -33,13 +33,16 @@ from ba_node.config import Config, SolverConfig, SolverOptions
 from ba_node.core import geometry, methods, native_kernels, solver
 from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
+from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
+from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
 
 MAX_ITERATIONS = 50
+NOTHING = Extras()
 # A window is solved again and again, everything once: it is worth more digits.
 _FUNCTION_TOLERANCE = 1e-6
 # Fewer points than this tell a keyframe no scale of its own.
@@ -82,8 +85,10 @@ class Optimization:
     track_id: IdArray  # (n_pt,) uint64
     placed: BoolArray  # (n_pt,) True where the point had a position
     position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
+    wanted: Extras = NOTHING  # what is to be worked out beside the solution
     # result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`
     solved: tuple[Result, FloatArray] | None = None
+    covariances: Covariances | None = None  # None likewise, and if they were not asked for
 
     def solve(
         self,
@@ -98,6 +103,9 @@ class Optimization:
         chosen = options(config, method, max_iterations)
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
+        if self.wanted.covariance and result.status.usable and result.state.is_finite():
+            state = scaled(self.selection, self.position, result.state)
+            self.covariances = covariances(self.selection, state, self.position, chosen, points=self.wanted.points)
 
     @property
     def result(self) -> Result:
@@ -136,7 +144,7 @@ class _Similarity:
         return np.asarray(self.scale[which, None] * turned + self.translation[which])
 
 
-def take_snapshot(scene: Scene, config: Config) -> Optimization | str:
+def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Optimization | str:
     """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
@@ -152,6 +160,7 @@ def take_snapshot(scene: Scene, config: Config) -> Optimization | str:
         scene.landmarks.track_id[selection.landmarks],
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
+        wanted,
     )
 
 
