@@ -42,6 +42,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "synth",
     ),
     "the running node": (
+        "record",
         "play",
         "demo",
         "params",

@@ -41,10 +41,11 @@ class BagWriter:
 
     Args:
         path: the file, ``*.mcap``; an older one is replaced.
+        streaming: the file has its name from the beginning, and must not be there yet; so it outlives its process.
     """
 
-    def __init__(self, path: Path | str) -> None:
-        self._path = path
+    def __init__(self, path: Path | str, *, streaming: bool = False) -> None:
+        self._path, self._streaming = Path(path), streaming
         self._stack = contextlib.ExitStack()
         self._types: dict[str, tuple[str, bool]] = {}
         self._channels: dict[str, int] = {}
@@ -52,7 +53,8 @@ class BagWriter:
         self._sequences: dict[int, int] = {}
 
     def __enter__(self) -> BagWriter:
-        stream = self._stack.enter_context(whole_file(self._path))
+        new = self._path.open("xb") if self._streaming else whole_file(self._path)
+        stream = self._stack.enter_context(new)
         # The name of the library must not bring a version, and with it other bytes, into the file.
         self._writer = Writer(stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="ba_node")
