@@ -32,6 +32,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "look": (
         "info",
         "check",
+        "view",
         "report",
         "evaluate",
     ),
