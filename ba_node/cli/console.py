@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -39,6 +40,18 @@ def facts(rows: Sequence[tuple[str, str]]) -> str:
     """Return pairs of name and value, one a line."""
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name.ljust(width)}  {value}".rstrip() for name, value in rows)
+
+
+# By the first letters of what is shown, as on every terminal: red, yellow, green.
+_COLOURS = {"WORSE": 31, "MISSING": 31, "error": 31, "warning": 33, "better": 32, "ok": 32}
+
+
+def coloured(text: str) -> str:
+    """Return a word in its colour if somebody looks at a terminal that shows it (NO_COLOR: no), else as it is."""
+    code = _COLOURS.get(text)
+    if code is None or not sys.stdout.isatty() or "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb":
+        return text
+    return f"\x1b[{code}m{text}\x1b[0m"
 
 
 @contextmanager

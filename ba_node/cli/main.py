@@ -35,6 +35,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "view",
         "report",
         "evaluate",
+        "regress",
     ),
     "recordings and files": (
         "cut",
