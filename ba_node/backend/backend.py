@@ -255,6 +255,11 @@ class Backend:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
         return full.take_snapshot(self.scene, self.config, self.extras)
 
+    def copied(self) -> Callable[[], full.Optimization | str]:
+        """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called on any thread."""
+        scene, clone, config, wanted = self.scene, self.scene.clone(), self.config, self.extras
+        return lambda: full.take_snapshot(clone, config, wanted, scene)
+
     def is_current(self, optimization: full.Optimization) -> bool:
         """Return True if a solve of everything is of the current map."""
         return optimization.scene is self.scene

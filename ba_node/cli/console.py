@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 STANDARD_OUTPUT = Path("-")
 _out: list[IO[str]] = []
+_written: list[Path | None] = []
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -90,16 +91,25 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
     if "--json" not in parser.format_usage():
         words = "write the result as JSON; - for standard output, instead of the text"
         parser.add_argument("--json", type=Path, metavar="FILE", help=words)
+        parser.set_defaults(common_json=True)
 
 
 def write_result(path: Path | None, content: Mapping[str, Any]) -> None:
     """Write what a command found as JSON where it was asked for."""
     from ba_node.io.files import json_text, write_json  # noqa: PLC0415
 
+    _written.append(path)
     if path == STANDARD_OUTPUT:
         _out[-1].write(json_text(content))
     elif path is not None:
         write_json(path, content)
+
+
+def conclude(args: argparse.Namespace, code: int) -> None:
+    """Write the exit code as the result of a command that has no other."""
+    if args.json is not None and args.json not in _written and getattr(args, "common_json", False):
+        write_result(args.json, {"command": args.command, "exit_code": code})
+    _written.clear()
 
 
 @contextmanager
@@ -137,6 +147,14 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
+    )
+
+
+def add_fleet_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that work on many recordings."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes on this machine (default: 1)")
+    parser.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="scheduler of a Dask cluster, e.g. tcp://host:8786"
     )
 
 

@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 from ba_node import __version__
 from ba_node.cli import interrupts
 from ba_node.cli.checkout import CheckoutCommand
-from ba_node.cli.console import add_json_option, json_alone, require_folder
+from ba_node.cli.console import add_json_option, conclude, json_alone, require_folder
 
 # Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -41,6 +41,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "cut",
         "merge",
         "convert",
+        "rig",
         "synth",
     ),
     "the running node": (
@@ -187,6 +188,8 @@ def _run(argv: Sequence[str] | None) -> int:
         require_folder(asked)
         with json_alone(asked):
             code: int = COMMANDS[args.command].run(args)
+            if asked is not None:
+                conclude(args, code)
         sys.stdout.flush()
         return code
     except BrokenPipeError:

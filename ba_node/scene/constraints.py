@@ -11,6 +11,7 @@ receiver are in east, north, up about the first of them (or ``priors.origin_*``)
 from __future__ import annotations
 
 import bisect
+import copy
 import importlib
 from dataclasses import dataclass
 
@@ -70,6 +71,12 @@ class Constraints:
         self.absolute: list[Absolute] = []
         self.world_frame = ""
         self.origin: FloatArray | None = None
+
+    def clone(self) -> Constraints:
+        """Return the same, to which later ones are not added."""
+        other = Constraints()
+        vars(other).update({name: copy.copy(value) for name, value in vars(self).items()})
+        return other
 
     def add_relative(self, measured: RelativePose, log: RejectionLog) -> None:
         """Take in a relative pose; the first between two keyframes stays."""

@@ -53,6 +53,17 @@ class Scene(MapTables):
         self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()
 
+    def clone(self) -> Scene:
+        """Return a scene of its own with the same content but for what waits and what was turned away."""
+        other = Scene(self.config, self.session_id)
+        other.frame_id, other.cameras = self.frame_id, self.cameras
+        other.refused_rig = self.refused_rig
+        other.keyframes, other.landmarks = self.keyframes.clone(), self.landmarks.clone()
+        other.observations, other.blocks = self.observations.clone(), [list(blocks) for blocks in self.blocks]
+        other._index_keyframes()
+        other.constraints = self.constraints.clone()
+        return other
+
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement of this session (or a rig); what cannot be used is counted."""
         if isinstance(measurement, CameraRig):
@@ -154,11 +165,11 @@ class Scene(MapTables):
             self._reject_known(keyframe, known)
         if pose is None:
             return
-        if len(self.keyframes) and keyframe.stamp_ns < self.keyframes.stamp_ns.max():
-            self.log.notice("reordered")
-        ingest.check_stamp(keyframe, self.keyframes, self.log)
+        if keyframe.stamp_ns <= self.newest_ns:
+            self.log.notice("reordered", keyframe.stamp_ns < self.newest_ns)
+            ingest.check_stamp(keyframe, self.keyframes, self.log)
         self.frame_id = self.frame_id or ingest.plain_name(keyframe.frame_id)
-        row = self.keyframes.append(
+        self.keyframes.append(
             1,
             keyframe_id=keyframe.keyframe_id,
             stamp_ns=keyframe.stamp_ns,
@@ -167,9 +178,8 @@ class Scene(MapTables):
             rotation=pose.rotation,
             position=pose.position,
         )
-        self._keyframe_rows[keyframe.keyframe_id] = int(row[0])
+        self._index_newest()
         self.blocks.append([])
-        self._order = None
         if len(self.keyframes) > self.config.max_keyframes:
             self._forget_keyframes()
         self.propagate_corrections()
@@ -200,7 +210,7 @@ class Scene(MapTables):
         self.landmarks.has_guess[rows[new]] = True
         if len(self.keyframes):
             # Counts as seen now, or a full map would forget it before its first observation comes.
-            self._see(rows[new], int(self.keyframes.stamp_ns.max()))
+            self._see(rows[new], self.newest_ns)
         self._limit_landmarks()
 
     def _place(self, tracks: FeatureTracks) -> None:
@@ -240,6 +250,7 @@ class Scene(MapTables):
             self.keyframes.solved[row] = False
         self.landmarks.last[landmarks] = added
         self.landmarks.views[landmarks] += 1
+        self.landmarks.changed(landmarks)
         self._see(landmarks, int(self.keyframes.stamp_ns[row]))
         self._limit_landmarks()
 
@@ -259,16 +270,18 @@ class Scene(MapTables):
 
     def _unseen(self, row: int, tracks: FeatureTracks, landmarks: IntArray) -> BoolArray:
         """Return which landmarks this camera has not seen in this keyframe yet; count the others."""
-        seen = np.zeros(len(self.landmarks), bool)
-        for block in self.blocks[row]:
-            if block.camera == tracks.camera_index:
-                seen[self.observations.landmark[block.begin : block.end]] = True
-        repeated = np.flatnonzero(seen[landmarks])
+        known = [
+            self.observations.landmark[b.begin : b.end] for b in self.blocks[row] if b.camera == tracks.camera_index
+        ]
+        if not known:
+            return np.ones(len(landmarks), bool)
+        seen = np.isin(landmarks, np.concatenate(known))
+        repeated = np.flatnonzero(seen)
         if len(repeated):
             where = f"keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
             what = f"track {tracks.track_id[repeated[0]]} is known in {where}"
             self.log.reject("duplicate_observation", what, len(repeated))
-        return ~seen[landmarks]
+        return ~seen
 
 
 def _same(a: Cameras, b: Cameras) -> bool:

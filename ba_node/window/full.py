@@ -144,8 +144,13 @@ class _Similarity:
         return np.asarray(self.scale[which, None] * turned + self.translation[which])
 
 
-def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Optimization | str:
-    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
+def take_snapshot(
+    scene: Scene, config: Config, wanted: Extras = NOTHING, origin: Scene | None = None
+) -> Optimization | str:
+    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it.
+
+    ``origin`` is the scene that the result is for where this one is a clone of it.
+    """
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
     if isinstance(selection, str):
@@ -154,7 +159,7 @@ def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Opt
     fixed = _fixed(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
     return Optimization(
-        scene,
+        origin or scene,
         selection,
         scene.keyframes.keyframe_id[selection.keyframes],
         scene.landmarks.track_id[selection.landmarks],
@@ -213,6 +218,8 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     table.refined[keyframes[here]] = True
     points.position[landmarks[kept]] = found[kept]
     points.has_position[landmarks[kept]] = True
+    points.changed()
+    scene.moved()
     scene.propagate_corrections()
     _classify(scene, config, taken.selection, keyframes[here], landmarks[kept])
     _join(scene, config, len(table) - 1 - int(scene.places()[keyframes[here]].max()))
