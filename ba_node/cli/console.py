@@ -91,6 +91,14 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_fleet_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that work on many recordings."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes on this machine (default: 1)")
+    parser.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="scheduler of a Dask cluster, e.g. tcp://host:8786"
+    )
+
+
 def parameters(args: argparse.Namespace) -> Config:
     """Return all parameters, with what these options change."""
     from ba_node.config import parse_assignment  # noqa: PLC0415

@@ -26,7 +26,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, gauge, moving, odometry, trial, turns
+from ba_node.window import arrival, constraints, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
@@ -134,9 +134,11 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     active = some_observations(part.problem, np.flatnonzero(inlier))
     held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
     active = dataclasses.replace(active, fixed=held.fixed)
-    factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    factors = constraints.in_place(steps, constraints.factors(scene, config, active, part.keyframes, part.origin))
+    priors = constraints.point_priors(scene, config, part.landmarks, part.origin)
     return Selection(
-        problem=dataclasses.replace(active, factors=factors),
+        problem=dataclasses.replace(active, factors=factors, point_priors=priors),
         observations=obs,
         norms=norms,
         rows=part.rows,
