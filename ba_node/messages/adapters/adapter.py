@@ -288,7 +288,7 @@ class Adapter:
             uv = features.normalised * self.rig.intrinsics[0, :2] + self.rig.intrinsics[0, 2:]
         depth_m = np.empty(0)
         if features.point_in_body:
-            depth_m = self._depth_m(features)
+            depth_m = self._depth_m(features) if features.has_depth else depth_m
             point = point @ geometry.matrix_from_quaternion(pose.orientation).T + pose.position
         ids = features.ids.astype(np.uint64)
         new = [i for i, track in enumerate(ids.tolist()) if track not in self._guessed and np.isfinite(point[i]).all()]

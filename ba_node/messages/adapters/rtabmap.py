@@ -148,6 +148,8 @@ class RtabmapMap(Source):
             normalised=nowhere(len(ids), 2),
             point=point[rows],
             point_in_body=True,
+            # That of a disparity is good near and bad far away.
+            has_depth=not len(_list(node.data, "right_camera_info")),
             wrong={"no_word": ids <= 0, "ambiguous_word": repeated(ids, camera[rows])},
         )
 
