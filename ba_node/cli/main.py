@@ -25,7 +25,7 @@ from ba_node.cli.checkout import CheckoutCommand
 GROUPS: dict[str, tuple[str, ...]] = {
     "refine": ("replay", "tune", "sweep", "solve", "map"),
     "look": ("check", "report", "evaluate"),
-    "recordings and files": ("convert", "synth"),
+    "recordings and files": ("convert", "rig", "synth"),
     "the running node": ("play", "demo", "params"),
     "in a checkout of the repository": ("steps", "robustness", "thesis"),
 }

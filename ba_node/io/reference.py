@@ -70,7 +70,7 @@ def _read(path: Path, topic: str) -> tuple[Poses, bool]:
     """Return a trajectory, and whether it has stamps."""
     if path.is_dir() or path.suffix in _RECORDINGS:
         return _read_topic(path, topic), True
-    columns = _columns(path)
+    columns = first_line(path)
     if "," in columns:
         return _read_table(path, ",", 8, "stamp[ns],x,y,z,qw,qx,qy,qz,... (EuRoC)"), True
     if len(columns.split()) == 12:
@@ -78,7 +78,7 @@ def _read(path: Path, topic: str) -> tuple[Poses, bool]:
     return read_tum(path), True
 
 
-def _columns(path: Path) -> str:
+def first_line(path: Path) -> str:
     """Return the first line of a file that is no comment, empty if it has none or cannot be read."""
     try:
         with open_regular(path, MAX_BYTES) as stream:

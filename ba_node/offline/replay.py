@@ -193,7 +193,7 @@ class _Run:
     def _record(self, estimate: Estimate) -> None:
         if not self.sessions or self.sessions[-1].map_index != estimate.map_index:
             self._begin(estimate)
-        self.sessions[-1].add(estimate, self.backend.map.refined_keyframes())
+        self.sessions[-1].add(estimate, self.backend.map)
         if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
             self._written = len(estimate.trajectory)
             self._write(estimate, OUTPUT_TYPES)

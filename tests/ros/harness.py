@@ -32,7 +32,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RclpyParameter
 
-from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages import conversion
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS
 from ba_node.ros import qos
@@ -217,6 +217,7 @@ class Peer:
             message = conversion.guesses_message(FACTORY, measurement, stamp_ns, "odom")
             self.publishers["landmark_guesses"].publish(message)
         else:
+            assert isinstance(measurement, CameraRig)
             self.publishers["camera_rig"].publish(conversion.rig_message(FACTORY, measurement, stamp_ns))
 
     def play(self, data: SyntheticData, session_id: int = 0) -> None:
