@@ -124,10 +124,18 @@ def replay(
     return report
 
 
-class _Run:
-    """One pass over the measurements."""
+def rehearse(measurements: Sequence[Measurement], config: Config, watch: Watch = Watch()) -> list[SessionRecord]:
+    """Replay measurements and write nothing; return what each session gave."""
+    run = _Run(config, None, watch)
+    run.read(measurements, len(measurements))
+    run.end(optimize=False)
+    return run.sessions
 
-    def __init__(self, config: Config, writer: BagWriter, watch: Watch) -> None:
+
+class _Run:
+    """One pass over the measurements; what comes out is written if there is a writer."""
+
+    def __init__(self, config: Config, writer: BagWriter | None, watch: Watch) -> None:
         self.backend = Backend(config, clock=watch.clock)
         self.sessions: list[SessionRecord] = []
         self._config = config
@@ -207,6 +215,8 @@ class _Run:
         self._inputs = {}
 
     def _write(self, estimate: Estimate, wanted: Container[str]) -> None:
+        if self._writer is None:
+            return
         timeless = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, solve_time_s=0.0))
         for topic, kind, message in output_messages(ROSBAGS_FACTORY, timeless, self._config.output, wanted):
             time_ns = max(0, estimate.stamp_ns)
