@@ -234,6 +234,7 @@ setup(
         "console_scripts": [
             "ba = ba_node.cli.main:main",
             "ba_adapter = ba_node.ros.tools.adapter:main",
+            "ba_front_end = ba_node.ros.front_end.main:main",
             "ba_node = ba_node.ros.main:main",
         ],
         # So that the linter ament_copyright understands the second line of this file.
