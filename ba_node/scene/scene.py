@@ -182,8 +182,7 @@ class Scene(MapTables):
         self._index_newest()
         self.constraints.add_step(keyframe.keyframe_id, keyframe.covariance, self.log)
         self.blocks.append([])
-        if len(self.keyframes) > self.config.max_keyframes:
-            self._forget_keyframes()
+        self._limit_keyframes()
         self.propagate_corrections()
         self._place_pending()
 

@@ -400,3 +400,22 @@ def test_rows_are_numbered_and_told_apart_without_regard_to_the_rest() -> None:
     for _ in range(2):
         assert scene.distinct(rows).tolist() == [3, 7, 9, 40]
         assert scene.numbers(rows, np.array([40, 7])).tolist() == [1, -1, 1, 0, -1, -1]
+
+
+def test_observations_are_bounded_however_many_an_image_shows() -> None:
+    """The oldest keyframes go, a tenth of the bound at once, and no row of what stays is lost."""
+    scene, n = scene_of(rig(), max_observations=1000), 0
+    for i in range(300):
+        ids = np.arange(10 * i, 10 * i + 60 + i % 7, dtype=np.uint64)
+        scene.add(keyframe(i))
+        scene.add(tracks(i, ids=ids))
+        assert len(scene.observations) <= 1000 + len(ids)
+        n = max(n, len(scene.observations))
+        assert int(scene.keyframes.keyframe_id[scene.order[-1]]) == i
+        last = scene.blocks[scene.order[-1]][0]
+        seen = scene.landmarks.track_id[scene.observations.landmark[last.begin : last.end]]
+        assert seen.tolist() == ids.tolist()
+    assert n > 950
+    scene.add(tracks(299, camera=1, ids=np.arange(5000, dtype=np.uint64)))
+    scene.add(keyframe(300))
+    assert scene.keyframes.keyframe_id.tolist() == [299, 300], "the newest stay, whatever they see"
