@@ -253,8 +253,8 @@ class MapTables:
     def _see(self, landmarks: IntArray, stamp_ns: int) -> None:
         self.landmarks.last_seen[landmarks] = np.maximum(self.landmarks.last_seen[landmarks], stamp_ns)
 
-    def _limit_keyframes(self) -> None:
-        """Forget the oldest keyframes with their observations once there is too much of either.
+    def _limit_keyframes(self) -> IdArray:
+        """Forget the oldest keyframes with their observations once there is too much of either; return their ids.
 
         A tenth at once, so that the cost is spread; the two newest stay.
         """
@@ -267,7 +267,8 @@ class MapTables:
             n_drop = max(n_drop, 1 + int(np.searchsorted(seen, excess)))
         n_drop = min(n_drop, len(table) - 2)
         if n_drop <= 0:
-            return
+            return table.keyframe_id[:0]
+        forgotten = table.keyframe_id[self.order[:n_drop]]
         keep = np.ones(len(table), bool)
         keep[self.order[:n_drop]] = False
         self._drop_observations(keep[self.observations.keyframe])
@@ -275,6 +276,7 @@ class MapTables:
         self.observations.keyframe[:] = renumbered[self.observations.keyframe]
         self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
         self._index_keyframes()
+        return forgotten
 
     def _limit_landmarks(self) -> None:
         """Forget the landmarks seen longest ago, ties by row, once there are too many; again a tenth at once."""
