@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -97,6 +97,13 @@ def add_fleet_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scheduler", default="", metavar="ADDRESS", help="scheduler of a Dask cluster, e.g. tcp://host:8786"
     )
+
+
+def say_left_out(left_out: Mapping[str, str]) -> int:
+    """Name the recordings that could not be used, and why; return the exit code."""
+    for name, words in left_out.items():
+        print(f"ba: error: {words if name in words else f'{name}: {words}'}", file=sys.stderr)
+    return 3 if left_out else 0
 
 
 def parameters(args: argparse.Namespace) -> Config:
