@@ -23,7 +23,7 @@ from typing import Any
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations, find
 from ba_node.offline.fleet import Fleet, result_of
 from ba_node.offline.measure import Measured, MeasureError, Question, measure
-from ba_node.offline.study import MAX_LOSS, MAX_SCORE, MIN_GAIN, Plan, Study, Trial, TuneError
+from ba_node.offline.study import MAX_LOSS, MAX_SCORE, MIN_GAIN, Goal, Plan, Study, Trial, TuneError
 
 
 @dataclass(frozen=True)
