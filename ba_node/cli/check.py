@@ -26,8 +26,8 @@ from ba_node.cli.console import (
     add_parameter_options,
     parameters,
     progress_bar,
-    require_folder,
     table,
+    write_result,
 )
 
 if TYPE_CHECKING:
@@ -49,15 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", nargs="+", metavar="RECORDING", help="a file, a folder, or a URL; repeatable")
     add_fleet_options(parser)
     add_parameter_options(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all of it as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    from ba_node.io.files import write_json  # noqa: PLC0415
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
-    require_folder(args.json)
     config = parameters(args)
     if len(args.bag) > 1 or args.scheduler or "://" in args.bag[0]:
         return _check_all(args, config)
@@ -72,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         for text in session.warnings:
             print(f"ba: warning: {text}", file=sys.stderr)
-    if args.json is not None:
-        write_json(args.json, {"sessions": [session.as_dict() for session in sessions]})
+    write_result(args.json, {"sessions": [session.as_dict() for session in sessions]})
     if any(session.found.findings or session.warnings for session in sessions):
         return MISTAKE
     return 0 if any(session.found.sound for session in sessions) else TOO_LITTLE
@@ -81,7 +77,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_all(args: argparse.Namespace, config: Config) -> int:
     """Check many recordings."""
-    from ba_node.io.files import write_json  # noqa: PLC0415
     from ba_node.io.mcap import TopicChoice  # noqa: PLC0415
     from ba_node.offline import batch  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet, expand  # noqa: PLC0415
@@ -91,8 +86,7 @@ def _check_all(args: argparse.Namespace, config: Config) -> int:
         rows = batch.check_all(fleet, tasks, progress)
     for row in rows:
         print(f"{row['recording']}: {row['state']}", *_wrapped(row["note"], _WIDTH, "    ", "    "), sep="\n")
-    if args.json is not None:
-        write_json(args.json, {"recordings": rows})
+    write_result(args.json, {"recordings": rows})
     if all(row["state"] == batch.FAILED for row in rows):
         return TOO_LITTLE
     return 0 if all(row["state"] == batch.OK for row in rows) else MISTAKE

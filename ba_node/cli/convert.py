@@ -23,7 +23,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import TargetError, add_topic_options, require_folder, require_mcap, topic_choice
+from ba_node.cli.console import (
+    TargetError,
+    add_topic_options,
+    require_folder,
+    require_mcap,
+    topic_choice,
+    write_result,
+)
 
 SUMMARY = "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY"
 EXAMPLE = (
@@ -69,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     what = convert.read(args.source, topic_choice(args))
     left_out = convert.write(args.target, what, form)
     print(f"{args.target}: {convert.counts(what)}{f', without {left_out}' if left_out else ''}")
+    write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})
     return 0
 
 
@@ -85,6 +93,7 @@ def _convert_front_end(args: argparse.Namespace) -> int:
     options = AdapterOptions(args.tolerance, args.parallax, rig=rig)
     adapter = adapt(args.source, args.target, args.front_end, options, args.cameras, topics)
     print(f"{args.target}: {adapter.summary()}")
+    write_result(args.json, {"summary": adapter.summary(), "notes": list(adapter.told())})
     for note in adapter.told():
         print(f"  {note}")
     return NEEDS_A_LOOK if any(adapter.counted[reason] for reason in _FAULTS) else 0

@@ -38,6 +38,7 @@ from ba_node.cli.console import (
     require_folder,
     table,
     topic_choice,
+    write_result,
 )
 from ba_node.offline.attention import HARMLESS
 
@@ -99,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
     print(facts(_rows(report)))
     _tell(report)
     print(f"written to {args.out}{'' if args.no_report else _pictures(args.out)}")
+    write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
 
 

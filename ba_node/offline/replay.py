@@ -30,7 +30,7 @@ from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
-from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES
+from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, WHOLE_MAP
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.run_folder import recording_facts, versions, write_details
@@ -198,7 +198,7 @@ class _Run:
             self._written = len(estimate.trajectory)
             self._write(estimate, OUTPUT_TYPES)
         else:
-            self._write(estimate, OUTPUT_TYPES.keys() - set(LATCHED_OUTPUTS))
+            self._write(estimate, OUTPUT_TYPES.keys() - set(WHOLE_MAP))
 
     def _begin(self, estimate: Estimate) -> None:
         session_id = self.backend.map.session_id
@@ -211,7 +211,7 @@ class _Run:
         if record is not None and not record.closed:
             record.close(summary)
             if len(record.last.trajectory) > self._written:
-                self._write(record.last, LATCHED_OUTPUTS)
+                self._write(record.last, WHOLE_MAP)
         self._inputs = {}
 
     def _write(self, estimate: Estimate, wanted: Container[str]) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from ba_node.core import geometry
 from ba_node.estimate import Transform
-from ba_node.ros.front_end.streams import Frame, OdometryBuffer, Streams
+from ba_node.front_end.streams import Frame, OdometryBuffer, Streams
 
 MS = 1_000_000
 
