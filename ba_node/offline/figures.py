@@ -162,15 +162,25 @@ def _over_time(shown: Sequence[_Shown]) -> Figure:
     return Figure("error", "Error over time", text, data, layout)
 
 
-def _objective(shown: Sequence[_Shown]) -> Figure:
+def _of_solves(shown: Sequence[_Shown], what: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return a figure of each solve: before it, unless several runs are shown, and after it; 0 is none."""
     data = []
     for one in shown:
-        for name, key, colour in (("before", "objective_before", BEFORE), ("after", "objective_after", one.colour)):
-            if len(one.solve_s) and not (name == "before" and one.several):
-                values = np.where(one.details[key] > 0.0, one.details[key], np.nan)
-                data.append(line(one.solve_s, values, one.name(name), colour))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "objective", "type": "log"}}
-    return Figure("objective", "Objective of each solve", "At its start and at its end.", data, layout)
+        for name, colour in (("before", BEFORE), ("after", one.colour))[one.several :]:
+            values = one.details[f"{what}_{name}"] if len(one.solve_s) else np.empty(0)
+            if values.any():
+                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
+    return data, {"xaxis": {"title": "time [s]"}, "yaxis": {"type": "log"}}
+
+
+def _objective(shown: Sequence[_Shown]) -> Figure:
+    text = "The cost at its start and at its end."
+    return Figure("objective", "Objective of each solve", text, *_of_solves(shown, "objective"))
+
+
+def _held_out(shown: Sequence[_Shown]) -> Figure:
+    text = "Median residual [px] of tracks that took no part in a solve, by the front-end's poses and by the solution."
+    return Figure("held_out", "Tracks held out", text, *_of_solves(shown, "held_out_px"))
 
 
 def _arrows(shown: Sequence[_Shown]) -> Figure:
@@ -303,18 +313,6 @@ def _health(shown: Sequence[_Shown]) -> Figure:
     }
     text = "Share of a window's observations that agree with its solution, median parallax, and what the guard held."
     return Figure("health", "Health of each window", text, data, layout)
-
-
-def _held_out(shown: Sequence[_Shown]) -> Figure:
-    data = []
-    for one in shown:
-        for name, key, colour in (("before", "held_out_px_before", BEFORE), ("after", "held_out_px_after", one.colour)):
-            values = one.details[key] if len(one.solve_s) else np.empty(0)
-            if values.any() and not (name == "before" and one.several):
-                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "median residual [px]", "type": "log"}}
-    text = "Tracks that took no part in a solve, by the front-end's poses and by the solution."
-    return Figure("held_out", "Tracks held out", text, data, layout)
 
 
 def _latency(shown: Sequence[_Shown]) -> Figure:
