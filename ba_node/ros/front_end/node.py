@@ -63,6 +63,8 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _LOOK_S, _LOG_S = 0.5, 5.0
 # Frames that wait for cameras, or for the odometry of their time.
 _MAX_WAITING = 30
+# Stamps of images further in the future are wrong, s.
+_MAX_AHEAD_S = 1.0
 # Messages that wait for a back-end.
 _MAX_UNSENT = 300
 # A publisher that began anew counts anew.
@@ -224,8 +226,13 @@ class FrontEndNode(ManagedNode):
         self._notice_losses(name, info["publication_sequence_number"])
         if not self._active or self._streams is None:
             return
-        before = self._streams.counted.copy()
-        self._frames += self._streams.put(name, stamp_ns_from_message(message.header.stamp), message)
+        before, stamp_ns = self._streams.counted.copy(), stamp_ns_from_message(message.header.stamp)
+        ahead_s = (stamp_ns - self.get_clock().now().nanoseconds) / 1e9
+        if ahead_s > _MAX_AHEAD_S:
+            self._warn(
+                "future", f"stamps of {name} are {ahead_s:.1f} s ahead of this machine's clock: set the clocks right"
+            )
+        self._frames += self._streams.put(name, stamp_ns, message)
         for reason in self._streams.counted - before:
             off = self._streams.apart_ns.get(reason.removeprefix("no "), 0)
             words = f", the nearest is {off / 1e6:+.1f} ms off" if off else ""

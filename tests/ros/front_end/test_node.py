@@ -241,6 +241,39 @@ def test_other_modes_and_compressed_images(start_node: StartNode, make_peer: Mak
 
 
 @pytest.mark.slow
+def test_depth_and_masks(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
+    """Depth from semi-global matching in mm; a mask that lets the lower half alone be seen; stamps in the future."""
+    node, peer = start_node("--ros-args", "-p", "mask_topic:=true", program=PROGRAM), make_peer()
+    as_back_end(peer)
+    camera = Camera(peer, "rgb", "depth")
+    kind = message_class("sensor_msgs/msg/Image")
+    peer.publishers["mask"] = peer.node.create_publisher(kind, "mask", qos.reliable(100))
+    camera.connect()
+    match = cv2.StereoSGBM.create(0, 128, 5)
+    begin_ns = time.time_ns() + 10**10
+    for i in range(8):
+        left, right = kitti.image("left", i), kitti.image("right", i)
+        disparity = match.compute(left, right).astype(float) / 16.0
+        depth = np.where(disparity > 1.0, -kitti.p[1][3] / np.maximum(disparity, 1.0), 0.0)
+        mask = np.zeros_like(left)
+        mask[mask.shape[0] // 2 :] = 255
+        stamp = begin_ns + i * STEP_NS
+        camera.publish("rgb", stamp, np.dstack([left] * 3), kitti.p[0], "bgr8")
+        camera.publish("depth", stamp, np.minimum(depth * 1000.0, 65535).astype(np.uint16), kitti.p[0], "16UC1")
+        peer.publishers["mask"].publish(image_message(stamp, mask))
+    peer.until(lambda: len(peer.received["feature_tracks"]) >= 4, "tracks")
+    v = np.concatenate([np.asarray(message.v) for message in peer.received["feature_tracks"]])
+    assert len(v) > 200 and v.min() > left.shape[0] // 2 - 2
+    depth_m = np.concatenate([np.asarray(message.depth_m) for message in peer.received["feature_tracks"]])
+    assert 5.0 < np.nanmedian(depth_m) < 40.0
+    last = peer.received["keyframes"][-1]
+    moved = kitti.truth[(stamp_of(last) - begin_ns) // STEP_NS, 2, 3]
+    assert last.pose.pose.position.z == pytest.approx(moved, rel=0.1)
+    assert "ahead of this machine's clock" in node.err
+    assert node.stop() == 0
+
+
+@pytest.mark.slow
 def test_a_restart_of_the_node_is_another_session(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
     node, peer = start_node(program=PROGRAM), make_peer()
     sent = peer.received["keyframes"]
