@@ -50,14 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", type=Path, metavar="OUT")
     parser.add_argument("--to", choices=_FORMATS, help="format of OUT, where its name does not tell it")
     add_topic_options(parser)
-    add_front_end_options(parser.add_argument_group("recordings of other front-ends"), required=False)
+    _add_front_end_options(parser.add_argument_group("recordings of other front-ends"))
 
 
-def add_front_end_options(parser: argparse._ActionsContainer, *, required: bool) -> None:
-    """Declare what is said of another front-end, here and to ba_adapter."""
+def _add_front_end_options(parser: argparse._ArgumentGroup) -> None:
     from ba_node.messages.adapters import SOURCES  # noqa: PLC0415  # slow to import
 
-    parser.add_argument("--from", dest="front_end", choices=SOURCES, required=required, help="which of them it is")
+    parser.add_argument("--from", dest="front_end", choices=SOURCES, help="which of them it is")
     parser.add_argument("--rig", type=Path, nargs="+", metavar="FILE", help="cameras, in any form that ba rig reads")
     parser.add_argument("--tolerance", type=float, default=1e-3, metavar="S", help="stamps pair within (%(default)s)")
     parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")

@@ -26,6 +26,8 @@ from ba_node.cli.console import add_json_option, conclude, json_alone, require_f
 GROUPS: dict[str, tuple[str, ...]] = {
     "refine": (
         "replay",
+        "tune",
+        "sweep",
         "solve",
         "map",
     ),

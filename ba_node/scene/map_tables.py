@@ -139,6 +139,26 @@ class MapTables:
         self._link_rows(rows, np.concatenate([landmarks, added]))
         return added
 
+    def join(self, landmark: int, into: int) -> bool:
+        """Give the views of one landmark to another; False, and nothing changes, if one image sees both."""
+        observations = self.observations
+        rows = [self.views_of(np.array([one])) for one in (landmark, into)]
+        seen = [set(zip(observations.keyframe[r].tolist(), observations.camera[r].tolist(), strict=True)) for r in rows]
+        if landmark == into or seen[0] & seen[1]:
+            return False
+        table = self.landmarks
+        if not table.has_position[into]:
+            table.position[into], table.has_position[into] = table.position[landmark], table.has_position[landmark]
+        table.has_position[landmark] = table.has_guess[landmark] = False
+        both = np.sort(np.concatenate(rows))
+        observations.landmark[rows[0]] = into
+        # What was an outlier of the one may fit the other.
+        observations.outlier[both] = False
+        self._link_rows(both, np.array([landmark, into]))
+        table.changed(np.array([landmark, into]))
+        self._see(np.array([into]), int(table.last_seen[landmark]))
+        return True
+
     def moved(self, keyframes: IntArray | None = None) -> None:
         """Note that keyframes have other poses, or are refined or no longer; all by default."""
         if keyframes is None:
@@ -183,6 +203,21 @@ class MapTables:
                 return begin + int(found[-1])
             place, size = begin, 2 * size
         return -1
+
+    def poses_and_points(self) -> tuple[FloatArray | BoolArray, ...]:
+        """Return a copy of where keyframes and points are, to be restored as long as none comes or goes."""
+        table, points = self.keyframes, self.landmarks
+        return tuple(a.copy() for a in (table.rotation, table.position, points.position, points.has_position))
+
+    def restore(self, known: tuple[FloatArray | BoolArray, ...]) -> None:
+        """Put keyframes and points back to where :meth:`poses_and_points` had them."""
+        table, points = self.keyframes, self.landmarks
+        for column, was in zip(
+            (table.rotation, table.position, points.position, points.has_position), known, strict=True
+        ):
+            column[:] = was
+        self.moved()
+        points.changed()
 
     def forget_solutions(self) -> None:
         """Put keyframes back to where the front-end has them; forget where points are and which views are outliers."""

@@ -8,6 +8,8 @@ What contradicts or cannot be used is counted in ``log`` and leaves the scene as
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ba_node.arrays import BoolArray, IntArray
@@ -33,9 +35,6 @@ from ba_node.scene.constraints import Constraints
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
-
-# Standard deviation of a fix that tells none, m.
-_FIX_SIGMA_M = 5.0
 
 
 class Scene(MapTables):
@@ -96,7 +95,7 @@ class Scene(MapTables):
         if isinstance(measured, PosePrior):
             self.constraints.add_pose(measured, self.log)
         else:
-            self.constraints.add_fix(measured, _FIX_SIGMA_M, self.log)
+            self.constraints.add_fix(measured, self.log)
 
     def _add_constraint(self, measured: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> None:
         if isinstance(measured, RelativePose):
@@ -105,6 +104,8 @@ class Scene(MapTables):
             self.constraints.add_gravity(measured, self.log)
         elif isinstance(measured, LandmarkPriors):
             self.constraints.add_landmarks(measured, self.log)
+        else:
+            self.constraints.add_merge(measured, self.log)
 
     def usable(self, measurement: Keyframe | OfSession) -> bool:
         """Return True if anything of a measurement passes the checks it can be given by itself; count nothing."""
@@ -179,6 +180,7 @@ class Scene(MapTables):
             position=pose.position,
         )
         self._index_newest()
+        self.constraints.add_step(keyframe.keyframe_id, keyframe.covariance, self.log)
         self.blocks.append([])
         if len(self.keyframes) > self.config.max_keyframes:
             self._forget_keyframes()
@@ -229,6 +231,7 @@ class Scene(MapTables):
             what = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}, an id that came twice"
             self.log.reject("duplicate_observation", what, len(tracks.track_id))
             return
+        tracks = self._renamed(tracks)
         landmarks = self._rows_of(tracks.track_id)
         new = self._unseen(row, tracks, landmarks)
         landmarks = landmarks[new]
@@ -253,6 +256,27 @@ class Scene(MapTables):
         self.landmarks.changed(landmarks)
         self._see(landmarks, int(self.keyframes.stamp_ns[row]))
         self._limit_landmarks()
+
+    def _renamed(self, tracks: FeatureTracks) -> FeatureTracks:
+        """Return tracks under the ids that they go on under; one that so comes twice in the image is turned away."""
+        names = self.constraints.names_of(tracks.track_id)
+        if names is tracks.track_id:
+            return tracks
+        kept = np.sort(np.unique(names, return_index=True)[1])
+        if len(kept) < len(names):
+            what = f"merged tracks in keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
+            self.log.reject("duplicate_observation", f"{what}: one image sees both", len(names) - len(kept))
+        rows = {name: getattr(tracks, name)[kept] for name in ("uv", "sigma_px", "depth_m")}
+        return dataclasses.replace(tracks, track_id=names[kept], **rows)
+
+    def join_tracks(self, track: int, other: int) -> bool:
+        """Let a track go on under the id of another; False (counted) if one image sees both."""
+        rows = self.find_landmarks(np.array([track, other], np.uint64))
+        if not self.join(int(rows[0]), int(rows[1])):
+            self.log.reject("bad_merge", f"tracks {track} and {other}: one image sees both, they are no one point")
+            return False
+        self.constraints.renamed[track] = other
+        return True
 
     def _place_pending(self) -> None:
         waiting, self.pending = self.pending, []

@@ -104,7 +104,7 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
     ]
     near = [_near(problem, start, config) for start in starts]
     for i in sorted(range(len(starts)), key=lambda i: -near[i])[:_TRIED]:
-        state = _lowered(problem, starts[i])
+        state = lowered(problem, starts[i])
         norms = native_kernels.residual_norms(problem, state, config.solver.kernels)
         agreeing = int(np.count_nonzero(norms <= _WIDE * config.tracks.outlier_px))
         if agreeing > most:
@@ -163,7 +163,7 @@ def _starts(scene: Scene, row: int) -> list[tuple[FloatArray, FloatArray]]:
     return [geometry.inverse(rotation, position - origin) for rotation, position in poses]
 
 
-def _lowered(problem: Problem, state: State) -> State:
+def lowered(problem: Problem, state: State) -> State:
     """Return the pose after steps of a robust loss that narrows; points are held."""
     with np.errstate(all="ignore"):
         for width in _WIDTHS:

@@ -131,7 +131,7 @@ class Optimization:
 
 
 @dataclass(frozen=True)
-class _Similarity:
+class Similarity:
     """x -> scale * rotation x + translation: (n,), (n, 3, 3), (n, 3)."""
 
     scale: FloatArray
@@ -208,7 +208,7 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     anchor_of_row = np.empty(len(table), np.intp)
     anchor_of_row[scene.order] = anchor
 
-    _follow_points(scene, landmarks[kept], anchor_of_row, similarity)
+    follow_points(scene, landmarks[kept], anchor_of_row, similarity)
     others = np.flatnonzero((member < 0) & table.refined)
     which = anchor_of_row[others]
     table.position[others] = similarity.move(which, table.position[others])
@@ -244,7 +244,7 @@ def _corrections(
     result: tuple[FloatArray, FloatArray, FloatArray],
     keyframes: IntArray,
     landmarks: IntArray,
-) -> _Similarity:
+) -> Similarity:
     """Return the correction at each keyframe of the snapshot; senseless at those that are forgotten."""
     rotation, position, found = result
     before = (scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes])
@@ -257,7 +257,7 @@ def _corrections(
     was = np.linalg.norm(scene.landmarks.position[landmarks[point]] - before[1][at], axis=1)
     sound = (far > 0) & (was > 0)
     scale = _medians(far[sound] / was[sound], at[sound], len(keyframes))
-    return _Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
+    return Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
 
 
 def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
@@ -277,7 +277,7 @@ def _anchors(member: IntArray) -> IntArray:
     return np.asarray(member[np.where(at < 0, int(np.argmax(member >= 0)), at)])
 
 
-def _follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: _Similarity) -> None:
+def follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: Similarity) -> None:
     """Move the points that the result does not place with the keyframe that saw them first."""
     follows = scene.landmarks.has_position.copy()
     follows[updated] = False

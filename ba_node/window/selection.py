@@ -26,7 +26,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, gauge, moving, odometry, trial, turns
+from ba_node.window import arrival, constraints, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
@@ -134,9 +134,11 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     active = some_observations(part.problem, np.flatnonzero(inlier))
     held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
     active = dataclasses.replace(active, fixed=held.fixed)
-    factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    factors = constraints.in_place(steps, constraints.factors(scene, config, active, part.keyframes, part.origin))
+    priors = constraints.point_priors(scene, config, part.landmarks, part.origin)
     return Selection(
-        problem=dataclasses.replace(active, factors=factors),
+        problem=dataclasses.replace(active, factors=factors, point_priors=priors),
         observations=obs,
         norms=norms,
         rows=part.rows,
@@ -179,11 +181,44 @@ def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:
 
 
 def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
-    """Return what may take part, and its residuals at the start, sigmas."""
+    """Return what may take part, with a first position for points that have none, and its residuals there, sigmas.
+
+    Positions are NaN where none can be had yet.
+    """
     part = _turned(scene, _reach(scene, window, config, without), window, config)
-    part = dataclasses.replace(part, problem=_placed(scene, part, config))
-    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
-    return part, native_kernels.residual_norms(part.problem, start, config.solver.kernels)
+    problem, kernels, new = part.problem, config.solver.kernels, ~scene.landmarks.has_position[part.landmarks]
+    points = np.where(new[:, None], 0.0, problem.start.points)
+    norms = native_kernels.residual_norms(problem, _at(problem, points).start, kernels)
+    of_new = new.take(problem.observations.point)
+    heard = ~scene.observations.outlier.take(part.rows)
+    points[new] = np.nan
+    rows = np.flatnonzero(of_new & heard)
+    if len(rows):
+        points[new] = _first_positions(scene, part, rows, (new, norms[heard & ~of_new]), config)
+        found = part_of(problem, np.flatnonzero(of_new), np.ones(len(part.keyframes), bool), new)
+        norms[of_new] = native_kernels.residual_norms(found, _at(found, np.nan_to_num(points[new])).start, kernels)
+    return dataclasses.replace(part, problem=_at(problem, points)), norms
+
+
+def _first_positions(
+    scene: Scene, part: _Part, rows: IntArray, among: tuple[BoolArray, FloatArray], config: Config
+) -> FloatArray:
+    """Return first positions (n_new, 3) of the points that have none, of which ``rows`` are the inlier observations.
+
+    ``among`` tells which they are, (n_pt,), and how far off the views of the others are, sigmas.
+    """
+    new, norms = among
+    of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
+    guess = moved_guesses(scene, part.landmarks[new]) - part.origin
+    if len(norms) < _BULK:
+        gate = poses_gate(of_new, config.tracks, config.solver.kernels)
+    else:
+        gate = widened(config.tracks.max_triangulation_px, norms)
+    return initial_points(of_new, guess, config.tracks, gate, config.solver.kernels)
+
+
+def _at(problem: Problem, points: FloatArray) -> Problem:
+    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:
@@ -250,41 +285,13 @@ def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Par
     """Return a part that begins with the orientations that images alone tell."""
     if not config.odometry.enabled or len(part.keyframes) > _MOST_TURNS:
         return part
-    of_window = np.isin(part.keyframes, window).take(part.problem.observations.keyframe)
+    of_window = (scene.numbers(part.keyframes, window) >= 0).take(part.problem.observations.keyframe)
     used = of_window & ~scene.observations.outlier.take(part.rows)
     found = turns.find(part.problem, part.keyframes, used, scene.landmarks.has_position[part.landmarks])
     if found is None:
         return part
     free = ~scene.keyframes.refined[part.keyframes]
     return dataclasses.replace(part, problem=found.applied(part.problem, part.keyframes, free), turned=found)
-
-
-def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
-    """Return the problem of a part with first positions of points that have none, NaN where none can be had yet."""
-    new = ~scene.landmarks.has_position[part.landmarks]
-    points = part.problem.start.points.copy()
-    points[new] = np.nan
-    rows = np.flatnonzero(new.take(part.problem.observations.point) & ~scene.observations.outlier.take(part.rows))
-    if len(rows):
-        of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
-        guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        gate = _gate(scene, part, new, config) or poses_gate(of_new, config.tracks, config.solver.kernels)
-        points[new] = initial_points(of_new, guess, config.tracks, gate, config.solver.kernels)
-    return _with_points(part.problem, points)
-
-
-def _gate(scene: Scene, part: _Part, new: BoolArray, config: Config) -> float | None:
-    """Return how far off a view of a new point may be: as those of the known points are; None without these."""
-    rows = np.flatnonzero(~new.take(part.problem.observations.point) & ~scene.observations.outlier.take(part.rows))
-    if len(rows) < _BULK:
-        return None
-    known = some_observations(part.problem, rows)
-    norms = native_kernels.residual_norms(known, known.start, config.solver.kernels)
-    return widened(config.tracks.max_triangulation_px, norms)
-
-
-def _with_points(problem: Problem, points: FloatArray) -> Problem:
-    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
 def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:

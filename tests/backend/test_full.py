@@ -19,7 +19,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, solver
 from ba_node.core.result import Iteration, Status
 from ba_node.evaluation.alignment import align
-from ba_node.measurements import CameraRig, Measurement
+from ba_node.measurements import CameraRig, Measurement, OfTime
 from ba_node.synthetic import SyntheticData, SyntheticOptions
 from ba_node.window import full
 from ba_node.window.merging import scaled
@@ -212,7 +212,9 @@ def test_the_result_of_a_map_that_is_gone_changes_nothing(lost: str) -> None:
     elif lost == "map":
         backend.take_over(unpack(backend.snapshot(), CONFIG.scene))
     else:
-        feed(backend, [m if isinstance(m, CameraRig) else dataclasses.replace(m, session_id=1) for m in stream])
+        feed(
+            backend, [m if isinstance(m, CameraRig | OfTime) else dataclasses.replace(m, session_id=1) for m in stream]
+        )
     before = backend.estimate().trajectory.position
     assert backend.merge(taken) is None
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before)

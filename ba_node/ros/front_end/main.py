@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 
 from ba_node.config import ConfigError
+from ba_node.ros import arguments
 from ba_node.ros.front_end.node import NODE_NAME, FrontEndNode
 from ba_node.ros.main import USAGE_ERROR, signals, spin
 from ba_node.ros.rclpy_compat.executor import NodeExecutor
@@ -24,10 +24,8 @@ def main(args: Sequence[str] | None = None) -> int:
     with signals() as ended:
         try:
             rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
-            if words := remove_ros_args(given)[1:]:
-                return _refuse(
-                    f"argument {words[0]!r} is not known: parameters are given as --ros-args -p mode:=stereo"
-                )
+            if reason := arguments.objection(given):
+                return _refuse(reason)
             node = FrontEndNode()
         except (*ARGUMENT_ERRORS, ConfigError) as error:
             return _refuse(str(error))

@@ -30,9 +30,18 @@ from ba_node.config.front_end_node import FrontEndNodeOptions
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Poses
 from ba_node.front_end.front_end import FrontEnd
-from ba_node.front_end.images import depth_of, grey_of
 from ba_node.front_end.opencv import cv2
-from ba_node.front_end.records import FrontEndError, Images, State, Tracked
+from ba_node.front_end.records import FrontEndError, State, Tracked
+from ba_node.front_end.streams import (
+    MASK,
+    MODES,
+    Frame,
+    OdometryBuffer,
+    Streams,
+    cameras_of,
+    images_of,
+    transform_of,
+)
 from ba_node.io.rig_file import read_rig
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages import conversion
@@ -42,24 +51,16 @@ from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
 from ba_node.messages.transforms import StaticTree, tf_message
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
-from ba_node.ros.front_end.streams import Frame, OdometryBuffer, Streams, transform_of
 from ba_node.ros.log import Severity, Throttle, log
 from ba_node.ros.parameters import declare
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.tools.adapter import PUBLISHED
 
 NODE_NAME = "ba_front_end"
-# Images of each mode, the leading one first; the camera_info of each lies beside it.
-MODES = {
-    "stereo": ("left/image_raw", "right/image_raw"),
-    "rgbd": ("rgb/image_raw", "depth/image_raw"),
-    "mono": ("image_raw",),
-}
-MASK = "mask"
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _LOOK_S, _LOG_S = 0.5, 5.0
-# Frames that wait for the odometry of their time.
+# Frames that wait for cameras, or for the odometry of their time.
 _MAX_WAITING = 30
 # Share of the time that tracking may take before images get lost.
 _BUSY = 0.95
@@ -173,7 +174,7 @@ class FrontEndNode(ManagedNode):
         self._listen(kind, topic, functools.partial(self._on_image, name), profile)
         self._subscribed[name] = topic
         self._log(Severity.INFO, f"{topic} ({kind}) is taken as {name}, mode {self._mode}")
-        if self._rig is None and name in _cameras(self._mode):
+        if self._rig is None and name in cameras_of(self._mode):
             beside, take = name.replace("image_raw", "camera_info"), functools.partial(self._on_info, name)
             # As with the cameras of ba_node: drivers publish them volatile, players latched.
             self._listen(INPUT_TYPES["camera_info"], beside, take, qos.latched(), **qos.at_peace())
@@ -183,6 +184,7 @@ class FrontEndNode(ManagedNode):
         known = self._infos.setdefault(name, info)
         if self._front_end is None:
             self._infos[name] = info
+            self._go_on()
         elif any(list(getattr(known, key)) != list(getattr(info, key)) for key in ("k", "d", "p")):
             self._warn("camera_info", f"camera_info of {name} has changed: what came first stays, or configure anew")
 
@@ -220,10 +222,9 @@ class FrontEndNode(ManagedNode):
         self._go_on()
 
     def _go_on(self) -> None:
-        """Track the frames whose odometry is known."""
+        """Track the frames whose cameras and odometry are known, or that have waited long."""
         while self._frames and self._active:
-            waits = self.options.odometry != "none" and not self._odometry.covers(self._frames[0].stamp_ns)
-            if waits and len(self._frames) <= _MAX_WAITING:
+            if len(self._frames) <= _MAX_WAITING and not self._is_known(self._frames[0].stamp_ns):
                 return
             began = time.perf_counter()
             try:
@@ -232,6 +233,11 @@ class FrontEndNode(ManagedNode):
                 self.counted["unusable"] += 1
                 self._warn("unusable", f"{error} (images left out: {self.counted['unusable']})")
             self._busy_s += time.perf_counter() - began
+
+    def _is_known(self, stamp_ns: int) -> bool:
+        """Return True if the cameras are known, and the odometry of a time."""
+        cameras = self._rig is not None or all(name in self._infos for name in cameras_of(self._mode))
+        return cameras and (self.options.odometry == "none" or self._odometry.covers(stamp_ns))
 
     def _track(self, frame: Frame) -> None:
         """Track one frame, and publish what comes of it."""
@@ -242,7 +248,7 @@ class FrontEndNode(ManagedNode):
             self.counted[reason] += 1
             self._warn(reason, f"{reason} for {self.counted[reason]} images")
             return
-        tracked = front_end.process(_images(frame, MODES[self._mode]), odometry)
+        tracked = front_end.process(images_of(frame, self._mode), odometry)
         self.counted["images"] += 1
         for note in tracked.notes:
             self._warn(note, note)
@@ -256,7 +262,7 @@ class FrontEndNode(ManagedNode):
 
     def _begin(self) -> FrontEnd | None:
         """Make the tracker once all cameras are known, and publish the rig."""
-        options, cameras = self.options, _cameras(self._mode)
+        options, cameras = self.options, cameras_of(self._mode)
         if self._rig is None:
             if any(name not in self._infos for name in cameras):
                 return None
@@ -340,25 +346,9 @@ class FrontEndNode(ManagedNode):
         log(self, severity, words)
 
 
-def _cameras(mode: str) -> tuple[str, ...]:
-    """Return the images of a mode that have a camera in the rig."""
-    return tuple(name for name in MODES[mode] if not name.startswith("depth"))
-
-
 def read_mask(path: str) -> BoolArray:
     """Return the mask in a picture, (h, w), False where it is black; raise FrontEndError if there is none."""
     picture = cv2().imread(path, cv2().IMREAD_GRAYSCALE)
     if picture is None:
         raise FrontEndError(f"mask_file {path!r} is no picture that can be read")
     return np.asarray(picture > 0)
-
-
-def _images(frame: Frame, names: tuple[str, ...]) -> Images:
-    """Return what a frame shows; depth and mask belong to its first image."""
-    depth, mask = None, None
-    grey = tuple(grey_of(frame.messages[name]) for name in names if not name.startswith("depth"))
-    if names[-1].startswith("depth"):
-        depth = depth_of(frame.messages[names[-1]])
-    if MASK in frame.messages:
-        mask = grey_of(frame.messages[MASK]) > 0
-    return Images(frame.stamp_ns, grey, depth, frame.skew_ns, mask)

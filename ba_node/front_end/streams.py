@@ -1,18 +1,28 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Put together what belongs to one time: images of several topics, and the odometry at it."""
+"""Put together what belongs to one time: images of several topics, and the odometry at it. Live and offline alike."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ba_node.core import geometry
 from ba_node.estimate import Transform
+from ba_node.front_end.images import depth_of, grey_of
+from ba_node.front_end.records import Images
 
+# Images of each mode, the leading one first, by the ends of their topics' names; camera_info lies beside each.
+MODES = {
+    "stereo": ("left/image_raw", "right/image_raw"),
+    "rgbd": ("rgb/image_raw", "depth/image_raw"),
+    "mono": ("image_raw",),
+}
+MASK = "mask"
 # Images further apart are never of one time, ns; what is nearer but not near enough, the front-end says.
 MAX_APART_NS = 50_000_000
 _KEPT_POSES = 2000
@@ -24,6 +34,23 @@ class Frame(NamedTuple):
     stamp_ns: int  # of the first stream
     messages: dict[str, Any]
     skew_ns: int  # stamp of the second stream less that of the first
+
+
+def cameras_of(mode: str) -> tuple[str, ...]:
+    """Return the images of a mode that have a camera in the rig."""
+    return tuple(name for name in MODES[mode] if not name.startswith("depth"))
+
+
+def images_of(frame: Frame, mode: str) -> Images:
+    """Return what a frame shows; depth and mask belong to its first image.
+
+    Raises:
+        FrontEndError: an image cannot be read.
+    """
+    grey = tuple(grey_of(frame.messages[name]) for name in cameras_of(mode))
+    depth = depth_of(frame.messages[MODES[mode][1]]) if mode == "rgbd" else None
+    mask = grey_of(frame.messages[MASK]) > 0 if MASK in frame.messages else None
+    return Images(frame.stamp_ns, grey, depth, frame.skew_ns, mask)
 
 
 class Streams:
@@ -52,10 +79,16 @@ class Streams:
         if len(queue) == queue.maxlen:
             self.counted[f"overflow of {name}"] += 1
         queue.append((stamp_ns, message))
-        frames = []
-        while self._waiting[self._first] and self._is_decided(self._waiting[self._first][0][0]):
-            stamp, leading = self._waiting[self._first].popleft()
-            frame = self._frame(stamp, leading)
+        return self._complete(self._is_decided)
+
+    def flush(self) -> list[Frame]:
+        """Return what is complete when nothing comes any more."""
+        return self._complete(lambda _: True)
+
+    def _complete(self, decided: Callable[[int], bool]) -> list[Frame]:
+        leading, frames = self._waiting[self._first], []
+        while leading and decided(leading[0][0]):
+            frame = self._frame(*leading.popleft())
             frames += [] if frame is None else [frame]
         return frames
 
