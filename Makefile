@@ -10,7 +10,7 @@ RUN := .venv/bin/python
 # Two at a time, grouped by tests/conftest.py.
 PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadgroup
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
-STYLED := $(CHECKED) examples
+STYLED := $(CHECKED) examples docs/conf.py
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
 
 .PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness regress docs lint format clean
