@@ -36,6 +36,7 @@ from ba_node.front_end.records import FrontEndError, State, Tracked
 from ba_node.front_end.streams import (
     MASK,
     MODES,
+    RECTIFIED,
     Frame,
     OdometryBuffer,
     Streams,
@@ -295,7 +296,8 @@ class FrontEndNode(ManagedNode):
             if any(name not in self._infos for name in cameras):
                 return None
             infos = [self._infos[name] for name in cameras]
-            rig = rig_from_infos(infos, rectified=options.rectified, tree=self._tree, base=options.base_frame)
+            rectified = options.rectified or any(RECTIFIED in self._subscribed[name] for name in cameras)
+            rig = rig_from_infos(infos, rectified=rectified, tree=self._tree, base=options.base_frame)
             if options.base_frame not in ("", rig.frame_id):
                 raise ConversionError(f"/tf_static has no way from {options.base_frame!r} to {rig.names[0]!r} (yet)")
             self._rig = rig
