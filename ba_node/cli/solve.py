@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solve a problem of "Bundle Adjustment in the Large" (.txt, .bz2, .gz) as a whole.
 
-Poses, points and each camera's f, k1, k2 are free. The defaults are those of the method: squared loss for
-local_dinm, points behind a camera keep their residual, as the published results count. Parameters of the node
+Poses, points and each camera's f, k1, k2 are free. The defaults are those of the method: squared loss but
+for irls_*, points behind a camera keep their residual, as the published results count. Parameters of the node
 (solver.*) and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
 
 Exit code: 0 all is well, 2 nothing came of it, 3 the result has to be looked at: it is worse than the start, focal
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ba_node.estimate import Iteration
 
 SUMMARY = "solve a BAL file as a whole"
-EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json"
+EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --iterations 50 --json trace.json"
 # Nothing came of it; something came of it that has to be looked at.
 NOTHING, ATTENTION = 2, 3
 _HEAD = ("iter", "time [s]", "objective", "|gradient|", "linear", "step", "damping", "radius")
@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problem", type=Path, metavar="PROBLEM")
     parser.add_argument(
         "--method",
-        default="local_dinm",
-        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: local_dinm)",
+        default="auto",
+        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: auto)",
     )
     parser.add_argument(
         "--iterations", type=int, metavar="N", help=f"{iterations.doc} (default: the method's, {iterations.default})"
