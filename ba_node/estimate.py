@@ -93,6 +93,9 @@ class SolveReport:
     landmarks: int = 0
     observations: int = 0
     outliers: int = 0
+    factors: int = 0
+    outvoted_factors: int = 0
+    variance_factor: float = 0.0
     inlier_share: float = 0.0
     parallax_deg: float = 0.0
     held_out_px_before: float = 0.0
@@ -105,6 +108,8 @@ class SolveReport:
     correction_m: float = 0.0
     correction_rad: float = 0.0
     correction_held: bool = False
+    adjustments: int = 0
+    merged_tracks: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,7 @@ class Extras:
 
     covariance: bool = False
     view: bool = False
+    points: bool = False  # covariances of the points too, by a solve of everything
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,8 @@ class Estimate:
     # (n_refined, 6, 6) x, y, z (m), rotation about X, Y, Z (rad) of the map's frame; NaN where unknown, 0 for poses
     # that were fixed. None if it was not asked for, or the solve is not usable.
     covariance: FloatArray | None = None
+    # (n_cloud, 3, 3) m^2, of the points; NaN where unknown. None unless a solve of everything was asked for it.
+    point_covariance: FloatArray | None = None
     view: WindowView | None = None  # what there is to see; None likewise
     map_index: int = 0  # number of the map; another one has another, whatever the session ids
 

@@ -25,7 +25,14 @@ from ba_node.config.declaration import (
     split_assignment,
     unknown,
 )
-from ba_node.config.estimation import GuardConfig, OdometryConfig, SceneConfig, TracksConfig, WindowConfig
+from ba_node.config.estimation import (
+    FactorsConfig,
+    GuardConfig,
+    OdometryConfig,
+    SceneConfig,
+    TracksConfig,
+    WindowConfig,
+)
 from ba_node.config.node import DiagnosticsConfig, FramesConfig, NodeConfig, OutputConfig
 from ba_node.config.solver import METHOD_LOSSES, PLATEAUS, SolverConfig, SolverOptions
 
@@ -37,6 +44,7 @@ __all__ = [
     "Config",
     "ConfigError",
     "DiagnosticsConfig",
+    "FactorsConfig",
     "FramesConfig",
     "GuardConfig",
     "NodeConfig",
@@ -74,6 +82,7 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    factors: FactorsConfig = field(default_factory=FactorsConfig)
     solver: SolverConfig = field(default_factory=lambda: _defaults(SolverConfig))
     guard: GuardConfig = field(default_factory=GuardConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)

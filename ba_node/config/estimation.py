@@ -104,6 +104,37 @@ class OdometryConfig:
 
 
 @dataclass(frozen=True)
+class FactorsConfig:
+    """What is known beside pixels and steps: relative poses, priors, gravity, loops. See docs/factors.md."""
+
+    enabled: bool = option(True, "Let what comes on their topics count.")
+    loss_scale: float = option(
+        3.0,
+        "Where Cauchy's loss leaves the square, in standard deviations: what contradicts the rest by far pulls little.",
+        within=(1e-3, 1e6),
+    )
+    gnss_sigma_m: float = option(
+        5.0, "Standard deviation of a fix of GNSS that tells no covariance.", unit="m", within=(1e-4, 1e6)
+    )
+    antenna_x_m: float = option(0.0, "Where the antenna is on the body.", unit="m", within=(-1e3, 1e3))
+    antenna_y_m: float = option(0.0, "The same, y.", unit="m", within=(-1e3, 1e3))
+    antenna_z_m: float = option(0.0, "The same, z.", unit="m", within=(-1e3, 1e3))
+    align_m: float = option(
+        10.0,
+        "How far the path has to spread (standard deviation) before map and world are aligned by positions alone; at"
+        " least five times the noise of these. With measured orientations at once.",
+        unit="m",
+        within=(0.0, 1e6),
+    )
+    adjust_m: float = option(
+        0.3,
+        "A loop or priors that move a keyframe further begin a solve of everything; 0: never.",
+        unit="m",
+        within=(0.0, 1e6),
+    )
+
+
+@dataclass(frozen=True)
 class GuardConfig:
     """When a solution is held back, so that the front-end's poses stand. See docs/concepts.md."""
 

@@ -1,16 +1,34 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""How well a solution is determined: the covariance of every free pose.
+"""How well a solution is determined: the covariance of every free pose, and of points.
 
-At the minimum the errors of the unknowns are, to first order, ``-H^-1 J' W e`` for noise e of the residuals, so their
-covariance is ``sigma^2 H^-1`` with the undamped ``H = J' W J``. Its keyframe part is the inverse of the Schur
-complement of the points (3.64-3.67), which is small::
+At the minimum the scores of all residuals balance, ``sum J' psi(r) = 0`` (rows.py has psi, w and d). To first order the
+error of the unknowns is therefore ``-A^-1 sum J' psi``, and its covariance is the sandwich (Huber, *Robust Statistics*,
+1981, 6.3-6.6)::
 
-    Sigma_c = sigma^2 S^-1,    S = B - E C^-1 E',    sigma^2 = r' W r / (m - n)
+    Sigma = A^-1 G A^-1,    A = sum d J'J,    G = sum v J'J,
 
-W are the IRLS weights of the losses at the solution, m the rows of residuals and n the unknowns: sigma^2 is the
-a-posteriori variance of unit weight, near 1 where sigma_px is right. So uncertain points count (they are integrated
-out); factors count in S and in both sums like all else, and everything is relative to what the problem holds fixed.
+where v is the variance of the score. With squared loss and sigma_px as stated it is ``A^-1``. Nothing in it relies on
+sigma_px: a robust loss that leaves the square too early, as noise is larger than stated, shows in d and v alike.
+
+Residuals at the solution are smaller than the errors that they come from, by their leverage ``h = J A^-1 J'``; points
+of few views take a third of it and more. With the residual's slope that makes, for each group of rows (pixels, depths,
+each kind of factor):
+
+- for the square, and for factors, which are few: one variance of unit weight, ``sum psi^2 / sum (1 - h d)``, r' r /
+  (m - n) in the case of pixels alone; the sigma that a factor states counts as ten rows more;
+- for pixels and depths with a robust loss: the jackknife's, row by row, less the variance of the prediction that it
+  takes in (Efron and Stein, *The Jackknife Estimate of Variance*, 1981)::
+
+    v = psi^2 / (1 - h d)^2 - kappa d^2 h,    kappa = sum psi^2/(1 - h d)^2 / sum d/(1 - h d)
+
+The keyframes' part needs S = B - E C^-1 E' of A alone (3.64-3.67): with C the points' blocks, and ``u = J_c - J_p C^-1
+E'`` of a row, the error of the keyframes is ``delta_c = -S^-1 sum u' psi``, and that of a point ``-C^-1 (sum J_p' psi +
+E' delta_c)``.
+
+**Which covariance it is**: of the free poses given those that the problem holds fixed, which count as exact. Points are
+integrated out. Errors of all residuals are taken to be independent: a front-end whose steps come from the same images
+as its tracks is not, and where the factors of its steps decide, the covariance is too small.
 
 Where a condition ``g'x = 0`` on the step of all keyframes fixes scale, and not a fixed pose, S is inverted on the
 directions that the condition leaves: with an orthonormal basis Q of them, ``S^-1 -> Q (Q' S Q)^-1 Q'``.
@@ -24,17 +42,18 @@ others keep theirs. S is scaled to a unit diagonal first, so that units do not d
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from scipy import sparse
 
-from ba_node.arrays import FloatArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
-from ba_node.core import geometry, native_kernels
+from ba_node.core import geometry
 from ba_node.core.kernels import DENSE_LIMIT, Kernels
-from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
+from ba_node.core.rows import DEPTHS, Rows, rows_of
 
 # Eigenvalues of S, scaled to a unit diagonal, that are rounding.
 _ROUNDING = 1e-11
@@ -42,6 +61,12 @@ _ROUNDING = 1e-11
 _SHARE = 1e-4
 # So many of the last poses are looked at for the weakest: of the newest keyframes, where these are oldest first.
 _NEWEST = 5
+# Rows with more leverage are taken to have this: they tell next to nothing about the noise.
+_MOST_LEVERAGE = 0.9
+# What the sigma that a factor states counts, in rows.
+_STATED = 10.0
+# Rows at a time whose leverage is worked out, and points whose covariance is.
+_CHUNK = 2000
 
 
 def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
@@ -54,20 +79,168 @@ def pose_covariances(problem: Problem, state: State, options: SolverOptions, con
         row-major. NaN where unknown: nothing determines the pose, there are no more residuals than unknowns, or S is
         too large to be inverted (DENSE_LIMIT).
     """
-    n_free = int(np.count_nonzero(~problem.fixed))
-    unknown = np.full((n_free, 6, 6), np.nan)
-    n = 6 * n_free
+    uncertainty = uncertainty_of(problem, state, options, conditions)
+    if uncertainty is None:
+        return np.full((int(np.count_nonzero(~problem.fixed)), 6, 6), np.nan)
+    return uncertainty.poses()
+
+
+def uncertainty_of(
+    problem: Problem, state: State, options: SolverOptions, conditions: FloatArray
+) -> Uncertainty | None:
+    """Return the uncertainty of a solution, None where it is unknown; arguments as of :func:`pose_covariances`."""
+    n = 6 * int(np.count_nonzero(~problem.fixed))
     if n == 0 or n > DENSE_LIMIT or problem.free_intrinsics:
-        return unknown
-    options = dataclasses.replace(options, parameterisation="local", schur="points")
+        return None
     with np.errstate(all="ignore"):
-        variance = unit_variance(Objective(problem, options), state, conditions.shape[2])
-        kernels = native_kernels.make(problem, options)
-        kernels.linearise(state)
-        s = kernels.reduce(np.zeros((n_free, 6)), np.zeros((problem.n_points, 3))).dense()
-    if not np.isfinite(variance) or not np.isfinite(s).all():
-        return unknown
-    return variance * _diagonal_of_inverse(s, conditions.reshape(n, -1))
+        rows = rows_of(problem, state, options)
+        return uncertainty_of_rows(rows, options.loss == "squared", conditions.reshape(n, -1))
+
+
+def uncertainty_of_rows(rows: Rows, squared: bool, conditions: FloatArray) -> Uncertainty | None:
+    """Return the same of rows, whose unknowns beside the points may be others than poses, under conditions (n, k).
+
+    ``squared`` where pixels and depths have no robust loss.
+    """
+    seen = np.unique(rows.points.indices[rows.points.data != 0.0] // 3)
+    unknowns = rows.keyframes.shape[1] + 3 * len(seen) - conditions.shape[1]
+    if len(rows) <= unknowns:
+        return None
+    reduced = Reduced(rows, np.maximum(rows.slope, 0.0))
+    if not np.isfinite(reduced.s).all():
+        return None
+    roots, loose = _roots(reduced.s, conditions)
+    slope = np.maximum(rows.slope, 0.0)
+    leverage = reduced.leverages(roots) * slope
+    variance = np.zeros(len(rows))
+    for group in np.unique(rows.group):
+        of = rows.group == group
+        score = rows.weight[of] * rows.residual[of]
+        make = _pooled if squared or group > DEPTHS else _jackknifed
+        variance[of] = make(score, slope[of], leverage[of], _STATED if group > DEPTHS else 0.0)
+    return Uncertainty(reduced, variance, roots, loose)
+
+
+def _pooled(score: FloatArray, slope: FloatArray, leverage: FloatArray, stated: float) -> FloatArray:
+    mean = slope.mean()
+    unit = (np.sum(score * score) + stated * mean) / (np.sum(1.0 - leverage) + stated)
+    return np.asarray(unit * slope / mean if mean > 0.0 else 0.0 * slope)
+
+
+def _jackknifed(score: FloatArray, slope: FloatArray, leverage: FloatArray, _stated: float) -> FloatArray:
+    left = 1.0 - np.minimum(leverage, _MOST_LEVERAGE)
+    square = (score / left) ** 2
+    kappa = np.sum(square) / max(float(np.sum(slope / left)), 1e-300)
+    return np.asarray(np.maximum(square - kappa * slope * (1.0 - left), 0.0))
+
+
+class Reduced:
+    """The equations ``sum weight J'J`` of rows with the points eliminated.
+
+    Attributes:
+        s: (n, n) Schur complement.
+        influence: (m, n) u of each row.
+        back: (3 n_pt, n) ``C^-1 E'``.
+        inverse: (3 n_pt, 3 n_pt) ``C^-1``, block diagonal.
+    """
+
+    def __init__(self, rows: Rows, weight: FloatArray) -> None:
+        self.rows = rows
+        weighted = sparse.diags(weight)
+        self.inverse = _inverse_blocks((rows.points.T @ weighted @ rows.points).tobsr((3, 3)))
+        self.back = (self.inverse @ (rows.points.T @ weighted @ rows.keyframes)).tocsr()
+        self.influence = (rows.keyframes - rows.points @ self.back).tocsr()
+        self.s = (rows.keyframes.T @ weighted @ self.influence).toarray()
+        self.s = 0.5 * (self.s + self.s.T)
+
+    def leverages(self, roots: FloatArray) -> FloatArray:
+        """Return ``J A^-1 J'`` of every row, (m,), with ``S^-1 = X X'`` for the roots X (n, k)."""
+        points = self.rows.points
+        local = (points @ self.inverse).multiply(points).sum(axis=1)
+        parts = [
+            np.sum((self.influence[begin : begin + _CHUNK] @ roots) ** 2, axis=1)
+            for begin in range(0, len(self.rows), _CHUNK)
+        ]
+        return np.asarray(np.asarray(local).ravel() + np.concatenate(parts))
+
+
+def _inverse_blocks(c: sparse.bsr_matrix) -> sparse.bsr_matrix:
+    """Return the inverse of a block diagonal matrix; 0 for points that nothing determines."""
+    n = c.shape[0] // 3
+    blocks = np.zeros((n, 3, 3))
+    c.sum_duplicates()
+    blocks[np.repeat(np.arange(n), np.diff(c.indptr))] = c.data
+    values, vectors = np.linalg.eigh(blocks)
+    sound = values > _ROUNDING * np.maximum(values[:, 2:], 1e-300)
+    inverse = np.where(sound, 1.0 / np.where(sound, values, 1.0), 0.0)
+    blocks = (vectors * inverse[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return sparse.bsr_matrix((blocks, np.arange(n), np.arange(n + 1)), shape=c.shape)
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What is known of the error of a solution."""
+
+    reduced: Reduced
+    variance: FloatArray  # (m,) v of each row
+    roots: FloatArray  # (n, k) X with S^-1 = X X'
+    loose: BoolArray  # (n,) unknowns that nothing determines
+
+    def _meat(self, variance: FloatArray) -> FloatArray:
+        """Return ``X' (sum v u'u) X``, (k, k)."""
+        influence = self.reduced.influence
+        meat = (influence.T @ sparse.diags(variance) @ influence).toarray()
+        return np.asarray(self.roots.T @ meat @ self.roots)
+
+    def of(self, unknowns: IntArray) -> FloatArray:
+        """Return the covariance of some unknowns beside the points, (k, k); NaN for those that are undetermined."""
+        roots = self.roots[unknowns]
+        out = np.asarray(roots @ self._meat(self.variance) @ roots.T)
+        out[self.loose[unknowns]], out[:, self.loose[unknowns]] = np.nan, np.nan
+        return out
+
+    def poses(self) -> FloatArray:
+        """Return the covariances (n_free, 6, 6) of the poses, which are all unknowns beside the points."""
+        blocks = self.roots.reshape(-1, 6, self.roots.shape[1])
+        # Not by matrix products of the blocks: they are too small for the threads of BLAS, which wait for each other.
+        out = np.asarray(np.einsum("kim,kjm->kij", blocks @ self._meat(self.variance), blocks))
+        out[self.loose.reshape(-1, 6).any(axis=1)] = np.nan
+        return out
+
+    def points(self, which: IntArray) -> FloatArray:
+        """Return the covariances (n, 3, 3) of some points, m^2; NaN for those that nothing determines."""
+        # A point has few rows of its own: each group's mean variance tells more than theirs.
+        variance = self.variance.copy()
+        for group in np.unique(self.reduced.rows.group):
+            of = self.reduced.rows.group == group
+            slope = np.maximum(self.reduced.rows.slope[of], 0.0)
+            variance[of] = slope * (variance[of].sum() / max(float(slope.sum()), 1e-300))
+        meat = self._meat(variance)
+        starts = range(0, len(which), _CHUNK)
+        parts = [self._of_points(which[begin : begin + _CHUNK], variance, meat) for begin in starts]
+        return np.concatenate([np.empty((0, 3, 3)), *parts])
+
+    def _of_points(self, which: IntArray, variance: FloatArray, meat: FloatArray) -> FloatArray:
+        """Return ``L - K - K' + M``: of the own rows, of both, and of the poses."""
+        reduced, rows = self.reduced, self.reduced.rows
+        place = (3 * which[:, None] + np.arange(3)).ravel()
+        n = len(which)
+        inverse = reduced.inverse.tocsr()[place][:, place]
+        seen = rows.points[:, place] @ inverse
+        weighted = sparse.diags(variance) @ seen
+        back = np.asarray(reduced.back[place] @ self.roots)
+        own = (seen.T @ weighted).tobsr((3, 3))
+        out = np.zeros((n, 3, 3))
+        own.sum_duplicates()
+        out[np.repeat(np.arange(n), np.diff(own.indptr))] = own.data
+        cross = (weighted.T @ reduced.influence @ self.roots).reshape(n, 3, -1)
+        both = np.einsum("pik,pjk->pij", cross, back.reshape(n, 3, -1))
+        poses = np.einsum("pik,pjk->pij", (back @ meat).reshape(n, 3, -1), back.reshape(n, 3, -1))
+        out += poses - both - np.swapaxes(both, 1, 2)
+        hangs = np.asarray(abs(reduced.back[place]) @ self.loose).reshape(n, 3).any(axis=1)
+        undetermined = np.diagonal(out, axis1=1, axis2=2).min(axis=1) <= 0.0
+        out[hangs | undetermined] = np.nan
+        return out
 
 
 def weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
@@ -118,17 +291,8 @@ def _inverses(blocks: FloatArray) -> FloatArray:
     return inverse * scale if sound else np.full_like(blocks, np.nan)
 
 
-def unit_variance(objective: Objective, state: State, n_conditions: int = 0) -> float:
-    """Return ``r' W r / (m - n)``, NaN where there are no more rows than unknowns."""
-    problem = objective.problem
-    squares, rows = objective.weighted_squares(state)
-    unknowns = 6 * int(np.count_nonzero(~problem.fixed)) + 3 * len(np.unique(problem.observations.point))
-    freedom = rows - (unknowns - n_conditions)
-    return squares / freedom if freedom > 0 else np.nan
-
-
-def _diagonal_of_inverse(s: FloatArray, conditions: FloatArray) -> FloatArray:
-    """Return the 6 x 6 blocks on the diagonal of ``Q (Q' S Q)^-1 Q'``, NaN for keyframes that are undetermined."""
+def _roots(s: FloatArray, conditions: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return X (n, k) with ``X X' = Q (Q' S Q)^-1 Q'``, and which unknowns (n,) nothing determines."""
     n = len(s)
     diagonal = np.diagonal(s)
     unit = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
@@ -142,9 +306,4 @@ def _diagonal_of_inverse(s: FloatArray, conditions: FloatArray) -> FloatArray:
         values, vectors = np.linalg.eigh(scaled)
     kept = values > _ROUNDING * n
     roots = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
-    blocks = roots.reshape(n // 6, 6, -1)
-    # Not by matrix products: they are too small for the threads of BLAS, which would wait for each other.
-    out = np.asarray(np.einsum("kim,kjm->kij", blocks, blocks))
-    loose = np.sum(vectors[:, ~kept].reshape(n // 6, -1) ** 2, axis=1) > _SHARE**2
-    out[loose] = np.nan
-    return out
+    return roots, np.sum(vectors[:, ~kept] ** 2, axis=1) > _SHARE**2

@@ -176,15 +176,6 @@ class FactorSum:
         """Return 1/2 sum Psi."""
         return sum(self._value(kind, state) for kind in self._factors)
 
-    def weighted_squares(self, state: State) -> tuple[float, int]:
-        """Return ``r' W r`` with the IRLS weights W, and the number of residuals."""
-        total, count = 0.0, 0
-        for kind in self._factors:
-            residual = kind.residuals(state)
-            total += float(np.sum(_weigh(kind, residual)[1] * np.sum(residual * residual, axis=1)))
-            count += residual.size
-        return total, count
-
     def linearise(self, state: State) -> FactorTerms:
         """Return what the factors add at a state."""
         n = len(self._free)

@@ -30,9 +30,10 @@ from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
-from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES
+from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, WHOLE_MAP
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
+from ba_node.offline.run_folder import recording_facts, versions, write_details
 from ba_node.offline.session_record import SessionRecord
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
@@ -112,6 +113,8 @@ def replay(
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
         report["known_already"] = len(run.known_already)
+        report["recording"] = recording_facts(reader.paths)
+        report["versions"] = versions(report["kernels"])
         report["attention"] = attention(report)
         if options.save is not None:
             write_map(map_name(options.save), run.backend.snapshot())
@@ -182,12 +185,12 @@ class _Run:
     def _record(self, estimate: Estimate) -> None:
         if not self.sessions or self.sessions[-1].map_index != estimate.map_index:
             self._begin(estimate)
-        self.sessions[-1].add(estimate, self.backend.map.refined_keyframes())
+        self.sessions[-1].add(estimate, self.backend.map)
         if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
             self._written = len(estimate.trajectory)
             self._write(estimate, OUTPUT_TYPES)
         else:
-            self._write(estimate, OUTPUT_TYPES.keys() - set(LATCHED_OUTPUTS))
+            self._write(estimate, OUTPUT_TYPES.keys() - set(WHOLE_MAP))
 
     def _begin(self, estimate: Estimate) -> None:
         session_id = self.backend.map.session_id
@@ -200,7 +203,7 @@ class _Run:
         if record is not None and not record.closed:
             record.close(summary)
             if len(record.last.trajectory) > self._written:
-                self._write(record.last, LATCHED_OUTPUTS)
+                self._write(record.last, WHOLE_MAP)
         self._inputs = {}
 
     def _write(self, estimate: Estimate, wanted: Container[str]) -> None:
@@ -218,6 +221,7 @@ def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dic
         write_tum(folder / "trajectory.tum", record.trajectory)
         write_tum(folder / "trajectory_input.tum", record.input_trajectory)
         write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
+        write_details(folder, record)
     summaries = [record.as_dict() | _against(truth, record) for record in sessions]
     for folder, entry in zip(folders[:-1], summaries, strict=False):
         entry["folder"] = folder.name

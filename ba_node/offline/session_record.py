@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ba_node.arrays import BoolArray
-from ba_node.backend import MapSummary
-from ba_node.estimate import Estimate, Poses
+from ba_node.backend import CurrentMap, MapSummary
+from ba_node.estimate import Estimate, Poses, SolveReport
 from ba_node.measurements import Keyframe
 
 _IDS_SHOWN = 6
@@ -28,9 +28,7 @@ class SessionRecord:
     inputs: dict[int, Keyframe] = field(default_factory=dict)  # accepted keyframe messages by id
     refined: set[int] = field(default_factory=set)  # ids of the keyframes that took part in a usable solve
     statuses: Counter[str] = field(default_factory=Counter)  # solves by status
-    solver_time_s: float = 0.0  # in all, s
-    slowest: tuple[float, int] = (0.0, 0)  # time and keyframe of the slowest solve
-    iterations: int = 0  # outer iterations in all
+    solves: list[tuple[int, SolveReport]] = field(default_factory=list)  # stamp of the newest keyframe, ns, and report
     reasons: dict[int, str] = field(default_factory=dict)  # why a solve gave nothing, by its newest keyframe
     unrefined: str = ""  # which keyframes were not refined and why, empty if all were; see :meth:`close`
     closed: MapSummary | None = None  # summary of the map at its end, None before :meth:`close`
@@ -46,23 +44,24 @@ class SessionRecord:
         assert self.closed is not None, "close() comes first"
         return self.closed
 
-    def add(self, estimate: Estimate, refined: set[int]) -> None:
-        """Take in the next estimate, and which keyframes of the map are refined now."""
-        before = self.last.trajectory
-        gone = ~np.isin(before.keyframe_id, estimate.trajectory.keyframe_id)
-        if gone.any():
-            self.forgotten.append(before[gone])
+    def add(self, estimate: Estimate, current: CurrentMap) -> None:
+        """Take in the next estimate; ``current`` is its map, as it is now."""
+        before, now = self.last.trajectory, estimate.trajectory
+        # The oldest are forgotten first.
+        if len(before) and not np.array_equal(before[:1].keyframe_id, now[:1].keyframe_id):
+            gone = ~np.isin(before.keyframe_id, now.keyframe_id)
+            self.forgotten += [before[gone]] if gone.any() else []
         self.last = estimate
         report = estimate.report
         self.statuses[report.status.name] += 1
-        self.iterations += report.iterations
-        self.solver_time_s += report.solve_time_s
-        self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
+        self.solves.append((estimate.stamp_ns, report))
         if not report.status.usable:
             self.reasons[report.newest_keyframe_id] = report.reason
-        self.refined.update(refined.intersection(estimate.refined.keyframe_id.tolist()))
-        # What a check of the set-up has taken back.
-        self.refined.difference_update(set(estimate.trajectory.keyframe_id.tolist()) - refined)
+        took_part = set(estimate.refined.keyframe_id.tolist())
+        refined = current.refined_among(took_part)
+        # What is taken back is that of a window, or, by a check of the set-up, all.
+        self.refined -= took_part if current.refined_count else set(now.keyframe_id.tolist())
+        self.refined |= refined
 
     def close(self, summary: MapSummary) -> None:
         """Take what there is to tell of the map at its end."""
@@ -97,6 +96,8 @@ class SessionRecord:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entries of report.json."""
+        reports = [report for _, report in self.solves]
+        slowest = max(((one.solve_time_s, one.newest_keyframe_id) for one in reports), default=(0.0, 0))
         return {
             "session_id": self.session_id,
             "frame_id": self.last.frame_id,
@@ -107,10 +108,11 @@ class SessionRecord:
             **_figures(self.summary),
             "solves": sum(self.statuses.values()),
             "solves_by_status": dict(sorted(self.statuses.items())),
-            "iterations": self.iterations,
-            "solver_time_s": self.solver_time_s,
-            "slowest_solve_s": self.slowest[0],
-            "slowest_solve_keyframe_id": self.slowest[1],
+            "iterations": sum(one.iterations for one in reports),
+            "solver_time_s": sum(one.solve_time_s for one in reports),
+            "slowest_solve_s": slowest[0],
+            "slowest_solve_keyframe_id": slowest[1],
+            "solve_times_s": [one.solve_time_s for one in reports],
         }
 
 

@@ -8,13 +8,30 @@ What contradicts or cannot be used is counted in ``log`` and leaves the scene as
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ba_node.arrays import BoolArray, IntArray
 from ba_node.config import SceneConfig
 from ba_node.core.problem import Cameras
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import (
+    CameraRig,
+    FeatureTracks,
+    GlobalFix,
+    GravityDirection,
+    Keyframe,
+    LandmarkGuesses,
+    LandmarkPriors,
+    Measurement,
+    OfSession,
+    OfTime,
+    PosePrior,
+    RelativePose,
+    TrackMerge,
+)
 from ba_node.scene import ingest
+from ba_node.scene.constraints import Constraints
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
@@ -32,12 +49,27 @@ class Scene(MapTables):
         self.refused_rig = ""  # why the last rig that was refused was, empty if none was
         self.log = RejectionLog()  # what was turned away
         self.pending: list[FeatureTracks] = []
+        self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()
+
+    def clone(self) -> Scene:
+        """Return a scene of its own with the same content but for what waits and what was turned away."""
+        other = Scene(self.config, self.session_id)
+        other.frame_id, other.cameras = self.frame_id, self.cameras
+        other.refused_rig = self.refused_rig
+        other.keyframes, other.landmarks = self.keyframes.clone(), self.landmarks.clone()
+        other.observations, other.blocks = self.observations.clone(), [list(blocks) for blocks in self.blocks]
+        other._index_keyframes()
+        other.constraints = self.constraints.clone()
+        return other
 
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement of this session (or a rig); what cannot be used is counted."""
         if isinstance(measurement, CameraRig):
             self._set_rig(measurement)
+            return
+        if isinstance(measurement, OfTime):
+            self._add_absolute(measurement)
             return
         if self.session_id is not None and measurement.session_id != self.session_id:
             if isinstance(measurement, Keyframe) and ingest.keyframe_pose(measurement, self.log) is None:
@@ -54,17 +86,35 @@ class Scene(MapTables):
             if tracks is not None:
                 self.log.notice("empty_tracks", len(measurement.track_id) == 0)
                 self._place(tracks)
-        else:
+        elif isinstance(measurement, LandmarkGuesses):
             self._add_guesses(measurement)
+        else:
+            self._add_constraint(measurement)
 
-    def usable(self, measurement: Keyframe | FeatureTracks | LandmarkGuesses) -> bool:
+    def _add_absolute(self, measured: PosePrior | GlobalFix) -> None:
+        if isinstance(measured, PosePrior):
+            self.constraints.add_pose(measured, self.log)
+        else:
+            self.constraints.add_fix(measured, self.log)
+
+    def _add_constraint(self, measured: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> None:
+        if isinstance(measured, RelativePose):
+            self.constraints.add_relative(measured, self.log)
+        elif isinstance(measured, GravityDirection):
+            self.constraints.add_gravity(measured, self.log)
+        elif isinstance(measured, LandmarkPriors):
+            self.constraints.add_landmarks(measured, self.log)
+        else:
+            self.constraints.add_merge(measured, self.log)
+
+    def usable(self, measurement: Keyframe | OfSession) -> bool:
         """Return True if anything of a measurement passes the checks it can be given by itself; count nothing."""
         log = RejectionLog()
         if isinstance(measurement, Keyframe):
             return ingest.keyframe_pose(measurement, log) is not None
         if isinstance(measurement, FeatureTracks):
             return ingest.clean_tracks(measurement, log) is not None
-        return ingest.clean_guesses(measurement, log) is not None
+        return not isinstance(measurement, LandmarkGuesses) or ingest.clean_guesses(measurement, log) is not None
 
     def refuse(self, refusal: Refusal) -> None:
         """Turn away what was held, and the tracks that wait for it."""
@@ -91,6 +141,7 @@ class Scene(MapTables):
         for tracks in self.pending:
             self._reject_waiting(tracks)
         self.pending = []
+        self.constraints.reject_unknown(self.keyframes.keyframe_id, self.log)
 
     def _set_rig(self, rig: CameraRig) -> None:
         cameras = ingest.rig_cameras(rig, self.log)
@@ -115,11 +166,11 @@ class Scene(MapTables):
             self._reject_known(keyframe, known)
         if pose is None:
             return
-        if len(self.keyframes) and keyframe.stamp_ns < self.keyframes.stamp_ns.max():
-            self.log.notice("reordered")
-        ingest.check_stamp(keyframe, self.keyframes, self.log)
+        if keyframe.stamp_ns <= self.newest_ns:
+            self.log.notice("reordered", keyframe.stamp_ns < self.newest_ns)
+            ingest.check_stamp(keyframe, self.keyframes, self.log)
         self.frame_id = self.frame_id or ingest.plain_name(keyframe.frame_id)
-        row = self.keyframes.append(
+        self.keyframes.append(
             1,
             keyframe_id=keyframe.keyframe_id,
             stamp_ns=keyframe.stamp_ns,
@@ -128,9 +179,9 @@ class Scene(MapTables):
             rotation=pose.rotation,
             position=pose.position,
         )
-        self._keyframe_rows[keyframe.keyframe_id] = int(row[0])
+        self._index_newest()
+        self.constraints.add_step(keyframe.keyframe_id, keyframe.covariance, self.log)
         self.blocks.append([])
-        self._order = None
         if len(self.keyframes) > self.config.max_keyframes:
             self._forget_keyframes()
         self.propagate_corrections()
@@ -161,7 +212,7 @@ class Scene(MapTables):
         self.landmarks.has_guess[rows[new]] = True
         if len(self.keyframes):
             # Counts as seen now, or a full map would forget it before its first observation comes.
-            self._see(rows[new], int(self.keyframes.stamp_ns.max()))
+            self._see(rows[new], self.newest_ns)
         self._limit_landmarks()
 
     def _place(self, tracks: FeatureTracks) -> None:
@@ -180,6 +231,7 @@ class Scene(MapTables):
             what = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}, an id that came twice"
             self.log.reject("duplicate_observation", what, len(tracks.track_id))
             return
+        tracks = self._renamed(tracks)
         landmarks = self._rows_of(tracks.track_id)
         new = self._unseen(row, tracks, landmarks)
         landmarks = landmarks[new]
@@ -201,8 +253,30 @@ class Scene(MapTables):
             self.keyframes.solved[row] = False
         self.landmarks.last[landmarks] = added
         self.landmarks.views[landmarks] += 1
+        self.landmarks.changed(landmarks)
         self._see(landmarks, int(self.keyframes.stamp_ns[row]))
         self._limit_landmarks()
+
+    def _renamed(self, tracks: FeatureTracks) -> FeatureTracks:
+        """Return tracks under the ids that they go on under; one that so comes twice in the image is turned away."""
+        names = self.constraints.names_of(tracks.track_id)
+        if names is tracks.track_id:
+            return tracks
+        kept = np.sort(np.unique(names, return_index=True)[1])
+        if len(kept) < len(names):
+            what = f"merged tracks in keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
+            self.log.reject("duplicate_observation", f"{what}: one image sees both", len(names) - len(kept))
+        rows = {name: getattr(tracks, name)[kept] for name in ("uv", "sigma_px", "depth_m")}
+        return dataclasses.replace(tracks, track_id=names[kept], **rows)
+
+    def join_tracks(self, track: int, other: int) -> bool:
+        """Let a track go on under the id of another; False (counted) if one image sees both."""
+        rows = self.find_landmarks(np.array([track, other], np.uint64))
+        if not self.join(int(rows[0]), int(rows[1])):
+            self.log.reject("bad_merge", f"tracks {track} and {other}: one image sees both, they are no one point")
+            return False
+        self.constraints.renamed[track] = other
+        return True
 
     def _place_pending(self) -> None:
         waiting, self.pending = self.pending, []
@@ -220,16 +294,18 @@ class Scene(MapTables):
 
     def _unseen(self, row: int, tracks: FeatureTracks, landmarks: IntArray) -> BoolArray:
         """Return which landmarks this camera has not seen in this keyframe yet; count the others."""
-        seen = np.zeros(len(self.landmarks), bool)
-        for block in self.blocks[row]:
-            if block.camera == tracks.camera_index:
-                seen[self.observations.landmark[block.begin : block.end]] = True
-        repeated = np.flatnonzero(seen[landmarks])
+        known = [
+            self.observations.landmark[b.begin : b.end] for b in self.blocks[row] if b.camera == tracks.camera_index
+        ]
+        if not known:
+            return np.ones(len(landmarks), bool)
+        seen = np.isin(landmarks, np.concatenate(known))
+        repeated = np.flatnonzero(seen)
         if len(repeated):
             where = f"keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
             what = f"track {tracks.track_id[repeated[0]]} is known in {where}"
             self.log.reject("duplicate_observation", what, len(repeated))
-        return ~seen[landmarks]
+        return ~seen
 
 
 def _same(a: Cameras, b: Cameras) -> bool:

@@ -10,12 +10,19 @@ The solver steps body from world, ``R <- R Exp(dphi)``, ``t <- t + R dt``. The p
 both along the axes of the world. So ``(dp, dtheta) = T (dphi, dt)``, and its covariance is ``T Sigma T'``, in the order
 of geometry_msgs/PoseWithCovariance: x, y, z, rotation about X, Y, Z of the fixed frame.
 
-What the covariance is relative to is what the window holds (gauge.py): fixed keyframes count as exact. Where scale
-floats, it is the front-end's steps that set it, after the solve: ``f = sum L l - sum l^2 = 0`` for the lengths L of its
-steps and l of the estimate's. The keyframes keep to it, ``sum (L - 2 l) dl = 0``; that is the condition handed on.
+Which covariance it is: of the free poses against those that the problem holds fixed (gauge.py), which count as exact.
+In a window these are older keyframes, in a map that begins and in a solve of everything the oldest keyframe alone: then
+it is along the whole path, and grows with the way travelled.
+
+Scale that cannot be seen comes from the front-end's steps. Where they are factors, their noise is that of the scale.
+Where they are not, they set it after the solve: ``f = sum L l - sum l^2 = 0`` for the lengths L of its steps and l of
+the estimate's. The keyframes keep to it, ``sum (L - 2 l) dl = 0``; that is the condition handed on, and the scale of
+the steps counts as exact.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,25 +34,37 @@ from ba_node.window import gauge
 from ba_node.window.selection import Selection
 
 
-def covariances(selection: Selection, state: State, measured: FloatArray, options: SolverOptions) -> FloatArray:
-    """Return the covariance of every pose of a window's problem.
+@dataclass(frozen=True)
+class Covariances:
+    """Covariances of a problem's keyframes, and of its points where they were asked for."""
+
+    # (n_kf, 6, 6): x, y, z (m), rotation about X, Y, Z (rad) of the fixed frame. NaN where unknown; 0 for fixed ones.
+    poses: FloatArray
+    points: FloatArray | None = None  # (n_pt, 3, 3), m^2; NaN where unknown
+
+
+def covariances(
+    selection: Selection, state: State, measured: FloatArray, options: SolverOptions, *, points: bool = False
+) -> Covariances:
+    """Return the covariance of every pose of a solved problem, and of every point if ``points``.
 
     ``measured`` (n_kf, 3) are the positions of the keyframes by the front-end, m; the state is in the scale of the map.
-
-    Returns:
-        (n_kf, 6, 6): x, y, z (m), rotation about X, Y, Z (rad) of the fixed frame. NaN where unknown; 0 for fixed ones.
     """
-    free = ~selection.problem.fixed
+    problem = selection.problem
+    free = ~problem.fixed
     _, position = geometry.inverse(state.rotation, state.translation)
+    floating = selection.unscaled if not problem.n_factors else np.full(len(free), -1)
     conditions = [
-        _scale_condition(np.flatnonzero(selection.unscaled == anchor), measured, position)
-        for anchor in np.unique(selection.unscaled[selection.unscaled >= 0])
+        _scale_condition(np.flatnonzero(floating == anchor), measured, position)
+        for anchor in np.unique(floating[floating >= 0])
     ]
     stacked = np.stack(conditions, axis=2) if conditions else np.empty((len(free), 6, 0))
-    out = np.zeros((len(free), 6, 6))
-    tangent = covariance.pose_covariances(selection.problem, state, options, stacked[free])
-    out[free] = in_world(tangent, position[free])
-    return out
+    poses = np.where(problem.fixed, 0.0, np.nan)[:, None, None] * np.ones((6, 6))
+    found = covariance.uncertainty_of(problem, state, options, stacked[free])
+    if found is None:
+        return Covariances(poses, np.full((problem.n_points, 3, 3), np.nan) if points else None)
+    poses[free] = in_world(found.poses(), position[free])
+    return Covariances(poses, found.points(np.arange(problem.n_points)) if points else None)
 
 
 def in_world(tangent: FloatArray, position: FloatArray) -> FloatArray:

@@ -33,13 +33,16 @@ from ba_node.config import METHOD_LOSSES, Config, SolverConfig, SolverOptions
 from ba_node.core import geometry, methods, native_kernels, solver
 from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
+from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
+from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
 
 MAX_ITERATIONS = 50
+NOTHING = Extras()
 # A window is solved again and again, everything once: it is worth more digits.
 _FUNCTION_TOLERANCE = 1e-6
 # Fewer points than this tell a keyframe no scale of its own.
@@ -85,8 +88,10 @@ class Optimization:
     track_id: IdArray  # (n_pt,) uint64
     placed: BoolArray  # (n_pt,) True where the point had a position
     position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
+    wanted: Extras = NOTHING  # what is to be worked out beside the solution
     # result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`
     solved: tuple[Result, FloatArray] | None = None
+    covariances: Covariances | None = None  # None likewise, and if they were not asked for
 
     def solve(
         self,
@@ -101,6 +106,9 @@ class Optimization:
         chosen = options(config, method, max_iterations)
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
+        if self.wanted.covariance and result.status.usable and result.state.is_finite():
+            state = scaled(self.selection, self.position, result.state)
+            self.covariances = covariances(self.selection, state, self.position, chosen, points=self.wanted.points)
 
     @property
     def result(self) -> Result:
@@ -126,7 +134,7 @@ class Optimization:
 
 
 @dataclass(frozen=True)
-class _Similarity:
+class Similarity:
     """x -> scale * rotation x + translation: (n,), (n, 3, 3), (n, 3)."""
 
     scale: FloatArray
@@ -139,8 +147,13 @@ class _Similarity:
         return np.asarray(self.scale[which, None] * turned + self.translation[which])
 
 
-def take_snapshot(scene: Scene, config: Config) -> Optimization | str:
-    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
+def take_snapshot(
+    scene: Scene, config: Config, wanted: Extras = NOTHING, origin: Scene | None = None
+) -> Optimization | str:
+    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it.
+
+    ``origin`` is the scene that the result is for where this one is a clone of it.
+    """
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
     if isinstance(selection, str):
@@ -149,12 +162,13 @@ def take_snapshot(scene: Scene, config: Config) -> Optimization | str:
     fixed = _fixed(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
     return Optimization(
-        scene,
+        origin or scene,
         selection,
         scene.keyframes.keyframe_id[selection.keyframes],
         scene.landmarks.track_id[selection.landmarks],
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
+        wanted,
     )
 
 
@@ -197,7 +211,7 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     anchor_of_row = np.empty(len(table), np.intp)
     anchor_of_row[scene.order] = anchor
 
-    _follow_points(scene, landmarks[kept], anchor_of_row, similarity)
+    follow_points(scene, landmarks[kept], anchor_of_row, similarity)
     others = np.flatnonzero((member < 0) & table.refined)
     which = anchor_of_row[others]
     table.position[others] = similarity.move(which, table.position[others])
@@ -207,6 +221,8 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     table.refined[keyframes[here]] = True
     points.position[landmarks[kept]] = found[kept]
     points.has_position[landmarks[kept]] = True
+    points.changed()
+    scene.moved()
     scene.propagate_corrections()
     _classify(scene, config, taken.selection, keyframes[here], landmarks[kept])
     _join(scene, config, len(table) - 1 - int(scene.places()[keyframes[here]].max()))
@@ -231,7 +247,7 @@ def _corrections(
     result: tuple[FloatArray, FloatArray, FloatArray],
     keyframes: IntArray,
     landmarks: IntArray,
-) -> _Similarity:
+) -> Similarity:
     """Return the correction at each keyframe of the snapshot; senseless at those that are forgotten."""
     rotation, position, found = result
     before = (scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes])
@@ -244,7 +260,7 @@ def _corrections(
     was = np.linalg.norm(scene.landmarks.position[landmarks[point]] - before[1][at], axis=1)
     sound = (far > 0) & (was > 0)
     scale = _medians(far[sound] / was[sound], at[sound], len(keyframes))
-    return _Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
+    return Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
 
 
 def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
@@ -264,7 +280,7 @@ def _anchors(member: IntArray) -> IntArray:
     return np.asarray(member[np.where(at < 0, int(np.argmax(member >= 0)), at)])
 
 
-def _follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: _Similarity) -> None:
+def follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: Similarity) -> None:
     """Move the points that the result does not place with the keyframe that saw them first."""
     follows = scene.landmarks.has_position.copy()
     follows[updated] = False

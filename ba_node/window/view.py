@@ -32,7 +32,7 @@ def work_out(
     if wanted.covariance:
         measured = scene.keyframes.input_position[selection.keyframes]
         found["covariance"] = np.full((len(refined), 6, 6), np.nan)
-        found["covariance"][place] = covariances(selection, state, measured, methods.from_config(config.solver))
+        found["covariance"][place] = covariances(selection, state, measured, methods.from_config(config.solver)).poses
     if wanted.view:
         good = ~scene.observations.outlier[selection.rows[selection.inlier]]
         found["view"] = view(selection.problem, state, good, place, len(refined))

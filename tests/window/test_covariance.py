@@ -62,7 +62,7 @@ def test_it_is_what_repeated_measurements_scatter_by(baseline_m: float) -> None:
         errors.append(np.concatenate([moved, turn], axis=1)[free])
         if seed < 20:
             measured_once = dataclasses.replace(selection, problem=sample)
-            told.append(covariance.covariances(measured_once, state, measured, EXACT)[free])
+            told.append(covariance.covariances(measured_once, state, measured, EXACT).poses[free])
     # The scatter of 300 has a standard error of 4 %.
     ratio = np.std(errors, axis=0) / np.sqrt(np.diagonal(np.mean(told, axis=0), axis1=1, axis2=2))
     assert np.all(np.abs(ratio - 1.0) < 0.2), f"scatter over told deviation: {ratio.min():.2f} to {ratio.max():.2f}"
@@ -122,7 +122,7 @@ def test_held_poses_have_none() -> None:
         selection.problem.start,
         positions(selection.problem.start),
         EXACT,
-    )
+    ).poses
     assert (told[selection.problem.fixed] == 0.0).all()
     values = np.linalg.eigvalsh(told[~selection.problem.fixed])
     assert (values > 0.0).all(), "a covariance is positive definite"
