@@ -4,8 +4,9 @@
 
 BAL ("Bundle Adjustment in the Large") and Bundler: poses, points and each camera's f, k1, k2 are free. The defaults are
 those of the method: squared loss but for irls_*, points behind a camera keep their residual, as the published results
-count. COLMAP: poses, points, and what --refine names of the cameras, which stay shared as they are in the model; points that are behind their camera at the start are left out, as COLMAP does. Parameters of the node
-(solver.*) and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
+count. COLMAP: poses, points, and what --refine names of the cameras, which stay shared as they are in the model; points
+that are behind their camera at the start are left out, as COLMAP does. Parameters of the node (solver.*) and
+options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
 
 Exit code: 0 all is well, 2 nothing came of it, 3 the result has to be looked at: it is worse than the start, focal
 lengths are not positive, or many points lie behind their cameras.
