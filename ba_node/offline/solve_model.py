@@ -72,7 +72,7 @@ class ModelSolution:
         if before or after:
             lines.append(
                 f"{before} of {count} observations are of points behind their camera at the start, {after} at the end:"
-                f" those at the start {'are left out, as COLMAP does' if self.options.cheirality == 'drop' else 'count'}"
+                f" those at the start {'are left out' if self.options.cheirality == 'drop' else 'count'}"
             )
         result, grave = self.result, max(before, after) > _MANY_BEHIND * count
         if result.status.usable and not result.objective_after <= result.objective_before:
