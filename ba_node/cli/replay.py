@@ -99,7 +99,12 @@ def run(args: argparse.Namespace) -> int:
         report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
     print(facts(_rows(report)))
     _tell(report)
-    print(f"written to {args.out}{'' if args.no_report else _pictures(args.out)}")
+    if args.no_report:
+        print(f"written to {args.out}")
+    else:
+        from ba_node.offline.report import show  # noqa: PLC0415
+
+        print(f"written to {args.out}: {show(args.out)}")
     write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
 
@@ -143,19 +148,6 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
 
 def _named(row: Mapping[str, Any]) -> str:
     return f"{row['recording']}: {row['note']}"
-
-
-def _pictures(out: Path) -> str:
-    """Write page and picture of the results; return what to say of them."""
-    from ba_node.offline.page import PageError  # noqa: PLC0415
-    from ba_node.offline.report import REPORT, draw_trajectory, write_report  # noqa: PLC0415
-
-    draw_trajectory(out)
-    try:
-        write_report([out], out / REPORT)
-    except PageError as error:
-        return f": trajectory.png; {error}"
-    return f": {REPORT}, trajectory.png and others"
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

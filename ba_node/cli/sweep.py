@@ -17,6 +17,7 @@ from ba_node.cli.console import (
     add_topic_options,
     parameters,
     progress_bar,
+    say_left_out,
     table,
     topic_choice,
 )
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.batch import recordings  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet  # noqa: PLC0415
     from ba_node.offline.page import PageError  # noqa: PLC0415
+    from ba_node.offline.study import Plan  # noqa: PLC0415
 
     base = parameters(args)
     values = {}
@@ -55,12 +57,12 @@ def run(args: argparse.Namespace) -> int:
         name, listed = split_assignment(text, "window.max_keyframes=5,10,20")
         parameter = find(name)
         values[parameter.name] = [parameter.read(one.strip()) for one in listed.split(",")]
-    plan = tuning.Plan(
+    plan = Plan(
         tuple(recordings(args.bag, each=args.each)), None, (), objective=args.objective, topics=topic_choice(args)
     )
     args.out.mkdir(parents=True, exist_ok=True)
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("sweep", "replays") as progress:
-        found = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
+        found, left_out = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
     print(table(*tuning_page.sweep_rows(found)))
     names = "sweep.csv, sweep.json, index.html"
     try:
@@ -68,4 +70,4 @@ def run(args: argparse.Namespace) -> int:
     except PageError as error:
         names = f"sweep.csv, sweep.json; {error}"
     print(f"written to {args.out}: {names}")
-    return 0
+    return say_left_out(left_out)

@@ -11,7 +11,8 @@ Writes into DIR: tuned.yaml, ready for --params and for the node; tuning.json; i
 
     ba tune --apply /ba_node --out out/tune     # sets what was found on a running node
 
-Exit code: 0 better parameters were found, 3 nothing better was, or they are worse on the recording for validation.
+Exit code: 0 better parameters were found, 3 nothing better was, they are worse on the recording for validation, or a
+recording could not be used, which is named and stops no other.
 """
 
 from __future__ import annotations
@@ -29,12 +30,14 @@ from ba_node.cli.console import (
     parameters,
     progress_bar,
     require_folder,
+    say_left_out,
     table,
     topic_choice,
 )
 
 if TYPE_CHECKING:
-    from ba_node.offline.tuning import Plan, Trial, Tuned
+    from ba_node.offline.study import Plan, Trial
+    from ba_node.offline.tuning import Tuned
 
 SUMMARY = "search for better parameters on recordings"
 EXAMPLE = "ba tune bags/*.mcap --out out/tune --preset accuracy --trials 50 --jobs 2"
@@ -121,12 +124,13 @@ def _tune(args: argparse.Namespace) -> int:
     except PageError as error:
         names = f"tuned.yaml, tuning.json; {error}"
     print(f"written to {args.out}: {names}")
-    return _verdict(tuned)
+    return max(say_left_out(tuned.left_out), _verdict(tuned))
 
 
 def _plan(args: argparse.Namespace) -> Plan:
     from ba_node.offline.batch import recordings  # noqa: PLC0415
-    from ba_node.offline.tuning import Plan, TuneError, chosen, preset  # noqa: PLC0415
+    from ba_node.offline.study import Plan, TuneError  # noqa: PLC0415
+    from ba_node.offline.tuning import chosen, preset  # noqa: PLC0415
 
     found = recordings(args.bag, each=args.each)
     validation = None

@@ -24,7 +24,7 @@ from ba_node.offline.figures import COLOURS, Figure, array
 from ba_node.offline.fleet import Fleet, delivered, expand, fetched, is_url, name_of
 from ba_node.offline.page import PageError, write_page
 from ba_node.offline.replay import MapOptions, Watch, replay
-from ba_node.offline.report import REPORT, draw_trajectory, html_table, write_report
+from ba_node.offline.report import REPORT, html_table, show
 
 # Columns of the table of all recordings: name in results.json and .csv, heading.
 COLUMNS = {
@@ -114,8 +114,7 @@ def _replayed(task: ReplayTask) -> dict[str, Any]:
         bag = [first, *map(Path, task.recording[1:])]
         report = replay(bag, out, task.config, Watch(task.clock), MapOptions(topics=task.topics))
         if task.report:
-            draw_trajectory(out)
-            write_report([out], out / REPORT)
+            show(out)
     return report
 
 

@@ -9,6 +9,7 @@ Colours are those of Okabe and Ito, told apart by colour-blind readers.
 from __future__ import annotations
 
 import base64
+import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ TRUTH, BEFORE, CLOUD = "#000000", "#D55E00", "#9AA0A6"
 COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 _BAD = {"HELD": "#E69F00", "FAILED": "#D55E00", "SKIPPED": "#9AA0A6"}
 # Points that are drawn at most, in space and from above, and residuals.
-_POINTS, _ABOVE, _ARROWS = 100_000, 6_000, 3_000
+_POINTS, _ABOVE, _ARROWS, _CAMERAS = 100_000, 6_000, 3_000, 4
 # Beyond it a float32 has steps of more than a centimetre.
 _FAR = 1e5
 # Length of a drawn residual: the 90th percentile takes this share of the image's width.
@@ -161,53 +162,84 @@ def _over_time(shown: Sequence[_Shown]) -> Figure:
     return Figure("error", "Error over time", text, data, layout)
 
 
-def _objective(shown: Sequence[_Shown]) -> Figure:
+def _of_solves(shown: Sequence[_Shown], what: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return a figure of each solve: before it, unless several runs are shown, and after it; 0 is none."""
     data = []
     for one in shown:
-        for name, key, colour in (("before", "objective_before", BEFORE), ("after", "objective_after", one.colour)):
-            if len(one.solve_s) and not (name == "before" and one.several):
-                values = np.where(one.details[key] > 0.0, one.details[key], np.nan)
-                data.append(line(one.solve_s, values, one.name(name), colour))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "objective", "type": "log"}}
-    return Figure("objective", "Objective of each solve", "At its start and at its end.", data, layout)
+        for name, colour in (("before", BEFORE), ("after", one.colour))[one.several :]:
+            values = one.details[f"{what}_{name}"] if len(one.solve_s) else np.empty(0)
+            if values.any():
+                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
+    return data, {"xaxis": {"title": "time [s]"}, "yaxis": {"type": "log"}}
+
+
+def _objective(shown: Sequence[_Shown]) -> Figure:
+    text = "The cost at its start and at its end."
+    return Figure("objective", "Objective of each solve", text, *_of_solves(shown, "objective"))
+
+
+def _held_out(shown: Sequence[_Shown]) -> Figure:
+    text = "Median residual [px] of tracks that took no part in a solve, by the front-end's poses and by the solution."
+    return Figure("held_out", "Tracks held out", text, *_of_solves(shown, "held_out_px"))
 
 
 def _arrows(shown: Sequence[_Shown]) -> Figure:
-    """Draw the residuals of the first run as vectors, one image for each camera."""
+    """Draw the residuals of the first run as vectors, for each camera; on images those of one keyframe."""
     details = shown[0].details
-    cameras = np.unique(details["camera"])[:4]
-    length = np.linalg.norm(details["error"][~details["outlier"]], axis=1)
-    width = float(np.ptp(details["uv"][:, 0])) if len(details["uv"]) else 1.0
-    scale = max(1.0, round(_ARROW_SHARE * width / max(float(np.percentile(length, 90)), 1e-3))) if len(length) else 1.0
-    data, layout = [], {}
-    for place, camera in enumerate(cameras):
+    images = {camera: details[f"image_{camera}"] for camera in range(_CAMERAS) if f"image_{camera}" in details}
+    cameras = sorted(images) or np.unique(details["camera"])[:_CAMERAS].tolist()
+    chosen = np.isin(details["camera"], cameras)
+    if images:
+        chosen &= details["keyframe"] == details["shown_keyframe"]
+    uv, error, outlier = details["uv"][chosen], details["error"][chosen], details["outlier"][chosen]
+    text, scale = "Predicted minus measured", 1.0
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {}
+    if len(uv):
+        length = float(np.percentile(np.linalg.norm(error[~outlier], axis=1), 90)) if (~outlier).any() else 1.0
+        scale = max(1.0, round(_ARROW_SHARE * float(np.ptp(uv[:, 0])) / max(length, 1e-3)))
+    for place, camera in enumerate(cameras if len(uv) else ()):
+        own = details["camera"][chosen] == camera
         axis = str(place + 1) if place else ""
-        for outlier, name, colour in ((False, "inliers", shown[0].colour), (True, "outliers", BEFORE)):
-            rows = np.flatnonzero((details["camera"] == camera) & (details["outlier"] == outlier))
-            rows = _few(rows, _ARROWS // len(cameras))
-            end = details["uv"][rows] + (scale if not outlier else 1.0) * details["error"][rows]
-            x, y = (_segments(details["uv"][rows, k], end[:, k]) for k in (0, 1))
+        for left_out, name, colour in (
+            (False, "inliers", "#E69F00" if images else shown[0].colour),
+            (True, "outliers", BEFORE),
+        ):
+            rows = _few(np.flatnonzero(own & (outlier == left_out)), _ARROWS // len(cameras))
+            end = uv[rows] + (1.0 if left_out else scale) * error[rows]
+            x, y = (_segments(uv[rows, k], end[:, k]) for k in (0, 1))
             drawn = line(x, y, name, colour, mode="lines", xaxis=f"x{axis}", yaxis=f"y{axis}")
-            drawn |= {"line": {"color": colour, "width": 1}, "showlegend": place == 0, "legendgroup": name}
-            data.append(drawn | {"visible": "legendonly" if outlier else True})
-        share = 1.0 / len(cameras)
-        low, high = details["uv"].min(axis=0), details["uv"].max(axis=0)
-        domain = [place * share, (place + 1) * share - (0.04 if len(cameras) > 1 else 0.0)]
-        layout[f"xaxis{axis}"] = {
-            "title": f"u [px], camera {camera}",
-            "domain": domain,
-            "range": [float(low[0]), float(high[0])],
-        }
-        layout[f"yaxis{axis}"] = {
-            "title": "v [px]" if place == 0 else "",
-            "anchor": f"x{axis}",
-            "scaleanchor": f"x{axis}",
-            "range": [float(high[1]), float(low[1])],
-        }
-    text = f"Predicted minus measured; inliers {scale:g} times as long as they are. A click on outliers shows them."
-    if len(shown) > 1:
-        text += f" Of {shown[0].run.name}."
-    return Figure("residuals", "Reprojection errors in the image", text, data if len(length) else [], layout, wide=True)
+            drawn |= {"line": {"color": colour, "width": 1.3}, "showlegend": place == 0, "legendgroup": name}
+            data.append(drawn | {"visible": "legendonly" if left_out else True})
+        layout |= _image_axes(axis, place, camera, len(cameras), uv)
+    if images:
+        text += ", in the keyframe that sees the most"
+        layout["images"] = [_picture(images[camera], place) for place, camera in enumerate(cameras)]
+    text += f"; inliers {scale:g} times as long as they are. A click on outliers shows them."
+    text += f" Of {shown[0].run.name}." if len(shown) > 1 else ""
+    return Figure("residuals", "Reprojection errors in the image", text, data, layout, wide=True)
+
+
+def _image_axes(axis: str, place: int, camera: int, count: int, uv: FloatArray) -> dict[str, Any]:
+    """Return the axes of one image of several side by side."""
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    domain = [place / count, (place + 1) / count - (0.04 if count > 1 else 0.0)]
+    across = {"title": f"u [px], camera {camera}", "domain": domain, "range": [float(low[0]), float(high[0])]}
+    down = {"title": "v [px]" if place == 0 else "", "anchor": f"x{axis}", "scaleanchor": f"x{axis}"}
+    return {f"xaxis{axis}": across, f"yaxis{axis}": down | {"range": [float(high[1]), float(low[1])]}}
+
+
+def _picture(grey: NDArray[np.uint8], place: int) -> dict[str, Any]:
+    """Return an image (h, w) as plotly.js lays it below a figure; pixel 0 is its centre."""
+    from PIL import Image  # noqa: PLC0415  # comes with matplotlib
+
+    packed = io.BytesIO()
+    Image.fromarray(grey).save(packed, "JPEG", quality=75)
+    height, width = grey.shape
+    axis = str(place + 1) if place else ""
+    source = f"data:image/jpeg;base64,{base64.b64encode(packed.getvalue()).decode()}"
+    size = {"x": -0.5, "y": -0.5, "sizex": width, "sizey": height, "sizing": "stretch", "layer": "below"}
+    return {"source": source, "xref": f"x{axis}", "yref": f"y{axis}", "yanchor": "top", **size}
 
 
 def _segments(begin: FloatArray, end: FloatArray) -> FloatArray:
@@ -281,18 +313,6 @@ def _health(shown: Sequence[_Shown]) -> Figure:
     }
     text = "Share of a window's observations that agree with its solution, median parallax, and what the guard held."
     return Figure("health", "Health of each window", text, data, layout)
-
-
-def _held_out(shown: Sequence[_Shown]) -> Figure:
-    data = []
-    for one in shown:
-        for name, key, colour in (("before", "held_out_px_before", BEFORE), ("after", "held_out_px_after", one.colour)):
-            values = one.details[key] if len(one.solve_s) else np.empty(0)
-            if values.any() and not (name == "before" and one.several):
-                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "median residual [px]", "type": "log"}}
-    text = "Tracks that took no part in a solve, by the front-end's poses and by the solution."
-    return Figure("held_out", "Tracks held out", text, data, layout)
 
 
 def _latency(shown: Sequence[_Shown]) -> Figure:

@@ -22,7 +22,8 @@ from ba_node.offline.fleet import name_of
 from ba_node.offline.measure import Measured
 from ba_node.offline.page import write_page
 from ba_node.offline.report import html_table
-from ba_node.offline.tuning import Trial, Tuned
+from ba_node.offline.study import Trial
+from ba_node.offline.tuning import Tuned
 
 _GREY, _ORANGE = "#9AA0A6", "#D55E00"
 _TUNED = "tuned.yaml"

@@ -17,7 +17,8 @@ from ba_node.io.parameters import read_parameters
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.offline.measure import Measured, Question, is_held_out, measure
 from ba_node.offline.recording import record
-from ba_node.offline.tuning import chosen, grid, preset, score_of
+from ba_node.offline.study import score_of
+from ba_node.offline.tuning import chosen, grid, preset
 
 pytest.importorskip("optuna", reason="needs Optuna: pip install ba_node[tune]")
 
@@ -216,3 +217,16 @@ def test_a_sweep_is_every_combination(tmp_path: Path, capsys: pytest.CaptureFixt
     assert errors[0] > 2.0 * errors[1]
     assert main([*arguments, "--values", "tracks.outlier_px=x"]) == 2
     assert "parameter tracks.outlier_px = 'x': expected float" in capsys.readouterr().err
+
+
+def test_a_recording_that_cannot_be_used_is_left_out_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(MONO.read_bytes()[:3000])
+    arguments = ["--out", str(tmp_path / "sweep"), "--values", "window.max_keyframes=20"]
+    assert main(["sweep", str(broken), str(MONO), *arguments]) == 3
+    shown = capsys.readouterr()
+    assert f"ba: error: {broken}: no message can be read" in shown.err
+    assert "mono_loop [m]" in shown.out
+    assert main(["sweep", str(broken), *arguments]) == 2
