@@ -1,0 +1,132 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Look at images before they are used, and say once what is wrong with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+
+import numpy as np
+
+from ba_node.arrays import FloatArray
+from ba_node.config.front_end import FrontEndOptions
+from ba_node.front_end import stereo
+from ba_node.front_end.records import Images
+from ba_node.front_end.rectify import IdealRig
+from ba_node.front_end.tracking import Content, Frame
+from ba_node.measurements import CameraRig
+
+# Spread of grey values below which there is nothing in an image.
+_DARK = 2.5
+_BACK_NS = 1_000_000_000
+# A pair of which so few features have a partner is looked at with left and right exchanged.
+_FEW_PARTNERS = 0.25
+
+
+class ImageWatch:
+    """Tells a cause once, until it is over."""
+
+    def __init__(self, rig: CameraRig, options: FrontEndOptions) -> None:
+        self._rig, self._options = rig, options
+        self._told: set[str] = set()
+        self.counts: Counter[str] = Counter()  # images by cause
+
+    def say(self, cause: str, text: str, notes: list[str]) -> None:
+        """Add a note, once until the cause is cleared."""
+        self.counts[cause] += 1
+        if cause not in self._told:
+            self._told.add(cause)
+            notes.append(text)
+
+    def clear(self, cause: str) -> None:
+        """Take a cause for over."""
+        self._told.discard(cause)
+
+    def look(self, images: Images, last_ns: int | None, notes: list[str]) -> Images | None:
+        """Return the images as they can be used, None if they cannot."""
+        if last_ns is not None and last_ns - _BACK_NS < images.stamp_ns <= last_ns:
+            self.say("stamp", f"stamp {images.stamp_ns} ns is not after the one before, {last_ns} ns: left out", notes)
+            return None
+        if not 1 <= len(images.grey) <= len(self._rig):
+            self.say("count", f"{len(images.grey)} images for a rig of {len(self._rig)} cameras: left out", notes)
+            return None
+        for index, grey in enumerate(images.grey):
+            expected = tuple(int(v) for v in self._rig.image_size[index])
+            size = (grey.shape[1], grey.shape[0])
+            if all(expected) and size != expected:
+                self.say(
+                    "size",
+                    f"camera {index} ({self._rig.names[index]!r}): image of {size[0]} x {size[1]} px where the"
+                    f" calibration is for {expected[0]} x {expected[1]}: left out; calibrate at this resolution,"
+                    " or scale the calibration",
+                    notes,
+                )
+                return None
+        if float(images.grey[0][::4, ::4].std()) < _DARK:
+            self.say(
+                "dark",
+                f"image at {images.stamp_ns} ns shows nothing (black, or covered): the map stays as it is",
+                notes,
+            )
+            return None
+        self.clear("dark")
+        return self._pair(images, notes)
+
+    def _pair(self, images: Images, notes: list[str]) -> Images:
+        """Return the images without a partner of another time or of another size."""
+        limit = self._options.max_skew_s
+        if abs(images.skew_ns) > limit * 1e9 and (len(images.grey) > 1 or images.depth_m is not None):
+            self.say(
+                "skew",
+                f"the second image is {images.skew_ns / 1e6:+.1f} ms off the first, more than max_skew_s ="
+                f" {1e3 * limit:g} ms: not taken for a pair; let the cameras be triggered together",
+                notes,
+            )
+            return dataclasses.replace(images, grey=images.grey[:1], depth_m=None)
+        if len(images.grey) < len(self._rig) and images.depth_m is None:
+            self.say("single", f"no second image at {images.stamp_ns} ns: followed in the first alone", notes)
+        if images.depth_m is not None and images.depth_m.shape != images.grey[0].shape:
+            found, expected = images.depth_m.shape[::-1], images.grey[0].shape[::-1]
+            self.say(
+                "depth_size",
+                f"depth of {found[0]} x {found[1]} px with an image of {expected[0]} x {expected[1]}: left out; depths"
+                " must be registered to the image (aligned_depth_to_color, depth_registered)",
+                notes,
+            )
+            return dataclasses.replace(images, depth_m=None)
+        return images
+
+    def partners(self, content: Content, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
+        """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""
+        assert frame.right is not None
+        uv = content.uv
+        dense = stereo.dense(frame.grey, frame.right, 128, rig.baseline < 0.0)
+        swapped = stereo.dense(frame.right, frame.grey, 128, rig.baseline < 0.0)
+        ours, theirs = _share(dense), _share(swapped)
+        if theirs > 2.0 * ours and theirs > _FEW_PARTNERS:
+            self.say(
+                "swapped",
+                f"left and right images seem to be exchanged: {100 * theirs:.0f} % of them match the other way round,"
+                f" {100 * ours:.0f} % as given; exchange the topics, or the cameras in the rig",
+                notes,
+            )
+        elif ours < 0.02 and len(uv):
+            self.say(
+                "strangers",
+                f"only {100 * ours:.0f} % of the first image are found in the second: check that both are of one time"
+                " and that the rig is theirs",
+                notes,
+            )
+
+
+def _share(disparity: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
+    """Return how much of an image has a partner in the other."""
+    return float(np.mean(np.isfinite(disparity)))
+
+
+def covariance_of(found: FloatArray, fixed_from_camera: FloatArray) -> FloatArray:
+    """Return x, y, z, turn in the fixed frame of a covariance of turn and place in the camera's: (6, 6)."""
+    order = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+    R = np.kron(np.eye(2), fixed_from_camera)
+    return np.asarray(R @ found[order] @ R.T)
