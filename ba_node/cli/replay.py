@@ -125,7 +125,7 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
         for group, name in zip(found, batch.folder_names(found), strict=True)
     ]
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("replay", "recordings") as progress:
-        rows = batch.replay_all(fleet, tasks, progress)
+        rows = batch.each(fleet, batch.replay_one, tasks, progress)
     print(table(list(batch.COLUMNS.values())[:-1], [batch.cells(row)[:-1] for row in rows]))
     for row in rows:
         if row["state"] == batch.LOOK:
