@@ -33,5 +33,5 @@ class FrontEndNodeOptions(Checked):
     publish_tf: bool = option(True, "Publish odom_frame -> body, unless the odometry comes from elsewhere.")
     mask_file: str = option("", "Picture of the first camera's size, black where nothing is to be looked at.")
     mask_topic: bool = option(False, "Wait for a mask of each image on the topic mask (mono8, 0: do not look).")
-    queue_depth: int = option(30, "Images of a topic that may wait.", within=(2, 1000))
+    queue_depth: int = option(50, "Images of a topic that may wait.", within=(2, 1000))
     autostart: bool = option(True, "Configure and activate at start.")

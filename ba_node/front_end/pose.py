@@ -78,15 +78,19 @@ def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Trans
         error, jacobian = _linear(rig, seen, pose)
         weighted, _ = _weights(error)
         H = np.einsum("nik,nil,n->kl", jacobian, jacobian, weighted)
-        H += 1e-9 * np.eye(6) * np.trace(H)
+        H += (1e-9 * np.trace(H) + 1e-300) * np.eye(6)
         step = np.linalg.solve(H, np.einsum("nik,ni,n->k", jacobian, error, weighted))
+        if not np.isfinite(step).all():
+            return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
         pose = Transform(geometry.so3_exp(step[:3]), step[3:]).after(pose)
         if np.linalg.norm(step) < 1e-8:
             break
     error, jacobian = _linear(rig, seen, pose)
     weighted, size = _weights(error)
     H = np.einsum("nik,nil,n->kl", jacobian, jacobian, weighted)
-    return pose, np.linalg.pinv(H, hermitian=True), size
+    if not (np.isfinite(H).all() and np.isfinite(size).all()):
+        return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
+    return pose, np.linalg.inv(H + (1e-12 * np.trace(H) + 1e-300) * np.eye(6)), size
 
 
 def _weights(error: FloatArray) -> tuple[FloatArray, FloatArray]:
