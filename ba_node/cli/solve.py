@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import resource
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING
 from ba_node.cli.console import require_folder, write_result
 
 if TYPE_CHECKING:
+    from ba_node.config import SolverOptions
     from ba_node.estimate import Iteration
     from ba_node.offline.solve_bal import Solution
     from ba_node.offline.solve_model import ModelSolution
@@ -64,6 +66,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help=f"change an option, one of {', '.join(name for name in options if name != 'method')}; repeatable",
     )
+    parser.add_argument(
+        "--ranks", type=int, metavar="N", help="BAL, Bundler: solve on N processes by MPI, see docs/scale.md"
+    )
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="with ranks: write where the solve is")
+    parser.add_argument(
+        "--every", type=int, default=5, metavar="K", help="iterations between checkpoints (default: %(default)s)"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem in its own format")
     parser.add_argument(
         "--refine",
@@ -77,8 +87,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve."""
+    from ba_node.offline.solve_ranks import started_as_ranks  # noqa: PLC0415
+
     require_folder(args.out)
+    if args.ranks is not None and not started_as_ranks():
+        return _start_ranks(args)
     solution = _solved(args)
+    if solution is None:
+        return 0
     summary = solution.as_dict()
     summary["peak_rss_mb"] = _peak_rss_mb()
     write_result(args.json, summary)
@@ -107,17 +123,67 @@ def run(args: argparse.Namespace) -> int:
     return ATTENTION if grave else 0
 
 
-def _solved(args: argparse.Namespace) -> Solution | ModelSolution:
+def _start_ranks(args: argparse.Namespace) -> int:
+    """Run this command once more, on several ranks."""
+    from ba_node.offline.solve_ranks import RanksError, launch_command  # noqa: PLC0415
+
+    if args.ranks < 1:
+        raise RanksError(f"--ranks {args.ranks}: expected 1 or more")
+    command, environ = launch_command(args.ranks, sys.argv[1:])
+    code = subprocess.run(command, env=environ, check=False).returncode
+    if code not in (0, NOTHING, ATTENTION):
+        hint = (
+            f": go on from {args.checkpoint} with --resume"
+            if args.checkpoint
+            else "; --checkpoint FILE keeps what was done"
+        )
+        print(f"ba: error: a rank ended with code {code}, and all with it{hint}", file=sys.stderr)
+    return code if code >= 0 else NOTHING
+
+
+def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | None:
+    """Solve as one of several ranks; whatever ends one of them ends all."""
+    from ba_node.offline.solve_ranks import Alone, Checkpoint, solve_on_ranks, started_as_ranks, world  # noqa: PLC0415
+
+    communicator = world() if started_as_ranks() else Alone()
+    checkpoint = Checkpoint(args.checkpoint, max(1, args.every), args.resume) if args.checkpoint else None
+    try:
+        return solve_on_ranks(
+            args.problem,
+            options,
+            communicator,
+            checkpoint=checkpoint,
+            clock=time.perf_counter,
+            on_iteration=_show,
+            warn=lambda text: print(f"ba: warning: {text}", file=sys.stderr),
+        )
+    except (ValueError, OSError) as error:
+        if communicator.size == 1:
+            raise
+        print(f"ba: error: rank {communicator.rank}: {error}", file=sys.stderr, flush=True)
+        communicator.abort(NOTHING)
+        raise
+
+
+def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:
     from ba_node.config import ConfigError  # noqa: PLC0415
     from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
     from ba_node.offline.solve_model import DEFAULT_GROUPS, solve_model  # noqa: PLC0415
+    from ba_node.offline.solve_ranks import started_as_ranks  # noqa: PLC0415
     from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
 
     assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]
+    if args.resume and args.checkpoint is None:
+        raise ConfigError("--resume needs --checkpoint FILE, from which to go on")
+    on_ranks = args.checkpoint is not None or started_as_ranks()
+    if on_ranks and args.problem.is_dir():
+        raise ConfigError("ranks and checkpoints are for BAL and Bundler, not for models of COLMAP")
     if not args.problem.is_dir():
         if args.refine:
             raise ConfigError("--refine is for models of COLMAP: BAL and Bundler have f, k1, k2 of each image free")
         options = solver_options(args.method, assignments)
+        if on_ranks:
+            return _on_ranks(args, options)
         return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
     options = solver_options(args.method, [*_OF_MODELS, *assignments])
     groups = [group for group in args.refine or DEFAULT_GROUPS if group != "none"]

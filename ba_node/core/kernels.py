@@ -94,6 +94,9 @@ class Kernels(Protocol):
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
 
+    def gradient(self) -> FloatArray:
+        """Return the keyframes' part of the gradient, (n_free, d)."""
+
     def diagonals(self) -> tuple[FloatArray, FloatArray]:
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
 

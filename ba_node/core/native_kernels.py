@@ -100,6 +100,10 @@ class NativeKernels:
         self.gradient_norm = self._kernel.gradient_norm
         return value
 
+    def gradient(self) -> FloatArray:
+        """Return the keyframes' part of the gradient, (n_free, d)."""
+        return self._kernel.gradient()
+
     def diagonals(self) -> tuple[FloatArray, FloatArray]:
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
         d_c, d_p = self._kernel.diagonals()

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import scipy
@@ -60,12 +61,17 @@ class NumpyKernels:
         self.gradient_norm = self._equations.gradient_norm
         return self._linearisation.objective
 
+    def gradient(self) -> FloatArray:
+        """Return the keyframes' part of the gradient, (n_free, d)."""
+        return self._equations.gradient_c
+
     def diagonals(self) -> tuple[FloatArray, FloatArray]:
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
         return self._equations.diagonals()
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NumpySystem:
         """Add damping to the diagonals and eliminate."""
+        self._damping = damping_c, damping_p
         side, factor = self._options.schur, 1.0
         if side == "adaptive":
             side, factor = self._adapt(damping_c, damping_p)
@@ -77,8 +83,7 @@ class NumpyKernels:
     def damp(self, kind: str, mu: float) -> NumpySystem:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate."""
         d_c, d_p = scaling.diagonals(kind, self.diagonals())
-        self._damping = mu * d_c, mu * d_p
-        return self.reduce(*self._damping)
+        return self.reduce(mu * d_c, mu * d_p)
 
     def step(self, state: State, system: System, x: FloatArray, inner_iterations: int) -> StepResult:
         """Take the step whose part in ``system`` is x, and the inner iterations after it."""
@@ -190,7 +195,17 @@ class NumpySystem:
         return step_c, step_p, -float(slope) - 0.5 * curvature
 
 
-def preconditioner(kind: str, system: NumpySystem, scale: FloatArray) -> linear.Product:
+class _Blocks(Protocol):
+    """A system of which diagonal blocks are known."""
+
+    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
+        """Return those of S."""
+
+    def own_blocks(self) -> tuple[FloatArray, ...]:
+        """Return those of what was not eliminated, damped."""
+
+
+def preconditioner(kind: str, system: _Blocks, scale: FloatArray) -> linear.Product:
     """Return ``r -> M^-1 r`` for the system scaled by ``scale`` = 1/D, (n,)."""
     if kind == "none":
         return lambda r: r

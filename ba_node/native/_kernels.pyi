@@ -93,6 +93,9 @@ class Kernel:
     def inner_iterations(self, state: State, steps: int) -> tuple[float, float, Doubles]:
         """Return the objective before and after, and the points."""
 
+    def gradient(self) -> Doubles:
+        """Return the keyframes' part of the gradient, (n_free, d)."""
+
     def diagonals(self) -> tuple[Doubles, Doubles]:
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
 

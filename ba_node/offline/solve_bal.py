@@ -16,7 +16,7 @@ from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core.objective import rms_px
 from ba_node.core.problem import Problem, State
-from ba_node.core.result import Result
+from ba_node.core.result import Result, Status
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
 from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated, write_bal
@@ -145,14 +145,26 @@ def solve_file(
         ProblemError: it holds no well-formed problem.
     """
     began = clock()
+    solution = read(path, options)
+    ready = clock()
+    result = solve(solution.problem, options, clock=clock, on_iteration=on_iteration)
+    return dataclasses.replace(solution, result=result, setup_s=ready - began, solve_s=clock() - ready)
+
+
+def read(path: Path | str, options: SolverOptions) -> Solution:
+    """Read a file as its own solution, to be solved yet.
+
+    Raises:
+        BalError: the file cannot be read.
+        ProblemError: it holds no well-formed problem.
+    """
     scene = read_bundler(Path(path)) if is_bundler(Path(path)) else None
     bal = read_bal(path) if scene is None else scene.bal
     origin = middle_if_far(bal.points)
     bal = translated(bal, -origin) if origin.any() else bal
     problem = to_problem(bal)
-    ready = clock()
-    result = solve(problem, options, clock=clock, on_iteration=on_iteration)
-    return Solution(str(path), bal, problem, origin, result, options, ready - began, clock() - ready, scene)
+    unsolved = Result(problem.start, Status.SKIPPED, "not solved yet", options.method, ())
+    return Solution(str(path), bal, problem, origin, unsolved, options, 0.0, 0.0, scene)
 
 
 def middle_if_far(points: FloatArray) -> FloatArray:

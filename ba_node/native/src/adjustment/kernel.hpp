@@ -91,6 +91,12 @@ class KernelOf final : public Kernel {
     reduced_.set_pairs(pairs);
   }
 
+  // The keyframes' part of the gradient (n_free x D).
+  void gradient(double* out) const override {
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      for (int i = 0; i < D; ++i) out[k * D + i] = at(equations_.gradient_c[k], i);
+  }
+
   // diag(B) (n_free x D) and diag(C) (n_points x 3).
   void diagonals(double* d_c, double* d_p) const override {
     for (std::int64_t k = 0; k < l_.n_free; ++k)

@@ -179,6 +179,12 @@ void bind_assembly(py::class_<Kernel>& kernel) {
              return without_gil([&] { return k.objective(s.view()); });
            })
       .def("inner_iterations", &inner_iterations)
+      .def("gradient",
+           [](const Kernel& k) {
+             Doubles out = empty({k.n_free(), k.size()});
+             k.gradient(out.mutable_data());
+             return out;
+           })
       .def("diagonals",
            [](const Kernel& k) {
              Doubles d_c = empty({k.n_free(), k.size()}), d_p = empty({k.n_points(), 3});

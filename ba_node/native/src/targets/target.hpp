@@ -42,6 +42,8 @@ class Kernel {
   // Add what factors have at the state of the last linearisation: to B (n_free x 36), to the gradient (n_free x 6), and
   // the blocks of the coupled pairs (n_pairs x 36).
   virtual void add_factors(const double* diagonal, const double* gradient, const double* pairs) = 0;
+  // The keyframes' part of the gradient (n_free x d).
+  virtual void gradient(double* out) const = 0;
   // diag(B) (n_free x d) and diag(C) (n_points x 3).
   virtual void diagonals(double* d_c, double* d_p) const = 0;
 
