@@ -130,7 +130,15 @@ def _start_ranks(args: argparse.Namespace) -> int:
     if args.ranks < 1:
         raise RanksError(f"--ranks {args.ranks}: expected 1 or more")
     command, environ = launch_command(args.ranks, sys.argv[1:])
-    code = subprocess.run(command, env=environ, check=False).returncode
+    with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as ranks:
+        assert ranks.stderr is not None
+        framed = False
+        for line in ranks.stderr:
+            # Open MPI frames what it has to say itself; of a rank that died the line below tells in fewer words.
+            framed ^= line.startswith("-----")
+            if not framed and not line.startswith("-----"):
+                print(line, end="", file=sys.stderr)
+    code = ranks.returncode
     if code not in (0, NOTHING, ATTENTION):
         hint = (
             f": go on from {args.checkpoint} with --resume"
@@ -148,7 +156,7 @@ def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | No
     communicator = world() if started_as_ranks() else Alone()
     checkpoint = Checkpoint(args.checkpoint, max(1, args.every), args.resume) if args.checkpoint else None
     try:
-        return solve_on_ranks(
+        solution = solve_on_ranks(
             args.problem,
             options,
             communicator,
@@ -157,12 +165,18 @@ def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | No
             on_iteration=_show,
             warn=lambda text: print(f"ba: warning: {text}", file=sys.stderr),
         )
-    except (ValueError, OSError) as error:
-        if communicator.size == 1:
-            raise
-        print(f"ba: error: rank {communicator.rank}: {error}", file=sys.stderr, flush=True)
-        communicator.abort(NOTHING)
+    except (ValueError, OSError):
+        # All ranks have come to it; the first says it.
+        communicator.finish()
+        if communicator.rank:
+            return None
         raise
+    except BaseException as error:
+        print(f"ba: error: rank {communicator.rank}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+        communicator.abort(1)
+        raise
+    communicator.finish()
+    return solution
 
 
 def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:

