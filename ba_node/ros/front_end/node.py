@@ -45,8 +45,8 @@ from ba_node.front_end.streams import (
     transform_of,
 )
 from ba_node.io.rig_file import read_rig
-from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages import conversion
+from ba_node.measurements import Keyframe, Measurement
+from ba_node.messages.conversion import InputMessages
 from ba_node.messages.factory import ConversionError, header_message, pose_message, stamp_ns_from_message
 from ba_node.messages.rig import rig_from_infos
 from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
@@ -98,6 +98,7 @@ class FrontEndNode(ManagedNode):
         self._mask = read_mask(mask_file) if mask_file else None
         self.counted: Counter[str] = Counter()  # images tracked and keyframes sent, and images left out by reason
         self._throttle, self._factory = Throttle(_LOG_S), RclpyFactory()
+        self._messages = InputMessages(self._factory)
         self._entities: list[tuple[str, Any]] = []
         self._active = False
         self._session_id = max(1, int(self.get_clock().now().nanoseconds // 10**9) - _EPOCH_S)
@@ -308,25 +309,15 @@ class FrontEndNode(ManagedNode):
         self._front_end = FrontEnd(
             self._rig, self._tracking, mask=self._mask, session_id=self._session_id, fixed_frame=options.odom_frame
         )
-        self._out["camera_rig"].publish(conversion.rig_message(self._factory, self._rig, 0))
+        self._out["camera_rig"].publish(self._messages.of(self._rig, 0)[1])
         return self._front_end
 
     def _send(self, measurement: Measurement, stamp_ns: int) -> None:
         """Publish a measurement once the back-end listens; until then the newest of them wait."""
-        assert self._rig is not None
-        if isinstance(measurement, Keyframe):
-            self.counted["keyframes"] += 1
-            message = "keyframes", conversion.keyframe_message(self._factory, measurement)
-        elif isinstance(measurement, LandmarkGuesses):
-            frame = self.options.odom_frame
-            message = "landmark_guesses", conversion.guesses_message(self._factory, measurement, stamp_ns, frame)
-        else:
-            assert isinstance(measurement, FeatureTracks)
-            name = self._rig.names[measurement.camera_index]
-            message = "feature_tracks", conversion.tracks_message(self._factory, measurement, stamp_ns, name)
+        self.counted["keyframes"] += isinstance(measurement, Keyframe)
         if len(self._unsent) == self._unsent.maxlen:
             self._warn("nobody", f"nobody listens to {self.resolve_topic_name('keyframes')}: keyframes are lost")
-        self._unsent.append(message)
+        self._unsent.append(self._messages.of(measurement, stamp_ns))
         self._publish_unsent()
 
     def _publish_unsent(self) -> None:
