@@ -218,7 +218,7 @@ setup(
         # Optional parts, each of which says what to install where its library is missing.
         "front_end": ["poselib"],
         "report": ["plotly"],
-        "tune": ["optuna"],
+        "tune": ["optuna>=5"],
         "fleet": ["distributed", "fsspec"],
         "geo": ["pymap3d"],
         "mpi": ["mpi4py"],

@@ -60,7 +60,7 @@ def _add_front_end_options(parser: argparse._ArgumentGroup) -> None:
     parser.add_argument("--rig", type=Path, nargs="+", metavar="FILE", help="cameras, in any form that ba rig reads")
     parser.add_argument("--tolerance", type=float, default=1e-3, metavar="S", help="stamps pair within (%(default)s)")
     parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")
-    parser.add_argument("--cameras", type=int, default=1, metavar="N", help="NUM_OF_CAM of vins_mono (%(default)s)")
+    parser.add_argument("--cameras", type=int, default=0, metavar="N", help="NUM_OF_CAM of vins_mono (rig's, or 1)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -91,7 +91,7 @@ def _convert_front_end(args: argparse.Namespace) -> int:
         raise TargetError(f"--topic {' '.join(args.topic)}: expected NAME=TOPIC, each name once")
     rig = load_rig(args.rig) if args.rig else None
     options = AdapterOptions(args.tolerance, args.parallax, rig=rig)
-    adapter = adapt(args.source, args.target, args.front_end, options, args.cameras, topics)
+    adapter = adapt(args.source, args.target, args.front_end, options, args.cameras or (len(rig) if rig else 1), topics)
     print(f"{args.target}: {adapter.summary()}")
     write_result(args.json, {"summary": adapter.summary(), "notes": list(adapter.told())})
     for note in adapter.told():

@@ -30,6 +30,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "refine": (
         "replay",
+        "tune",
+        "sweep",
         "solve",
         "map",
     ),

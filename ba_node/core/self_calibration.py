@@ -84,7 +84,8 @@ def calibrate(
     """
     _require(problem, options)
     problem.check()
-    start = CalibratedState(**vars(problem.start), cameras=problem.cameras)
+    at = problem.start
+    start = CalibratedState(at.rotation, at.translation, at.points, at.intrinsics, problem.cameras)
     problem = replace(problem, start=start)
     with np.errstate(all="ignore"):
         kernels = CalibrationKernels(problem, options, unknowns)

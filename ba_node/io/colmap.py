@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry
 from ba_node.core.problem import Cameras
 from ba_node.io.model import ModelError, Reconstruction, lens_values, read_lens, stamps
@@ -35,9 +35,13 @@ class ColmapModel:
     camera_ids: list[int]
     frame_ids: list[int]
     point_ids: list[int]
+    views: IntArray  # (l, 2) image, and number among its features, of each observation
 
-    def take(self, model: Reconstruction) -> None:
-        """Take over poses, points and cameras of a solution; all else, ids too, stays as it was read."""
+    def take(self, model: Reconstruction, left_out: BoolArray) -> None:
+        """Take over poses, points and cameras of a solution, and delete observations (l,) that took no part in it.
+
+        All else, ids too, stays as it was read. COLMAP deletes what is behind its camera before it adjusts.
+        """
         colmap = library()
         for id_, rotation, translation in zip(self.frame_ids, model.rotation, model.translation, strict=True):
             self.world.frames[id_].rig_from_world = _rigid(colmap, rotation, translation)
@@ -50,6 +54,9 @@ class ColmapModel:
                 if camera.sensor_id in rig.non_ref_sensors:
                     place = model.cameras.rotation[number], model.cameras.translation[number]
                     rig.set_sensor_from_rig(camera.sensor_id, _rigid(colmap, *place))
+        for image, feature in self.views[left_out].tolist():
+            if self.world.images[image].points2D[feature].has_point3D():
+                self.world.delete_observation(image, feature)
         self.world.update_point_3d_errors()
 
 
@@ -99,6 +106,7 @@ def read_colmap(path: Path) -> ColmapModel:
     ]
     places = [_place(world, camera) for camera in cameras]
     poses = [world.frames[id_].rig_from_world for id_ in frame_ids]
+    frame, camera, point, uv, views = _observations(world, camera_ids, frame_ids, point_ids)
     model = Reconstruction(
         tuple(camera.model_name for camera in cameras),
         np.array([(camera.width, camera.height) for camera in cameras], np.intp).reshape(-1, 2),
@@ -112,10 +120,13 @@ def read_colmap(path: Path) -> ColmapModel:
         np.array([pose.translation for pose in poses]).reshape(-1, 3),
         np.array([world.points3D[id_].xyz for id_ in point_ids]).reshape(-1, 3),
         np.array([world.points3D[id_].color for id_ in point_ids], np.intp).reshape(-1, 3),
-        *_observations(world, camera_ids, frame_ids, point_ids),
+        frame,
+        camera,
+        point,
+        uv,
         stamps(len(frame_ids)),
     )
-    return ColmapModel(world, model, camera_ids, frame_ids, point_ids)
+    return ColmapModel(world, model, camera_ids, frame_ids, point_ids, views)
 
 
 def _require_whole(path: Path) -> None:
@@ -137,22 +148,24 @@ def _require_whole(path: Path) -> None:
 
 def _observations(
     world: Any, camera_ids: list[int], frame_ids: list[int], point_ids: list[int]
-) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Return frame, camera and point of each observation, and its pixel from the middle of the first one."""
+) -> tuple[IntArray, IntArray, IntArray, FloatArray, IntArray]:
+    """Return frame, camera and point of each observation, its pixel from the middle of the first, and its view."""
     camera_of, frame_of, point_of = (
         {id_: number for number, id_ in enumerate(ids)} for ids in (camera_ids, frame_ids, point_ids)
     )
-    frames, cameras, points, pixels = [], [], [], []
+    frames, cameras, points, pixels, views = [], [], [], [], [np.empty((0, 2), np.intp)]
     for id_ in sorted(world.reg_image_ids()):
         image = world.images[id_]
         seen = image.get_observation_points2D()
+        features = image.get_observation_point2D_idxs()
+        views.append(np.stack([np.full(len(seen), id_), np.array(features, np.intp)], axis=1))
         frames.append(np.full(len(seen), frame_of[image.frame_id]))
         cameras.append(np.full(len(seen), camera_of[image.camera_id]))
         points.append(np.array([point_of[point.point3D_id] for point in seen], np.intp))
         pixels.append(np.array([point.xy for point in seen]).reshape(-1, 2) - 0.5)
     none = [np.empty(0, np.intp)]
     index = [np.concatenate(part or none) for part in (frames, cameras, points)]
-    return index[0], index[1], index[2], np.concatenate([np.empty((0, 2)), *pixels])
+    return index[0], index[1], index[2], np.concatenate([np.empty((0, 2)), *pixels]), np.concatenate(views)
 
 
 def write_colmap(path: Path, world: Any, *, text: bool = False) -> None:

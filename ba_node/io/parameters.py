@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -77,12 +77,35 @@ def parameters_yaml(config: Config, *, comments: bool = True) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parameters_markdown() -> str:
-    """Return a table of all parameters."""
+def changes_yaml(config: Config) -> str:
+    """Return the parameters that differ from their defaults as such a file, the default behind each."""
+    lines = ["/**:", f"  {_ROS_KEY}:"]
+    values = config.values()
+    changed = [one for one in declarations() if values[one.name] != one.default]
+    for group, parameters in groupby(changed, key=lambda p: p.name.split(".")[0]):
+        lines.append(f"    {group}:")
+        lines += [
+            f"      {one.name.split('.')[1]}: {_scalar(values[one.name])}  # default {_scalar(one.default)}"
+            for one in parameters
+        ]
+    return "\n".join(lines if changed else ["{}  # all parameters have their defaults"]) + "\n"
+
+
+def parameters_markdown(parameters: Sequence[Parameter] = declarations()) -> str:
+    """Return a table of parameters, those of the node if none are given."""
     lines = ["| parameter | default | unit | allowed | change | meaning |", "|---|---|---|---|---|---|"]
-    for p in declarations():
+    for p in parameters:
         change = "next solve" if p.live else "restart"
         lines.append(f"| `{p.name}` | {_scalar(p.default)} | {p.unit} | {_allowed(p)} | {change} | {p.doc} |")
+    return "\n".join(lines) + "\n"
+
+
+def plain_yaml(parameters: Sequence[Parameter]) -> str:
+    """Return parameters without groups, with their defaults, as a file for ``--params-file``."""
+    lines = ["/**:", f"  {_ROS_KEY}:"]
+    for parameter in parameters:
+        lines += [f"    # {parameter.doc}", f"    # {_facts(parameter)}"]
+        lines.append(f"    {parameter.name}: {_scalar(parameter.default)}")
     return "\n".join(lines) + "\n"
 
 

@@ -30,6 +30,10 @@ class FleetError(ValueError):
     """Workers that are not there, or a recording that cannot be fetched."""
 
 
+class LostError(FleetError):
+    """Work that workers die of."""
+
+
 class Fleet:
     """Workers. Use it as a context manager.
 
@@ -106,12 +110,24 @@ class Fleet:
         for future in as_completed(futures):
             number = futures.pop(future)
             try:
-                yield number, future.result()
-            except Exception as error:  # what a scheduler says of dead workers is of its own types
-                if type(error).__module__.partition(".")[0] != "distributed":
-                    raise
-                words = f"{_TRIES} workers died of it, perhaps for want of memory ({type(error).__name__})"
-                yield number, failed(tasks[number], words)
+                yield number, result_of(future)
+            except LostError as error:
+                yield number, failed(tasks[number], str(error))
+
+
+def result_of(future: Future[Result]) -> Result:
+    """Return what a worker has returned.
+
+    Raises:
+        LostError: several workers died of it.
+    """
+    try:
+        return future.result()
+    except Exception as error:  # what a scheduler says of dead workers is of its own types
+        if type(error).__module__.partition(".")[0] != "distributed":
+            raise
+        name = type(error).__name__
+        raise LostError(f"{_TRIES} workers died of it, perhaps for want of memory ({name})") from None
 
 
 class _Here(Executor):
@@ -124,6 +140,13 @@ class _Here(Executor):
         except Exception as error:  # as an executor does
             future.set_exception(error)
         return future
+
+
+def words_of(error: Exception) -> str:
+    """Return in one line what is wrong."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(str(error).split())
 
 
 def _version() -> str:

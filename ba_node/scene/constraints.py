@@ -222,6 +222,13 @@ class Constraints:
             return
         self._insert(Absolute(fix.stamp_ns, position, None, covariance, of_antenna=True))
 
+    def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
+        """Drop what hangs on keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
+        gone = set(keyframes.tolist())
+        self.relative = {key: value for key, value in self.relative.items() if gone.isdisjoint(key)}
+        self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}
+        self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
+
     def reject_unknown(self, keyframes: IdArray, log: RejectionLog) -> None:
         """Give up what names keyframes that never came."""
         known = set(keyframes.tolist())

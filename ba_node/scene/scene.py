@@ -182,8 +182,9 @@ class Scene(MapTables):
         self._index_newest()
         self.constraints.add_step(keyframe.keyframe_id, keyframe.covariance, self.log)
         self.blocks.append([])
-        if len(self.keyframes) > self.config.max_keyframes:
-            self._forget_keyframes()
+        forgotten = self._limit_keyframes()
+        if len(forgotten):
+            self.constraints.forget(forgotten, int(self.keyframes.stamp_ns[self.order[0]]))
         self.propagate_corrections()
         self._place_pending()
 

@@ -69,7 +69,7 @@ class EqualHeights(CustomFactors):
 
     def residuals(self, state: State) -> np.ndarray:
         height = -np.einsum("nij,ni->nj", state.rotation, state.translation)[:, 2]
-        return (height[self.keyframes[:, 1]] - height[self.keyframes[:, 0]])[:, None] / 0.1
+        return np.asarray((height[self.keyframes[:, 1]] - height[self.keyframes[:, 0]])[:, None] / 0.1)
 
 
 def single_keyframe_factors(truth: State, n: int) -> tuple[KeyframeFactors, ...]:

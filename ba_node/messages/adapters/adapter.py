@@ -132,9 +132,10 @@ class Adapter:
 
     def finish(self) -> None:
         """Count what still waits when no more messages come."""
+        words = "nothing tells the cameras: give them with --rig FILE"
         for reason, waiting in (("no_features", self._poses), ("no_pose", self._features), ("no_rig", self._frames)):
             if waiting:
-                self.leave(reason, f"{len(waiting)} at the end", len(waiting))
+                self.leave(reason, words if reason == "no_rig" else f"{len(waiting)} at the end", len(waiting))
 
     def leave(self, reason: str, words: str, count: int = 1) -> None:
         """Count what is left out."""
@@ -287,7 +288,7 @@ class Adapter:
             uv = features.normalised * self.rig.intrinsics[0, :2] + self.rig.intrinsics[0, 2:]
         depth_m = np.empty(0)
         if features.point_in_body:
-            depth_m = self._depth_m(features)
+            depth_m = self._depth_m(features) if features.has_depth else depth_m
             point = point @ geometry.matrix_from_quaternion(pose.orientation).T + pose.position
         ids = features.ids.astype(np.uint64)
         new = [i for i, track in enumerate(ids.tolist()) if track not in self._guessed and np.isfinite(point[i]).all()]
