@@ -94,9 +94,14 @@ class FrontEnd:
 
     def _know_size(self, size: tuple[int, int]) -> None:
         self._ideal = ideal_rig(self.rig, size)
-        allowed = self._ideal.cameras[0].inside
+        inside = self._ideal.cameras[0].inside
         width, height = self._ideal.size
-        self._allowed = np.ones((height, width), bool) if allowed is None else allowed
+        self._allowed = np.ones((height, width), bool)
+        if inside is not None:
+            # The rim of the raw image looks like corners.
+            side = self.options.patch_px
+            kernel = np.ones((side, side), np.uint8)
+            self._allowed = np.asarray(opencv.cv2().erode(inside.astype(np.uint8), kernel, borderValue=0)) > 0
         if self._mask is not None:
             if self._mask.shape != (size[1], size[0]):
                 found = f"{self._mask.shape[1]} x {self._mask.shape[0]}"

@@ -34,6 +34,10 @@ SMOOTHING_PX = 1.0
 _SAME, _SAME_AGAIN, _RENEW = 0.7, 0.85, 0.8
 # How far from where the pose says a patch may be found: followed ones, lost ones, px.
 _NEAR_PX, _AGAIN_PX = 4.0, 4.0
+# Least sigma of one camera alone, px.
+_ALONE_PX = 0.5
+# Distance of features of one camera from their epipolar line, px.
+_EPIPOLAR_PX = 1.0
 # Patches are cut anew when they appear larger or smaller by this.
 _ZOOM = 1.5
 # Lost points that are looked for at once, newest first.
@@ -109,6 +113,7 @@ class Tracker:
         self.frame: Frame | None = None
         self.pose = _IDENTITY  # camera from map, of the last image
         self.sigma = np.empty(0)  # their standard deviations at the last keyframe, px
+        self.given = False  # True where poses come from an odometry
         self.shared = 0  # features of the last keyframe
 
     @property
@@ -189,8 +194,8 @@ class Tracker:
         return Transform(self.map.rotation[-1], self.map.position[-1]).inverse()
 
     def locate_by(self, expected: Transform) -> Found | None:
-        """Take a pose from elsewhere; let go features that contradict it by far, or each other."""
-        self.pose = expected
+        """Take a pose from elsewhere; let go features that contradict each other."""
+        self.pose, self.given = expected, True
         known = self.map.known[self.rows]
         keep = np.ones(len(self.rows), bool)
         if known.sum() >= 2 * self.options.min_points:
@@ -247,13 +252,14 @@ class Tracker:
         found = self._align(frame)
         self._look_for_lost(frame)
         if frame.right is None and frame.depth is None:
+            self._agree_in_pairs()
             self._triangulate()
         place = self.map.add_keyframe(keyframe_id, self.pose)
         old = len(self.rows)
         border = self.side // 2 + 2
         fresh_uv = features.corners(frame.grey, frame.allowed, self.uv, self.options.max_features, border)
         uv = np.concatenate([self.uv, fresh_uv])
-        sigma = np.concatenate([self.sigma, np.full(len(fresh_uv), self.options.sigma_px)])
+        sigma = np.concatenate([self.sigma, np.full(len(fresh_uv), self._floor_px(frame))])
         first = np.full(len(uv), np.nan)
         warp = self.map.warp(self.rows, self.pose)
         known = self.map.known[self.rows]
@@ -305,7 +311,13 @@ class Tracker:
         if known.sum() < self.options.min_points:
             return None
         seen = self._seen(self.rows[known], self.uv[known], self.sigma[known])
-        refined, covariance, size = pose.refine(self.rig, seen, self.pose)
+        if self.given:
+            # What the odometry is off shows in every feature: only those that are far from the others are wrong.
+            size = pose.errors(self.rig, seen, self.pose)
+            size = size * min(1.0, 2.0 / max(float(np.median(size)), 1e-9))
+            refined, covariance = self.pose, np.full((6, 6), np.nan)
+        else:
+            refined, covariance, size = pose.refine(self.rig, seen, self.pose)
         keep = np.ones(len(self.rows), bool)
         keep[known] = size < 5.0
         self.pose = refined
@@ -323,12 +335,30 @@ class Tracker:
         templates = patches.Templates.of(self.map.patch[rows], "place")
         found = patches.align(templates, frame.soft, uv, affine, bend)
         sigma = np.sqrt(np.maximum(np.trace(found.covariance, axis1=1, axis2=2), 0.0) / 2.0)
-        sigma = np.hypot(sigma, self.options.sigma_px)
+        sigma = np.hypot(sigma, self._floor_px(frame))
         height, width = frame.grey.shape
         half = self.side // 3
         inside = (found.uv >= half).all(axis=1) & (found.uv <= [width - 1 - half, height - 1 - half]).all(axis=1)
         good = inside & (found.correlation > least) & (np.linalg.norm(found.uv - uv, axis=1) < near_px)
         return found.uv, sigma, good
+
+    def _floor_px(self, frame: Frame) -> float:
+        """Return the least sigma; more for one camera alone, which does not know how surfaces are slanted."""
+        alone = frame.right is None and frame.depth is None
+        return max(self.options.sigma_px, _ALONE_PX) if alone else self.options.sigma_px
+
+    def _agree_in_pairs(self) -> None:
+        """Let go features that do not move as the others since the last keyframe: epipolar geometry, by consensus."""
+        if self._last is None:
+            return
+        before = self._last[0]
+        _, i, j = np.intersect1d(before.track_id, self.map.track_id[self.rows], return_indices=True)
+        found = pose.relative(self.rig, before.uv[i], self.uv[j], _EPIPOLAR_PX)
+        if found is None or found[1].mean() < 0.5:
+            return
+        keep = np.ones(len(self.rows), bool)
+        keep[j[~found[1]]] = False
+        self.rows, self.uv, self.sigma = self.rows[keep], self.uv[keep], self.sigma[keep]
 
     def _triangulate(self) -> None:
         """Measure how far followed points are by the camera's motion since their anchors."""

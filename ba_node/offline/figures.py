@@ -22,6 +22,7 @@ from ba_node.arrays import FloatArray
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+from ba_node.evaluation.plot import ground_axes
 from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Run
 
 TRUTH, BEFORE, CLOUD = "#000000", "#D55E00", "#9AA0A6"
@@ -109,25 +110,25 @@ def _paths(one: _Shown) -> list[tuple[str, FloatArray, str, str]]:
 
 def _above(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
+    across, up = ground_axes(_paths(shown[0])[0][1])
     for number, one in enumerate(shown):
-        cloud = _few(one.aligned(one.run.cloud, one.after), _ABOVE)
+        cloud = _few(_without_strays(one.aligned(one.run.cloud, one.after)), _ABOVE)
         if len(cloud) and number == 0:
-            low, high = np.percentile(cloud[:, :2], [0.5, 99.5], axis=0)
-            cloud = cloud[((cloud[:, :2] >= low) & (cloud[:, :2] <= high)).all(axis=1)]
-            marker = {"color": CLOUD, "size": 3, "opacity": 0.6}
-            data.append(line(cloud[:, 0], cloud[:, 1], "map", CLOUD, mode="markers", marker=marker, hoverinfo="skip"))
+            style = {"mode": "markers", "marker": {"color": CLOUD, "size": 3, "opacity": 0.6}, "hoverinfo": "skip"}
+            data.append(line(cloud[:, across], cloud[:, up], "map", CLOUD, **style))
         for name, path, colour, dash in _paths(one):
             if name != "reference" or number == 0:
-                drawn = line(path[:, 0], path[:, 1], one.name(name), colour)
+                drawn = line(path[:, across], path[:, up], one.name(name), colour)
                 data.append(drawn | {"line": {"color": colour, "width": 2, "dash": dash}})
-    layout = {"xaxis": {"title": "x [m]"}, "yaxis": {"title": "y [m]", "scaleanchor": "x"}}
+    titles = [{"title": f"{'xyz'[axis]} [m]"} for axis in (across, up)]
+    layout = {"xaxis": titles[0], "yaxis": titles[1] | {"scaleanchor": "x"}}
     return Figure("above", "From above", "Trajectories, and points of the map.", data, layout)
 
 
 def _space(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
     for number, one in enumerate(shown):
-        cloud = _few(one.aligned(one.run.cloud, one.after), _POINTS)
+        cloud = _few(_without_strays(one.aligned(one.run.cloud, one.after)), _POINTS)
         for name, path, colour, dash in _paths(one):
             if name != "reference" or number == 0:
                 style = {"mode": "lines", "line": {"color": colour, "width": 5, "dash": dash}}
@@ -135,9 +136,22 @@ def _space(shown: Sequence[_Shown]) -> Figure:
         if len(cloud):
             marker = {"color": CLOUD if number == 0 else one.colour, "size": 1.5, "opacity": 0.6}
             data.append(_in_space(cloud, one.name("map")) | {"mode": "markers", "marker": marker, "hoverinfo": "skip"})
+    # Upwards is the axis along which nothing goes; cameras look along z, with y downwards.
+    vertical = "xyz"[3 - sum(ground_axes(_paths(shown[0])[0][1]))]
+    camera: dict[str, Any] = {"up": dict.fromkeys("xyz", 0) | {vertical: -1 if vertical == "y" else 1}}
+    camera["eye"] = {axis: -1.3 if axis == "y" else 1.3 for axis in "xyz"}
     axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
     note = f" {_POINTS} of its points are drawn." if any(len(one.run.cloud) > _POINTS for one in shown) else ""
-    return Figure("space", "In space", f"Drag to turn.{note}", data, {"scene": axes | {"aspectmode": "data"}})
+    text = f"Drag to turn. Strays of the map, one point in a hundred along each axis, are left out.{note}"
+    return Figure("space", "In space", text, data, {"scene": axes | {"aspectmode": "data", "camera": camera}})
+
+
+def _without_strays(cloud: FloatArray) -> FloatArray:
+    """Return the points that all but 1 % along each axis span: strays must not shrink the picture."""
+    if not len(cloud):
+        return cloud
+    low, high = np.percentile(cloud, [0.5, 99.5], axis=0)
+    return np.asarray(cloud[((cloud >= low) & (cloud <= high)).all(axis=1)])
 
 
 def _in_space(points: FloatArray, name: str) -> dict[str, Any]:
