@@ -9,6 +9,7 @@ pixel less. Rigs of several cameras stay rigs.
 from __future__ import annotations
 
 import importlib
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry
 from ba_node.core.problem import Cameras
+from ba_node.io.files import whole_file
 from ba_node.io.model import ModelError, Reconstruction, lens_values, read_lens, stamps
 
 _PARTS = ("cameras", "images", "points3D")
@@ -199,13 +201,15 @@ def write_colmap(path: Path, world: Any, *, text: bool = False) -> None:
     """
     if path.exists() and not is_model(path) and (not path.is_dir() or any(path.iterdir())):
         raise ModelError(f"{path}: is there already and is no model of COLMAP: name another folder")
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as made:
+    with tempfile.TemporaryDirectory(prefix="ba_colmap_") as made:
         (world.write_text if text else world.write_binary)(made)
         path.mkdir(exist_ok=True)
-        for old in (path / f"{part}{suffix}" for part in _FILES for suffix in (".bin", ".txt")):
-            old.unlink(missing_ok=True)
-        for part in Path(made).iterdir():
-            part.replace(path / part.name)
+        for part in sorted(Path(made).iterdir()):
+            with part.open("rb") as source, whole_file(path / part.name) as stream:
+                shutil.copyfileobj(source, stream)
+    for name in _FILES:
+        # What an older model of the other form has left would be read in its place.
+        (path / f"{name}{'.bin' if text else '.txt'}").unlink(missing_ok=True)
 
 
 def to_colmap(model: Reconstruction) -> Any:
