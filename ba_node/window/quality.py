@@ -61,7 +61,7 @@ def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[
         "observations": len(problem.observations),
         "held_keyframes": len(set(selection.window.tolist()) - set(selection.keyframes.tolist())),
         "factors": problem.n_factors + (0 if problem.point_priors is None else len(problem.point_priors.point)),
-        "outvoted_factors": sum(_outvoted(kind, result.state) for kind in problem.factors),
+        "outvoted_factors": sum(_outvoted(kind, result.state) for kind in selection.beside),
         "outliers": int(np.count_nonzero(~selection.inlier & ~selection.held_out[selection.observations.point])),
     }
 
