@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 
 from ba_node.arrays import FloatArray
 from ba_node.backend import Backend
+from ba_node.backend.archive import unpack
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate
@@ -27,6 +29,7 @@ from ba_node.measurements import (
     RelativePose,
     TrackMerge,
 )
+from ba_node.scene.map_content import MapContent, MapError
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from ba_node.synthetic.world import Path as Motion
 from ba_node.synthetic.world import World
@@ -255,3 +258,26 @@ def test_the_example_of_the_page_counts(street: SyntheticData) -> None:
         constraints.SOURCES[:] = known
     spread = [float(np.std(one.trajectory.position[:, 2])) for one in (free, level)]
     assert spread[1] < 0.3 * spread[0]
+
+
+def test_a_saved_map_keeps_its_place_in_the_world(street: SyntheticData) -> None:
+    backend, _ = replayed(first(street, 40), fixes(street, 0.0), **(ANTENNA | {"factors.align_m": 1.0}))
+    known = backend.scene.constraints
+    assert known.map_from_world is not None and known.origin is not None
+    known.renamed = {5: 7, 7: 9}
+    content = backend.snapshot()
+    content.facts.update(json.loads(json.dumps(content.facts)))
+    loaded = unpack(content, Config().scene).scene.constraints
+    assert loaded.map_from_world is not None and loaded.origin is not None
+    np.testing.assert_array_equal(loaded.origin, known.origin)
+    for one, other in zip(loaded.map_from_world, known.map_from_world, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (loaded.world_frame, loaded.name_of(5)) == ("enu", 9)
+    for name, value in (
+        ("origin", [1.0, 2.0]),
+        ("renamed", [[1, 2], [2, 1]]),
+        ("map_from_world", [[2.0] * 9, [0.0] * 3]),
+    ):
+        broken = MapContent(content.arrays, content.facts | {"world": content.facts["world"] | {name: value}})
+        with pytest.raises(MapError, match="world"):
+            unpack(broken, Config().scene)
