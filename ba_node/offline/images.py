@@ -23,16 +23,7 @@ import numpy as np
 
 from ba_node.estimate import Transform
 from ba_node.front_end.records import FrontEndError, Images
-from ba_node.front_end.streams import (
-    MODES,
-    RECTIFIED,
-    Frame,
-    OdometryBuffer,
-    Streams,
-    cameras_of,
-    images_of,
-    transform_of,
-)
+from ba_node.front_end.streams import MODES, Frame, OdometryBuffer, Streams, cameras_of, images_of, transform_of
 from ba_node.io.bag_topics import absolute
 from ba_node.io.mcap import BagError, BagReader
 from ba_node.io.rig_file import read_rig
@@ -65,7 +56,7 @@ class ImageRequest:
 
     rig: CameraRig | None = None  # in place of what the recording or folder says
     topics: Mapping[str, str] = field(default_factory=dict)  # by left, right, rgb, depth, image, odometry
-    rectified: bool = False  # p of camera_info is the camera; so it is where topics are called image_rect
+    rectified: bool = False  # p of camera_info is the camera
     base: str = ""  # body frame in /tf_static, empty for the first camera
     rate_hz: float = 10.0  # of a folder whose pictures have no stamps
 
@@ -112,8 +103,7 @@ def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str,
     infos = [_info_of(reader, chosen[name], alone=mode != "stereo") for name in cameras_of(mode)]
     # A camera_rig tells all that camera_info would.
     known = [] if _RIG in reader.topics.values() and not set(infos) <= set(reader.topics) else infos
-    rectified = request.rectified or any(RECTIFIED in chosen[name] for name in cameras_of(mode))
-    return rig_of_recording(reader, known, rectified=rectified, base=request.base)
+    return rig_of_recording(reader, known, rectified=request.rectified, base=request.base)
 
 
 def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:
