@@ -103,6 +103,7 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
     assert main(["convert", str(bag), str(tmp_path / "model")]) == 0
     world = pycolmap.Reconstruction(tmp_path / "model")
     assert (world.num_rigs(), world.num_reg_frames(), world.num_reg_images()) == (1, 8, 16)
+    assert {(camera.width, camera.height) for camera in world.cameras.values()} == {(640, 480)}
     assert objective(world) / (2.0 * world.compute_num_observations()) < 1.0, "half a px^2 each coordinate, or so"
     assert main(["convert", str(tmp_path / "model"), str(tmp_path / "again.mcap")]) == 0
     assert main(["replay", str(tmp_path / "again.mcap"), "--out", str(tmp_path / "out")]) == 0
