@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # Standard deviation of a depth camera, as a share of the depth.
 _DEPTH_SHARE = 0.02
-_LARGEST_SHARE = 0.2
+_LARGEST_SHARE = 0.1
 # Points at an image that rows are learned from, and which of them count.
-_FOR_ROWS, _SAME, _SURE_PX, _MOST_OFF_PX = 200, 0.9, 0.15, 2.5
+_FOR_ROWS, _SAME, _SURE_PX, _MOST_OFF_PX = 120, 0.9, 0.15, 2.5
 
 
 @dataclass(frozen=True)

@@ -62,10 +62,13 @@ def _apart(found: FloatArray, taken: FloatArray, distance: float) -> FloatArray:
     if not len(found):
         return found
     limit = distance * distance
-    near_taken = (((found[:, None] - taken[None]) ** 2).sum(axis=2) < limit).any(axis=1)
-    found = found[~near_taken]
-    near = ((found[:, None] - found[None]) ** 2).sum(axis=2) < limit
-    return np.asarray(found[~np.tril(near, -1).any(axis=1)])
+    found = found[_squares(found, taken).min(axis=1, initial=np.inf) > limit]
+    return np.asarray(found[~np.tril(_squares(found, found) < limit, -1).any(axis=1)])
+
+
+def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return squared distances: (n, m)."""
+    return np.asarray((a[:, None, 0] - b[None, :, 0]) ** 2 + (a[:, None, 1] - b[None, :, 1]) ** 2)
 
 
 def follow(before: Grey, now: Grey, uv: FloatArray, expected: FloatArray | None) -> tuple[FloatArray, BoolArray]:

@@ -135,9 +135,10 @@ def measure(
     good = (np.abs(forth[0] - start) < _REACH_PX) & (forth[3] > _LEAST_CORRELATION)
     width = left.shape[1]
     good &= (at[:, 0] > side // 3) & (at[:, 0] < width - side // 3)
+    rows, at, down, forth = rows[good], at[good], down[good], tuple(one[good] for one in forth)
     back = _along(right, left, at, np.column_stack([forth[0], -down]), -forth[2], side, prior)
     off = forth[0] + back[0]
-    good &= (np.abs(off) < _BACK_PX) & (back[3] > _LEAST_CORRELATION)
+    good = (np.abs(off) < _BACK_PX) & (back[3] > _LEAST_CORRELATION)
     rows = rows[good]
     # Both ways err alike in size, and by interpolation in opposite ways: their mean is better than either.
     result.value[rows] = 0.5 * (forth[0] - back[0])[good]
@@ -148,7 +149,7 @@ def measure(
 
 def _along(
     left: Floats, right: Floats, uv: FloatArray, shift: FloatArray, slant: FloatArray, side: int, prior: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, ...]:
     """Return disparity, its sigma, slant and correlation of patches of one image in the rows of another."""
     templates = patches.Templates.of(patches.cut(left, uv, side), "row", prior)
     affine = np.tile(np.eye(2), (len(uv), 1, 1))
