@@ -15,7 +15,7 @@ _BLOCK = 5
 # Least such eigenvalue, in units of OpenCV's (grey values in 0 to 1): a weak corner on a road, above noise.
 _WEAKEST = 4e-6
 # Windows of Lucas-Kanade, and levels of its pyramid where a first place is known, and where none is.
-_WINDOW, _LEVELS, _LEVELS_BLIND = 21, 2, 4
+_WINDOW, _LEVELS, _LEVELS_BLIND = 17, 2, 4
 # There and back again a feature must end where it began.
 _BACK_PX = 0.7
 
@@ -84,7 +84,7 @@ def follow(before: Grey, now: Grey, uv: FloatArray, expected: FloatArray | None)
     if expected is not None:
         first = np.where(np.isfinite(expected), expected, uv).astype(np.float32).reshape(-1, 1, 2)
         flags, levels = cv2().OPTFLOW_USE_INITIAL_FLOW, _LEVELS
-    criteria = (3, 12, 0.02)
+    criteria = (3, 10, 0.03)
     size = (_WINDOW, _WINDOW)
     there, ok, _ = cv2().calcOpticalFlowPyrLK(
         before, now, one, first, winSize=size, maxLevel=levels, criteria=criteria, flags=flags

@@ -98,7 +98,7 @@ class Templates:
         side = patches.shape[1] - 2
         w = window(side)
         k = _STRIDE
-        values = patches[:, 1:-1:k, 1:-1:k].reshape(len(patches), -1)
+        values = patches[:, 1:-1:k, 1:-1:k].reshape(len(patches), len(w))
         dx = (0.5 * (patches[:, 1:-1:k, 2::k] - patches[:, 1:-1:k, :-2:k])).reshape(values.shape)
         values = values - (values @ w)[:, None]
         weighted = values * w
