@@ -22,7 +22,7 @@ from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.problem import State
-from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform
+from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
 from ba_node.window import full, quality, view
@@ -90,6 +90,7 @@ class CurrentMap:
         completion: which keyframes are complete.
         report: of the last solve.
         correction: map from odom.
+        adjustments: how often a solve of everything went into it.
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
@@ -97,6 +98,7 @@ class CurrentMap:
         self.completion = Completion()
         self.report = SolveReport(reason="not solved yet")
         self.correction = MapCorrection()
+        self.adjustments = 0
         self._trust = Trust()
 
     @property
@@ -282,6 +284,8 @@ class CurrentMap:
             method=self.config.solver.method,
             rejected=dict(sorted(self.rejected.items())),
             warnings=self.warnings,
+            adjustments=self.adjustments,
+            merged_tracks=len(self.scene.constraints.renamed),
         )
 
     def rms_px(self, state: str = "refined") -> float:
@@ -304,6 +308,7 @@ class CurrentMap:
             cloud=MapCloud.taken(scene),
             report=self.report,
             correction=self._published(),
+            world=self.world(),
             map_index=self.index,
         )
 
@@ -315,6 +320,14 @@ class CurrentMap:
         poses = _rows_by_id(estimate.refined.keyframe_id, taken.keyframe_id, found.poses)
         points = None if found.points is None else _rows_by_id(estimate.cloud.track_id, taken.track_id, found.points)
         return dataclasses.replace(estimate, covariance=poses, point_covariance=points)
+
+    def world(self) -> World | None:
+        """Return where the map lies in the world, None if that is not known."""
+        known = self.scene.constraints
+        if known.map_from_world is None:
+            return None
+        rotation, translation = geometry.inverse(*known.map_from_world)
+        return World(known.world_frame, translation, geometry.quaternion_from_matrix(rotation), known.origin)
 
     def _published(self) -> Correction | None:
         transform = self.correction.published

@@ -141,7 +141,9 @@ class Scene(MapTables):
         for tracks in self.pending:
             self._reject_waiting(tracks)
         self.pending = []
-        self.constraints.reject_unknown(self.keyframes.keyframe_id, self.log)
+        stamps = self.keyframes.stamp_ns
+        span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
+        self.constraints.end(self.keyframes.keyframe_id, span, self.log)
 
     def _set_rig(self, rig: CameraRig) -> None:
         cameras = ingest.rig_cameras(rig, self.log)
