@@ -61,7 +61,10 @@ def rows_of(problem: Problem, state: State, options: SolverOptions) -> Rows:
     pixels = _weighed(options.loss, options.loss_scale_px, at.residual[:, :2])
     parts = [np.repeat(pixels[:, :, None], 2, axis=2)]
     if n == 3:
-        parts.append(_weighed(options.loss, options.loss_scale_px, at.residual[:, 2:])[:, :, None])
+        depths = _weighed(options.loss, options.loss_scale_px, at.residual[:, 2:])
+        # A single row has no other directions that keep its slope from falling below zero.
+        depths[1] = depths[0] * (depths[1].sum() / max(float(depths[0].sum()), 1e-300))
+        parts.append(depths[:, :, None])
     weights = np.concatenate(parts, axis=2)
     index = np.arange(len(obs))
     found = Rows(

@@ -85,6 +85,7 @@ class Optimization:
     track_id: IdArray  # (n_pt,) uint64
     placed: BoolArray  # (n_pt,) True where the point had a position
     position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
+    held: BoolArray  # (n_kf,) keyframes that are fixed but for the one that holds a floating scale
     wanted: Extras = NOTHING  # what is to be worked out beside the solution
     # result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`
     solved: tuple[Result, FloatArray] | None = None
@@ -104,8 +105,11 @@ class Optimization:
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
+            # After it the front-end's steps set the scale, be they factors or not.
+            problem = dataclasses.replace(self.selection.problem, fixed=self.held)
             state = scaled(self.selection, self.position, result.state)
-            self.covariances = covariances(self.selection, state, self.position, chosen, points=self.wanted.points)
+            selection = dataclasses.replace(self.selection, problem=problem)
+            self.covariances = covariances(selection, state, self.position, chosen, points=self.wanted.points)
 
     @property
     def result(self) -> Result:
@@ -160,6 +164,7 @@ def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Opt
         scene.landmarks.track_id[selection.landmarks],
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
+        problem.fixed,
         wanted,
     )
 
