@@ -25,11 +25,19 @@ from ba_node.config.declaration import (
     split_assignment,
     unknown,
 )
-from ba_node.config.estimation import GuardConfig, OdometryConfig, SceneConfig, TracksConfig, WindowConfig
+from ba_node.config.estimation import (
+    CalibrationConfig,
+    GuardConfig,
+    OdometryConfig,
+    SceneConfig,
+    TracksConfig,
+    WindowConfig,
+)
 from ba_node.config.node import DiagnosticsConfig, FramesConfig, NodeConfig, OutputConfig
 from ba_node.config.solver import SolverConfig, SolverOptions
 
 __all__ = [
+    "CalibrationConfig",
     "Checked",
     "Choice",
     "Config",
@@ -74,6 +82,7 @@ class Config:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     solver: SolverConfig = field(default_factory=lambda: _defaults(SolverConfig))
     guard: GuardConfig = field(default_factory=GuardConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     node: NodeConfig = field(default_factory=NodeConfig)

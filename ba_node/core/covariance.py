@@ -60,7 +60,7 @@ from ba_node.config import SolverOptions
 from ba_node.core import geometry
 from ba_node.core.kernels import DENSE_LIMIT, Kernels
 from ba_node.core.problem import Problem, State
-from ba_node.core.rows import DEPTHS, PIXELS, Rows, rows_of
+from ba_node.core.rows import DEPTHS, GIVEN, PIXELS, Rows, rows_of
 
 # Eigenvalues of S, scaled to a unit diagonal, that are rounding.
 _ROUNDING = 1e-11
@@ -126,7 +126,7 @@ def uncertainty_of_rows(rows: Rows, squared: bool, conditions: FloatArray) -> Un
         of = rows.group == group
         score = rows.weight[of] * rows.residual[of]
         make = _pooled if squared or group > PIXELS else _jackknifed
-        variance[of] = make(score, slope[of], leverage[of])
+        variance[of] = slope[of] if group == GIVEN else make(score, slope[of], leverage[of])
     _add_factors(reduced, roots, leverage, variance)
     return Uncertainty(reduced, variance, roots, loose)
 

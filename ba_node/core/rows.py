@@ -27,7 +27,8 @@ from ba_node.core import loss
 from ba_node.core.objective import Objective
 from ba_node.core.problem import KeyframeFactors, Problem, State
 
-PIXELS, DEPTHS = 0, 1  # groups of rows; each kind of factor is one more
+GIVEN, PIXELS, DEPTHS = -1, 0, 1  # groups of rows; each kind of factor is one more
+# GIVEN are rows whose standard deviation is taken as it is stated.
 # The slope of a loss is taken over this share of its scale.
 _STEP = 1e-6
 
@@ -41,7 +42,7 @@ class Rows:
     points: sparse.csr_matrix  # (m, 3 n_pt) by the points, m^-1
     weight: FloatArray  # (m,) w
     slope: FloatArray  # (m,) d
-    group: IntArray  # (m,) PIXELS, DEPTHS, or 2 and up: factors of each kind
+    group: IntArray  # (m,) GIVEN, PIXELS, DEPTHS, or 2 and up: factors of each kind
     source: IntArray  # (m,) observation, or factor of its kind
 
     def __len__(self) -> int:
@@ -77,7 +78,7 @@ def rows_of(problem: Problem, state: State, options: SolverOptions) -> Rows:
         np.repeat(index, n),
     )
     kinds = [_factor_rows(kind, 2 + i, state, column, problem.n_points) for i, kind in enumerate(problem.factors)]
-    found = _joined([found, *kinds]) if kinds else found
+    found = joined([found, *kinds]) if kinds else found
     counts = np.any(at.d_point != 0.0, axis=2).ravel()
     return found.take(np.concatenate([counts, np.ones(len(found) - len(counts), bool)]))
 
@@ -104,7 +105,7 @@ def _factor_rows(kind: KeyframeFactors, group: int, state: State, column: IntArr
     return rows.take(counts.ravel())
 
 
-def _joined(parts: list[Rows]) -> Rows:
+def joined(parts: list[Rows]) -> Rows:
     """Return the rows of several, one after another."""
     columns = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(Rows)}
     stacked = {
