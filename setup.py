@@ -186,7 +186,12 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     # The definitions of ba_msgs, with which bags are read and written where ROS is not installed.
-    package_data={NAME: ["py.typed"], f"{NAME}.io": ["ba_msgs/*.msg"], f"{NAME}.native": ["*.pyi"]},
+    package_data={
+        NAME: ["py.typed"],
+        f"{NAME}.io": ["ba_msgs/*.msg"],
+        f"{NAME}.native": ["*.pyi"],
+        f"{NAME}.offline": ["page.html"],
+    },
     ext_modules=extensions(),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
@@ -219,7 +224,8 @@ setup(
         "mpi": ["mpi4py"],
         "colmap": ["pycolmap"],
         "view": ["foxglove-sdk"],
-        "docs": ["furo", "sphinx"],
+        "completion": ["argcomplete"],
+        "docs": ["furo", "myst-parser", "sphinx"],
         # Solvers that `make bench` compares with; each is left out where it is missing.
         "bench": ["g2opy", "gtsam", "pycolmap"],
         "lint": ["mypy", "ruff", "types-PyYAML", "types-tqdm"],

@@ -93,6 +93,9 @@ class SolveReport:
     landmarks: int = 0
     observations: int = 0
     outliers: int = 0
+    factors: int = 0
+    outvoted_factors: int = 0
+    variance_factor: float = 0.0
     inlier_share: float = 0.0
     parallax_deg: float = 0.0
     held_out_px_before: float = 0.0
@@ -105,6 +108,8 @@ class SolveReport:
     correction_m: float = 0.0
     correction_rad: float = 0.0
     correction_held: bool = False
+    adjustments: int = 0
+    merged_tracks: int = 0
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,9 @@ class Keyframe:
     frame_id: str  # name of the fixed frame
     position: FloatArray  # (3,) body in the fixed frame, m
     orientation: FloatArray  # (4,) fixed frame from body, quaternion x y z w
+    # (36,) or (0,) if unknown: covariance of the step from the keyframe before, row by row, in x, y, z (m) and
+    # rotations (rad) about the axes of the body there
+    covariance: FloatArray = field(default_factory=_no_floats)
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,73 @@ class LandmarkGuesses:
 
 
 @dataclass(frozen=True)
+class RelativePose:
+    """A measured pose of one keyframe in another (message ``ba_msgs/RelativePose``)."""
+
+    session_id: int  # as in the keyframes
+    from_keyframe_id: int  # the keyframe in whose body it is given
+    to_keyframe_id: int  # the keyframe whose pose it is
+    is_loop: bool  # it may be wrong as a whole
+    position: FloatArray  # (3,) body at the one in the body at the other, m
+    orientation: FloatArray  # (4,) the same, quaternion x y z w
+    covariance: FloatArray  # (36,) of x, y, z (m) and rotations (rad) about the axes of the body at the first
+
+
+@dataclass(frozen=True)
+class LandmarkPriors:
+    """Points whose places are known (message ``ba_msgs/LandmarkPriors``)."""
+
+    session_id: int  # as in the keyframes
+    frame_id: str  # name of the frame of the positions
+    track_id: IdArray  # (n,) uint64
+    position: FloatArray  # (n, 3) m
+    covariance: FloatArray  # (n, 3, 3) m^2
+    malformed: str = ""  # why the arrays could not be put together, empty if they could
+
+
+@dataclass(frozen=True)
+class TrackMerge:
+    """Tracks that are the same point (message ``ba_msgs/TrackMerge``)."""
+
+    session_id: int  # as in the keyframes
+    track_id: IdArray  # (n,) uint64, tracks that go on under ...
+    same_as: IdArray  # (n,) uint64, ... the id of these
+    malformed: str = ""  # why the arrays could not be put together, empty if they could
+
+
+@dataclass(frozen=True)
+class GravityDirection:
+    """Which way is down at a keyframe (message ``ba_msgs/GravityDirection``)."""
+
+    session_id: int  # as in the keyframe
+    keyframe_id: int  # the keyframe it belongs to
+    down: FloatArray  # (3,) in the body, any length
+    sigma_rad: float  # standard deviation about each horizontal axis, rad
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Where the body is in a frame fixed to the world (message ``geometry_msgs/PoseWithCovarianceStamped``)."""
+
+    stamp_ns: int  # time of the measurement, ns
+    frame_id: str  # name of the frame
+    position: FloatArray  # (3,) m
+    orientation: FloatArray  # (4,) frame from body, quaternion x y z w
+    covariance: FloatArray  # (36,) of x, y, z (m) and rotations (rad) about the axes of the frame
+
+
+@dataclass(frozen=True)
+class GlobalFix:
+    """Where an antenna is on the earth (message ``sensor_msgs/NavSatFix``)."""
+
+    stamp_ns: int  # time of the measurement, ns
+    frame_id: str  # name of the frame of the antenna
+    geodetic: FloatArray  # (3,) latitude and longitude (deg, WGS 84), altitude over the ellipsoid (m)
+    covariance: FloatArray  # (9,) of east, north, up, row by row, m^2
+    is_fix: bool  # False: the receiver says that it has none
+
+
+@dataclass(frozen=True)
 class CameraRig:
     """The cameras on the body (messages ``ba_msgs/CameraRig`` and ``sensor_msgs/CameraInfo``)."""
 
@@ -77,4 +147,7 @@ class CameraRig:
         return len(self.models)
 
 
-Measurement = Keyframe | FeatureTracks | LandmarkGuesses | CameraRig
+# What names the session that it belongs to, beside keyframes; and what belongs to whichever goes on at its time.
+OfSession = FeatureTracks | LandmarkGuesses | RelativePose | LandmarkPriors | TrackMerge | GravityDirection
+OfTime = PosePrior | GlobalFix
+Measurement = Keyframe | OfSession | OfTime | CameraRig

@@ -16,7 +16,19 @@ from ba_node.cli import checkout
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.io.mcap import BagReader
 from ba_node.io.trajectory import read_tum
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import (
+    CameraRig,
+    FeatureTracks,
+    GlobalFix,
+    GravityDirection,
+    Keyframe,
+    LandmarkGuesses,
+    LandmarkPriors,
+    Measurement,
+    PosePrior,
+    RelativePose,
+    TrackMerge,
+)
 from ba_node.messages.report import LatencyReport, QueueReport, Report
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -116,6 +128,22 @@ def guesses() -> LandmarkGuesses:
 
 
 @pytest.fixture
+def beside_pixels() -> list[Measurement]:
+    """Return one of each that is known beside pixels."""
+    pose = np.array([1.0, -2.0, 0.5]), np.array([0.0, 0.6, 0.0, 0.8])
+    ids, others = np.array([7, 2**63], dtype=np.uint64), np.array([1, 2], dtype=np.uint64)
+    covariance = np.arange(36.0) + 1e-3
+    return [
+        RelativePose(3, 5, 2**64 - 1, True, *pose, covariance),
+        LandmarkPriors(3, "enu", ids, np.arange(6.0).reshape(2, 3), np.arange(18.0).reshape(2, 3, 3)),
+        TrackMerge(3, ids, others),
+        GravityDirection(3, 5, np.array([0.0, 0.1, -9.8]), 0.02),
+        PosePrior(1_700_000_000_123_456_789, "enu", *pose, covariance),
+        GlobalFix(1_700_000_000_123_456_789, "gps", np.array([48.1, 11.5, 520.0]), np.arange(9.0), True),
+    ]
+
+
+@pytest.fixture
 def rig() -> CameraRig:
     return CameraRig(
         frame_id="base_link",
@@ -182,11 +210,16 @@ def report() -> SolveReport:
         landmarks=1500,
         observations=15_000,
         outliers=17,
+        factors=5021,
+        outvoted_factors=5022,
+        variance_factor=1.75,
         rejected={"unknown_camera": 2, "malformed": 5},
         solve_time_s=0.025,
         correction_m=0.25,
         correction_rad=0.0125,
         correction_held=True,
+        adjustments=5011,
+        merged_tracks=5019,
     )
 
 

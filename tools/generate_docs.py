@@ -19,7 +19,7 @@ from pathlib import Path
 from ba_node.config import Config, SolverOptions, Value, declared
 from ba_node.core.methods import METHODS
 from ba_node.io.parameters import parameters_markdown, parameters_yaml
-from ba_node.messages.topics import ACTIONS, SERVICES, TOPICS, Command, Direction, Topic
+from ba_node.messages.topics import ACTIONS, INTERFACE_VERSION, SERVICES, TOPICS, Command, Direction, Topic
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
 from experiments.robustness.page import page as robustness_page
@@ -49,6 +49,14 @@ How a front-end talks to it:
    they have a depth.
 4. After a restart, or when tracking was lost for good, raise `session_id`: a new map begins.
 
+What is known beside pixels comes on topics of its own, see [factors.md](factors.md).
+
+These are the inputs of interface version {version}. They keep their fields, types and meanings from here on: what is
+new comes as a new message on a topic of its own, and recordings of 0.2.0 replay by the definitions that they bring. The
+outputs may gain fields at their end with another release of ba_msgs. Build front-end and node with the same ba_msgs:
+each announces its definitions, and the node says which other node has another one. A recording whose inputs lack a
+field is refused with its name.
+
 A message that cannot be used is counted by reason in `report`, named in the node's log, and leaves everything known
 as it was.
 """
@@ -66,7 +74,7 @@ defaults, the same as `config/ba_node.yaml`.
 
 def topics_markdown() -> str:
     """Return docs/topics.md."""
-    parts = [TOPICS_INTRO]
+    parts = [TOPICS_INTRO.format(version=INTERFACE_VERSION)]
     own = [topic for topic in TOPICS.values() if not topic.is_shared]
     parts += [
         _topics("Inputs", [topic for topic in own if topic.direction is Direction.TAKEN]),

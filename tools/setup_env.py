@@ -198,7 +198,9 @@ class Environment:
         lists = self.root / "requirements"
         pinned = ("-c", str(lists / "constraints.txt"))
         self.pip(*pinned, "-r", str(lists / "build.txt"))
-        groups = [argument for name in ("ros", "run", "extras", "dev") for argument in ("-r", str(lists / f"{name}.txt"))]
+        groups = [
+            argument for name in ("ros", "run", "extras", "dev") for argument in ("-r", str(lists / f"{name}.txt"))
+        ]
         self.pip("--no-build-isolation", *pinned, *groups)
         self.relocate()
         self.hook()

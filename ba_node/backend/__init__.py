@@ -9,6 +9,7 @@ from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.window.full import Optimization
+from ba_node.window.quality import Residuals
 
 __all__ = [
     "FINISHED_KEPT",
@@ -23,6 +24,7 @@ __all__ = [
     "MapState",
     "MapSummary",
     "Optimization",
+    "Residuals",
     "Row",
     "can_examine",
 ]

@@ -32,6 +32,7 @@ class MapSummary:
     notices: dict[str, int]  # what was unusual but used, by kind
     rejection_notes: list[str]  # the last rejections in words, oldest first
     warnings: dict[str, str]  # what somebody has to know or mend, by kind
+    observed: quality.Residuals  # of each observation, by what is refined
 
 
 @dataclass(frozen=True)
@@ -59,4 +60,5 @@ def summary_of(scene: Scene, config: Config) -> MapSummary:
         notices=dict(sorted(scene.log.notices.items())),
         rejection_notes=list(scene.log.notes),
         warnings=dict(scene.log.warnings),
+        observed=quality.residuals(scene, config, "refined"),
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from ba_node.check import intrinsics, relations, units
+from ba_node.check import ids, intrinsics, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
@@ -37,7 +37,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
     tests: dict[str, Callable[[], Diagnosis]] = {
         _PIXELS: lambda: units.check_pixels(tracks),
         "stamps": lambda: units.check_stamps(tracks),
-        "ids": lambda: units.check_ids(tracks),
+        "ids": lambda: ids.check_ids(tracks),
         "cameras": lambda: relations.check_cameras(tracks),
         "poses": lambda: _poses(tracks, related()),
         "depth": lambda: units.check_depth(tracks, related()),

@@ -1,8 +1,10 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check what needs no geometry of its own once images are related: units of depths, lengths and stamps, and ids."""
+"""Check what needs no geometry of its own once images are related: units of depths, lengths and stamps."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 
@@ -10,7 +12,7 @@ from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.placement import as_given
-from ba_node.check.relations import AGREED, Relation, agreed, rays, relate, spread
+from ba_node.check.relations import Relation, agreed, rays
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 
@@ -19,9 +21,13 @@ _PARALLAX = 4.0
 _POINTS = 8
 _PAIRS = 4
 _MANY_PAIRS = 10
-# Factors of a depth and of a length beyond which they are wrong: the front-end's steps are no better.
+# Factors of a depth and of a length beyond which they are wrong, however few pairs of images tell.
 _DEPTH_FACTOR = 1.5
 _LENGTH_FACTOR = 1.3
+# Many pairs tell it beyond a smaller factor, where it is so many standard errors from 1: lengths that are wrong by that
+# much bend the whole way, and the steps of a robot that moves are known better.
+_SMALL_FACTOR = 1.06
+_STANDARD_ERRORS = 4.0
 # Factors beyond which they are wrong whatever the share of outliers.
 _GROSS = 5.0
 # A factor is named if depths agree on it to this share (median deviation of its logarithm).
@@ -39,19 +45,15 @@ _UNITS = (
 _CLEARLY = 3.0
 # A factor is named unless a shift leaves so much less.
 _SURELY = 0.7
+_STEPS = "the position in the keyframes, expected metres"
 # Image coordinates no larger than this are no pixels, where the focal length is at least this.
 _NO_PIXEL = 3.0
 _FOCAL = 30.0
 # Sensible distances between keyframes, s; and units that stamps may have been taken for.
 _SPACING_S = (5e-4, 600.0)
 _STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
-# Images that far apart, in keyframes, share tracks; where ids are used again, fewer of them are the same point.
-_FAR = 4
-_STARTS = 8
-_LOST = 0.9
-# Keyframes that are needed to judge ids and lengths; share of the ids of the last quarter that the first one had.
+# Keyframes that are needed to judge lengths.
 _KEYFRAMES = 10
-_PERSIST = 0.85
 
 
 def check_pixels(tracks: Tracks) -> Diagnosis:
@@ -80,50 +82,6 @@ def check_stamps(tracks: Tracks) -> Diagnosis:
     return Diagnosis([Finding((cause,), "median of their stamps", ("header.stamp of the keyframes",), harmful=False)])
 
 
-def check_ids(tracks: Tracks) -> Diagnosis:
-    """Look whether a track goes on being the same point: by consensus of neighbouring images, and of distant ones.
-
-    Where ids are used again, few new ones come, although tracks end.
-    """
-    near, far = [], []
-    if len(tracks) < _KEYFRAMES:
-        return Diagnosis(untold=["too few keyframes to judge ids"])
-    for k in spread(len(tracks) - _FAR, _STARTS):
-        camera = tracks.main_camera(k)
-        if camera is None:
-            continue
-        pairs = [
-            relate(tracks, (int(k), camera), (int(k + gap), camera), tracks.match((k, camera), (k + gap, camera)))
-            for gap in (1, _FAR)
-        ]
-        if pairs[0] is not None and len(tracks.match((k, camera), (k + _FAR, camera))[0]) >= two_view.MIN_PAIRS:
-            near.append(pairs[0].share)
-            far.append(0.0 if pairs[1] is None else pairs[1].share)
-    if len(near) < 3:
-        return Diagnosis(untold=["too few long tracks to judge ids"])
-    rows = [Row("ids", "images next to each other", float(np.median(near)))]
-    rows += [Row("ids", f"images {_FAR} keyframes apart", float(np.median(far)))]
-    quarter = max(1, len(tracks) // 4)
-    early = np.unique(tracks.track[tracks.keyframe < quarter])
-    persist = float(np.isin(tracks.track[tracks.keyframe >= len(tracks) - quarter], early).mean())
-    rows += [Row("ids", "of the last keyframes that the first had too", persist)]
-    if rows[1].share >= _LOST * rows[0].share or persist < _PERSIST:
-        return Diagnosis(sound=["tracks keep their ids"], rows=rows)
-    if rows[0].share < AGREED:
-        return Diagnosis(untold=["too many outliers to judge ids"], rows=rows)
-    evidence = (
-        f"{rows[0].share:.0%} of the tracks agree from one keyframe to the next, {rows[1].share:.0%} over {_FAR},"
-        f" and {persist:.0%} of the ids of the first keyframes are in the last"
-    )
-    finding = Finding(
-        ("ids reused: the same track_id stands for several points",),
-        evidence,
-        ("track_id in the feature_tracks: a new id for each point, never one of an ended track",),
-        harmful=False,
-    )
-    return Diagnosis([finding], rows=rows)
-
-
 def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     """Compare measured depths with those of the front-end's steps, or of two cameras."""
     measured = np.isfinite(tracks.depth_m)
@@ -144,16 +102,35 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         return Diagnosis([_depth_finding(cause, f"against {by}")], rows=rows)
     if spread_of > _AGREE:
         return Diagnosis(untold=[f"depths contradict {by}"], rows=rows)
-    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+    if _alike(ratio, _DEPTH_FACTOR):
         return Diagnosis(sound=[f"depths fit {by} (to {abs(factor - 1.0):.0%})"], rows=rows)
     if many_outliers and 1.0 / _GROSS < factor < _GROSS:
         return Diagnosis(untold=["too many outliers to compare depths with steps"], rows=rows)
+    evidence = f"over {len(pairs)} pairs of keyframes"
+    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+        finding = _depth_finding(f"scale of depth_m: it is {_times(factor)} what {by} tell", evidence)
+        steps = (f"scale of the front-end's steps: they are {_times(1.0 / factor)} what depth_m tells", _STEPS)
+        both = dataclasses.replace(
+            finding, causes=(*finding.causes, steps[0]), changes=("the factor from depth images to depth_m", steps[1])
+        )
+        return Diagnosis([both], rows=rows)
     cause = f"depth_m {_unit(factor) or 'in another unit'}: it is {_times(factor)} what {by} tell"
-    return Diagnosis([_depth_finding(cause, f"over {len(pairs)} pairs of keyframes")], rows=rows)
+    return Diagnosis([_depth_finding(cause, evidence)], rows=rows)
+
+
+def _alike(ratio: list[float], most: float) -> bool:
+    """Tell whether logarithms of ratios, one for each pair of images, are those of equal lengths.
+
+    They are not if their median is beyond a factor ``most``, or clearly beyond a small one.
+    """
+    middle = abs(float(np.median(ratio)))
+    error = 1.25 * 1.48 * _deviation(ratio) / np.sqrt(len(ratio))
+    clear = len(ratio) >= _MANY_PAIRS and middle > max(np.log(_SMALL_FACTOR), _STANDARD_ERRORS * error)
+    return middle < np.log(most) and not clear
 
 
 def _times(factor: float) -> str:
-    return f"{factor:.0f} times" if factor >= 10.0 else f"{factor:.2g} times"
+    return f"{factor:.0f} times" if factor >= 10.0 else f"{factor:.3g} times"
 
 
 def _unit(factor: float) -> str:
@@ -218,7 +195,7 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
     stereo, steps = (np.concatenate(part) for part in zip(*pairs, strict=True))
     factor = float(np.exp(_log_factor(pairs)))
     rows = [Row("lengths", f"baseline of camera {camera} over the front-end's steps: {factor:.3g}", 1.0)]
-    if 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
+    if _alike([float(np.median(np.log(one / other))) for one, other in pairs], _LENGTH_FACTOR):
         tell = f"the baseline of camera {camera} fits the steps (to {abs(factor - 1.0):.0%})"
         return Diagnosis(sound=[tell], rows=rows)
     evidence = f"depths of two cameras against those of the front-end's steps, over {len(pairs)} pairs of keyframes"
@@ -231,7 +208,7 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
     causes: dict[str, str] = {}
     if shifted < _CLEARLY * scaled and 1.0 / _GROSS < factor < _GROSS:
         causes |= _of_shift(tracks, camera, abs(shift) * baseline)
-    if not causes or scaled < shifted / _SURELY:
+    if not causes or scaled < shifted / _SURELY or 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
         causes |= _of_factor(camera, baseline, factor)
     return Diagnosis([Finding(tuple(causes), evidence, tuple(causes.values()))], rows=rows)
 
@@ -255,8 +232,15 @@ def _of_factor(camera: int, baseline: float, factor: float) -> dict[str, str]:
     size = _unit(factor) or f"is {_times(factor)} what the front-end's steps tell"
     return {
         f"baseline of camera {camera} {size}": (f"body_from_camera of camera {camera} in camera_rig {fitting}"),
-        f"poses {_unit(1.0 / factor) or 'in another unit'}": "the position in the keyframes, expected metres",
+        _scale_of_steps(factor): _STEPS,
     }
+
+
+def _scale_of_steps(factor: float) -> str:
+    """Return what is wrong with poses where lengths are ``factor`` times what these tell."""
+    if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+        return f"scale of the front-end's steps: they are {_times(1.0 / factor)} what the cameras tell"
+    return f"poses {_unit(1.0 / factor) or 'in another unit'}"
 
 
 def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

@@ -1,28 +1,45 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare a trajectory with a reference, pose by pose with the nearest stamp. Both are in the TUM format."""
+"""Compare a trajectory with a reference, pose by pose with the nearest stamp.
+
+Either may be a TUM or KITTI file, EuRoC's CSV, or a recording with a topic of poses. Prints absolute errors (ATE) and
+relative ones (RPE) over an interval, in frames or in metres of the way. KITTI has no stamps: such a file is
+compared in its order, and needs as many poses as the other.
+"""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 from pathlib import Path
 
 from ba_node.cli.console import require_folder, table
 
 SUMMARY = "compare a trajectory with a reference"
-EXAMPLE = "ba evaluate out/trajectory.tum ground_truth.tum --align se3"
+EXAMPLE = "ba evaluate out/trajectory.tum ground_truth.tum --align se3 --interval 1 --unit m"
+
+_HEAD = ("rmse", "mean", "median", "min", "max", "std", "sse", "count")
+_FIGURES = _HEAD[:6]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("estimate", type=Path, metavar="ESTIMATE.tum")
-    parser.add_argument("reference", type=Path, metavar="REFERENCE.tum")
+    parser.add_argument(
+        "estimate", type=Path, metavar="ESTIMATE", help="trajectory: .tum, KITTI, EuRoC .csv, recording"
+    )
+    parser.add_argument("reference", type=Path, metavar="REFERENCE", help="the same, to compare with")
     parser.add_argument(
         "--align",
         choices=("none", "se3", "sim3"),
         default="se3",
         help="what is fitted before comparing: nothing, rotation and translation, or scale too (default: se3)",
     )
+    parser.add_argument("--interval", type=float, default=1.0, metavar="N", help="of the relative error (default: 1)")
+    parser.add_argument(
+        "--unit", choices=("frames", "m"), default="frames", help="of the interval: frames (default) or m of the way"
+    )
+    parser.add_argument("--all-pairs", action="store_true", help="begin an interval at every pose, not end to end")
     parser.add_argument(
         "--max-difference",
         type=float,
@@ -30,38 +47,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="largest difference of the stamps of a pair, s (default: 0.01)",
     )
+    parser.add_argument("--reference-topic", default="", metavar="TOPIC", help="topic of poses in a recording")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the errors as JSON too")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the errors as CSV too")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw both trajectories and the error over time")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
-    from ba_node.evaluation.metrics import absolute_error  # noqa: PLC0415
+    from ba_node.evaluation import relative  # noqa: PLC0415
+    from ba_node.evaluation.metrics import absolute_error_of, pair  # noqa: PLC0415
     from ba_node.io.files import whole_file, write_json  # noqa: PLC0415
-    from ba_node.io.trajectory import read_tum  # noqa: PLC0415
+    from ba_node.io.reference import read_pair  # noqa: PLC0415
 
-    require_folder(args.json)
-    require_folder(args.plot)
-    estimate, reference = (read_tum(path) for path in (args.estimate, args.reference))
-    error = absolute_error(estimate, reference, args.align, args.max_difference)
-    rows = []
-    for name, unit, of in (("translation", "m", error.translation), ("rotation", "deg", error.rotation)):
-        shown = (of.rmse, of.mean, of.median, of.max, of.std)
-        rows.append([f"{name} [{unit}]", *(f"{value:.6f}" for value in shown)])
-    print(f"{len(error.stamp_ns)} of {len(estimate)} poses have a partner; alignment {args.align}")
-    print(table(["", "rmse", "mean", "median", "max", "std"], rows))
+    for path in (args.json, args.csv, args.plot):
+        require_folder(path)
+    estimate, reference = read_pair(args.estimate, args.reference, args.reference_topic)
+    paired = pair(estimate, reference, args.align, args.max_difference)
+    interval = relative.Interval(args.interval, args.unit, args.all_pairs)
+    absolute, moved = absolute_error_of(paired), relative.relative_error(paired, interval)
+    found = {
+        "translation_m": absolute.translation.as_dict(),
+        "rotation_deg": absolute.rotation.as_dict(),
+        "relative_translation_m": moved.translation.as_dict(),
+        "relative_rotation_deg": moved.rotation.as_dict(),
+    }
+    print(f"{len(paired.stamp_ns)} of {len(estimate)} poses have a partner; alignment {args.align}")
+    print(_table(found, f"{interval}, {len(moved.pairs)} pairs"))
     if args.align == "sim3":
-        print(f"scale {error.alignment.scale:.9f}")
+        print(f"scale {paired.alignment.scale:.9f}")
     if args.json:
-        write_json(
-            args.json,
-            {
-                "align": args.align,
-                "scale": error.alignment.scale,
-                "translation_m": error.translation.as_dict(),
-                "rotation_deg": error.rotation.as_dict(),
-            },
-        )
+        about = {"align": args.align, "scale": paired.alignment.scale, "interval": args.interval, "unit": args.unit}
+        write_json(args.json, about | found)
+    if args.csv:
+        text = io.StringIO(newline="")
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(("error", *_HEAD))
+        rows.writerows((name, *(of[key] for key in _HEAD)) for name, of in found.items())
+        with whole_file(args.csv) as stream:
+            stream.write(text.getvalue().encode())
     if args.plot:
         import numpy as np  # noqa: PLC0415
 
@@ -71,3 +95,9 @@ def run(args: argparse.Namespace) -> int:
         with whole_file(args.plot) as stream:
             draw(stream, Comparison(None, by_time[0], by_time[1], np.empty((0, 3)), args.align))
     return 0
+
+
+def _table(found: dict[str, dict[str, float | int]], over: str) -> str:
+    names = ("translation [m]", "rotation [deg]", f"translation [m] over {over}", f"rotation [deg] over {over}")
+    rows = [[name, *(f"{of[key]:.6f}" for key in _FIGURES)] for name, of in zip(names, found.values(), strict=True)]
+    return table(["", *_FIGURES], rows)

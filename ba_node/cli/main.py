@@ -21,16 +21,33 @@ from ba_node import __version__
 from ba_node.cli import interrupts
 from ba_node.cli.checkout import CheckoutCommand
 
-_INSTALLED = ("replay", "check", "map", "play", "solve", "convert", "evaluate", "synth", "demo", "params")
+# Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "refine": ("replay", "solve", "map"),
+    "look": ("check", "report", "evaluate"),
+    "recordings and files": ("convert", "synth"),
+    "the running node": ("play", "demo", "params"),
+    "in a checkout of the repository": ("steps", "robustness", "thesis"),
+}
 _IN_A_CHECKOUT = (
     CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
     CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
     CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
 )
+_BY_NAME = {command.name: command for command in _IN_A_CHECKOUT}
 COMMANDS: dict[str, ModuleType | CheckoutCommand] = {
-    **{name: importlib.import_module(f"ba_node.cli.{name}") for name in _INSTALLED},
-    **{command.name: command for command in _IN_A_CHECKOUT},
+    name: _BY_NAME.get(name) or importlib.import_module(f"ba_node.cli.{name}")
+    for names in GROUPS.values()
+    for name in names
 }
+_EXAMPLES = """\
+examples:
+  ba check bags/stereo_loop.mcap                 is the set-up sound?
+  ba replay bags/stereo_loop.mcap --out out      refine a recording
+  ba evaluate out/trajectory.tum truth.tum       how far from the truth?
+
+ba COMMAND --help tells more about each, with an example. Exit codes: 0 all is well, 2 wrong command line or input,
+3 results were written and something has to be looked at, 130 and 143 interrupted."""
 USAGE_ERROR = 2
 INTERRUPTED = 130
 FAULT = 1
@@ -54,12 +71,14 @@ class Parser(argparse.ArgumentParser):
         self.exit(USAGE_ERROR, f"ba: error: {message}; see {self.prog} --help\n")
 
 
-class Overview(argparse.HelpFormatter):
-    """Leave room for the longest command; argparse forgets that they are indented."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog)
-        self._action_max_length = 2 + max(map(len, COMMANDS)) + 2
+def overview() -> str:
+    """Return the commands by group, each with its line, and examples."""
+    width = max(map(len, COMMANDS))
+    parts = [
+        "\n".join([f"{title}:", *(f"    {name.ljust(width)}  {COMMANDS[name].SUMMARY}" for name in names)])
+        for title, names in GROUPS.items()
+    ]
+    return "\n\n".join([*parts, _EXAMPLES])
 
 
 class _Version(argparse.Action):
@@ -80,19 +99,21 @@ def build_parser(command: str) -> argparse.ArgumentParser:
     parser = Parser(
         prog="ba",
         description="Offline tools of ba_node, the bundle-adjustment back-end for ROS 2.",
-        epilog="ba COMMAND --help tells more about each.",
-        formatter_class=Overview,
+        usage="ba [--version] COMMAND ...",
+        epilog=overview(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=_Version, help="show the versions of ba_node and of its kernels")
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
+    subparsers = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, parser_class=Parser, help=argparse.SUPPRESS, prog="ba"
+    )
     for name, entry in COMMANDS.items():
         if name != command:
-            subparsers.add_parser(name, help=entry.SUMMARY)
+            subparsers.add_parser(name)
             continue
         module = entry.load() if isinstance(entry, CheckoutCommand) else entry
         sub = subparsers.add_parser(
             name,
-            help=entry.SUMMARY,
             description=module.__doc__,
             epilog=f"example:\n  {module.EXAMPLE}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -129,6 +150,8 @@ def _discard_files() -> None:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if "_ARGCOMPLETE" in os.environ:
+        _complete()
     command = next((word for word in arguments if not word.startswith("-")), "")
     try:
         args = build_parser(command).parse_args(arguments)
@@ -153,6 +176,13 @@ def _run(argv: Sequence[str] | None) -> int:
         if type(error).__module__.partition(".")[0] not in ("ba_node", "experiments"):
             raise
         return _end(USAGE_ERROR, f"error: {' '.join(str(error).split())}")
+
+
+def _complete() -> None:
+    """Answer a shell that asks how its line may go on (``eval "$(register-python-argcomplete ba)"``), and exit."""
+    argcomplete = importlib.import_module("argcomplete")  # the shell's hook comes with it
+    words = os.environ.get("COMP_LINE", "").split()[1:]
+    argcomplete.autocomplete(build_parser(next((word for word in words if word in COMMANDS), "")))
 
 
 def _end(code: int, message: str) -> int:

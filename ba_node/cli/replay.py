@@ -3,7 +3,8 @@
 """Run the back-end on a recording, without a middleware; the same recording gives the same bytes every time.
 
 Writes into DIR: trajectory.tum, trajectory_input.tum (the front-end's), points.ply, refined.mcap (the node's output
-topics), report.json, effective.yaml (all parameters), and ground_truth.tum if the recording has a ground truth.
+topics), report.json, effective.yaml (all parameters), details.npz (what the report is drawn from), and
+ground_truth.tum if the recording has a ground truth. report.html shows all of it, and trajectory.png the way.
 Older sessions of the recording go to DIR/session_<id>/, to DIR/session_<id>_2/ where the same id began a map again.
 
 Exit code: 0 all is well, 2 nothing was written (keyframes, tracks or cameras are missing, or none can be used), 3
@@ -60,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--final-optimize", action="store_true", help="refine all keyframes and points of the newest session at the end"
     )
+    parser.add_argument("--no-report", action="store_true", help="leave out the page and the picture of the results")
     parser.add_argument(
         "--save-map", type=Path, metavar="FILE", help="write the map at the end, NAME.npz; see docs/map_format.md"
     )
@@ -76,8 +78,21 @@ def run(args: argparse.Namespace) -> int:
         report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
     print(facts(_rows(report)))
     _tell(report)
-    print(f"written to {args.out}")
+    print(f"written to {args.out}{'' if args.no_report else _pictures(args.out)}")
     return ATTENTION if report["attention"] else 0
+
+
+def _pictures(out: Path) -> str:
+    """Write page and picture of the results; return what to say of them."""
+    from ba_node.offline.page import PageError  # noqa: PLC0415
+    from ba_node.offline.report import REPORT, draw_trajectory, write_report  # noqa: PLC0415
+
+    draw_trajectory(out)
+    try:
+        write_report([out], out / REPORT)
+    except PageError as error:
+        return f": trajectory.png; {error}"
+    return f": {REPORT}, trajectory.png and others"
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

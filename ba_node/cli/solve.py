@@ -1,9 +1,11 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve a problem of "Bundle Adjustment in the Large" (.txt, .bz2, .gz) as a whole.
+"""Solve a BAL file (.txt, .bz2, .gz), a scene of Bundler (.out) or a model of COLMAP (a folder) as a whole.
 
-Poses, points and each camera's f, k1, k2 are free. The defaults are those of the method: squared loss for
-local_dinm, points behind a camera keep their residual, as the published results count. Parameters of the node
+BAL ("Bundle Adjustment in the Large") and Bundler: poses, points and each camera's f, k1, k2 are free. The defaults are
+those of the method: squared loss for local_dinm, points behind a camera keep their residual, as the published results
+count. COLMAP: poses, points, and what --refine names of the cameras, which stay shared as they are in the model; method
+auto, and points that are behind their camera at the start are left out, as COLMAP does. Parameters of the node
 (solver.*) and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
 
 Exit code: 0 all is well, 2 nothing came of it, 3 the result has to be looked at: it is worse than the start, focal
@@ -23,11 +25,19 @@ from ba_node.cli.console import require_folder
 
 if TYPE_CHECKING:
     from ba_node.estimate import Iteration
+    from ba_node.offline.solve_bal import Solution
+    from ba_node.offline.solve_model import ModelSolution
 
-SUMMARY = "solve a BAL file as a whole"
-EXAMPLE = "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json"
+SUMMARY = "solve a BAL, Bundler or COLMAP problem as a whole"
+EXAMPLE = (
+    "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json\n"
+    "  ba solve sparse/0 --out refined --refine focal distortion"
+)
 # Nothing came of it; something came of it that has to be looked at.
 NOTHING, ATTENTION = 2, 3
+_GROUPS = ("focal", "principal_point", "distortion", "rig")
+# What differs from a method's defaults where a model of COLMAP is solved, before --set.
+_OF_MODELS = ("cheirality=drop", "damping_policy=nielsen", "function_tolerance=1e-9", "max_iterations=200")
 _HEAD = ("iter", "time [s]", "objective", "|gradient|", "linear", "step", "damping", "radius")
 _WIDTHS = (4, 9, 18, 11, 7, 9, 10, 10)
 
@@ -41,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problem", type=Path, metavar="PROBLEM")
     parser.add_argument(
         "--method",
-        default="local_dinm",
-        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: local_dinm)",
+        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: local_dinm,"
+        " for COLMAP auto)",
     )
     parser.add_argument(
         "--iterations", type=int, metavar="N", help=f"{iterations.doc} (default: the method's, {iterations.default})"
@@ -55,21 +65,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"change an option, one of {', '.join(name for name in options if name != 'method')}; repeatable",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write trace, options and statistics as JSON")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem as a BAL file")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem in its own format")
+    parser.add_argument(
+        "--refine",
+        nargs="+",
+        choices=(*_GROUPS, "none"),
+        metavar="WHAT",
+        help=f"COLMAP: what of the cameras is refined, of {', '.join(_GROUPS)}, or none (default: focal distortion rig,"
+        " as COLMAP does)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Solve."""
-    from ba_node.io.bal import write_bal  # noqa: PLC0415
     from ba_node.io.files import write_json  # noqa: PLC0415
-    from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
-    from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
 
-    assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]
-    options = solver_options(args.method, assignments)
     require_folder(args.json)
     require_folder(args.out)
-    solution = solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
+    solution = _solved(args)
     summary = solution.as_dict()
     summary["peak_rss_mb"] = _peak_rss_mb()
     if args.json:
@@ -86,14 +99,34 @@ def run(args: argparse.Namespace) -> int:
         f"linear solver: {summary['linear_solver']}\n"
         f"set-up {summary['setup_s']:.3f} s, solver {summary['solve_s']:.3f} s, memory {summary['peak_rss_mb']:.0f} MB"
     )
+    if "camera_unknowns" in summary:
+        print(f"cameras {len(summary['camera_models'])}, of which {summary['camera_unknowns']} numbers were refined")
     if solution.origin.any():
         print("solved about the origin {:g} {:g} {:g}, as that of the file is far away".format(*solution.origin))
     lines, grave = solution.attention()
     for line in lines:
         print(f"ba: warning: {line}" if grave else line, file=sys.stderr if grave else sys.stdout)
     if args.out:
-        write_bal(args.out, solution.refined())
+        solution.write(args.out)
+        print(f"written to {args.out}")
     return ATTENTION if grave else 0
+
+
+def _solved(args: argparse.Namespace) -> Solution | ModelSolution:
+    from ba_node.config import ConfigError  # noqa: PLC0415
+    from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
+    from ba_node.offline.solve_model import DEFAULT_GROUPS, solve_model  # noqa: PLC0415
+    from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
+
+    assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]
+    if not args.problem.is_dir():
+        if args.refine:
+            raise ConfigError("--refine is for models of COLMAP: BAL and Bundler have f, k1, k2 of each image free")
+        options = solver_options(args.method or "local_dinm", assignments)
+        return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
+    options = solver_options(args.method or "auto", [*_OF_MODELS, *assignments])
+    groups = [group for group in args.refine or DEFAULT_GROUPS if group != "none"]
+    return solve_model(args.problem, options, groups, clock=time.perf_counter, on_iteration=_show)
 
 
 def _show(row: Iteration) -> bool:

@@ -9,6 +9,7 @@ are weighed by the loss separately.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import cameras, columns, loss, parameterisation
 from ba_node.core.factors import FactorSum, FactorTerms
-from ba_node.core.problem import Problem, State
+from ba_node.core.problem import Cameras, Problem, State
 
 # What a point behind its camera costs under ``constant``: as much as a residual of this norm.
 _BEHIND_NORM = 100.0
@@ -102,6 +103,26 @@ class Objective:
         )
         if options.cheirality == "drop":
             self._all = replace(self._all, ignored=cameras.behind(self.in_camera(problem.start), self._all.model))
+
+    def through(self, cams: Cameras) -> Objective:
+        """Return the same objective with other cameras; observations that count for nothing are those of before."""
+        other = copy.copy(self)
+        other.problem = replace(self.problem, cameras=cams)
+        model, params = _lenses(other.problem, self._image_camera)
+        other._all = replace(self._all, model=model, params=params)
+        return other
+
+    def camera_rows(self, state: State) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Return points in their camera's optical frame (n_obs, 3), m, the masked rows, sqrt(weight) / sigma (n_obs,).
+
+        The rows of masked observations count for nothing. For problems without depths.
+        """
+        of = self._all
+        x_cam, _ = self._in_camera(state, of)
+        masked = self._mask(x_cam, of)
+        uv = cameras.project(x_cam, of.model, self._params(state, of))
+        _, root_weight = self._costs(self._residual(uv, x_cam, masked, of), masked, of)
+        return x_cam, masked, np.broadcast_to(self._row_scale(root_weight, of)[:, 0], len(x_cam))
 
     def in_camera(self, state: State) -> FloatArray:
         """Return the observed points in their camera's optical frame, (n_obs, 3), m."""

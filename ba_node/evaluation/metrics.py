@@ -29,6 +29,8 @@ class Statistics:
     max: float
     std: float
     count: int
+    min: float
+    sse: float  # sum of squares, their unit squared
 
     @classmethod
     def of(cls, errors: FloatArray) -> Statistics:
@@ -40,6 +42,8 @@ class Statistics:
             max=float(np.max(errors)),
             std=float(np.std(errors)),
             count=len(errors),
+            min=float(np.min(errors)),
+            sse=float(np.sum(errors**2)),
         )
 
     def as_dict(self) -> dict[str, float | int]:
@@ -85,10 +89,18 @@ def associate(
     return rows, order[partner[rows]]
 
 
-def absolute_error(
-    estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01
-) -> TrajectoryError:
-    """Return how far an estimated trajectory is from the reference, paired by stamp, aligned by the pairs' positions.
+@dataclass(frozen=True)
+class Paired:
+    """Poses of two trajectories that belong together, row by row, the estimate's aligned with the reference's."""
+
+    alignment: Alignment  # from the estimate to the reference
+    stamp_ns: NDArray[np.int64]  # (n,) of the estimate, by time
+    position: tuple[FloatArray, FloatArray]  # (n, 3) m of the estimate and of the reference
+    rotation: tuple[FloatArray, FloatArray]  # (n, 3, 3) fixed frame from body, likewise
+
+
+def pair(estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01) -> Paired:
+    """Pair the poses of two trajectories by stamp, and align the estimate by the positions of the pairs.
 
     Raises:
         EvaluationError: no pose has a partner, or the pairs cannot be aligned.
@@ -109,13 +121,34 @@ def absolute_error(
         alignment = align(ours.position, theirs.position, kind)
     except EvaluationError as error:
         raise EvaluationError(f"{len(rows)} of {len(estimate)} poses have a partner; {error}") from None
-    translation = np.linalg.norm(alignment.apply(ours.position) - theirs.position, axis=1)
     turned = alignment.rotation @ matrix_from_quaternion(ours.orientation)
-    difference = np.swapaxes(matrix_from_quaternion(theirs.orientation), -1, -2) @ turned
+    return Paired(
+        alignment,
+        ours.stamp_ns,
+        (alignment.apply(ours.position), theirs.position),
+        (turned, matrix_from_quaternion(theirs.orientation)),
+    )
+
+
+def absolute_error(
+    estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01
+) -> TrajectoryError:
+    """Return how far an estimated trajectory is from the reference, paired by stamp, aligned by the pairs' positions.
+
+    Raises:
+        EvaluationError: no pose has a partner, or the pairs cannot be aligned.
+    """
+    return absolute_error_of(pair(estimate, reference, kind, max_difference_s))
+
+
+def absolute_error_of(paired: Paired) -> TrajectoryError:
+    """Return the same of poses that are paired already."""
+    translation = np.linalg.norm(paired.position[0] - paired.position[1], axis=1)
+    difference = np.swapaxes(paired.rotation[1], -1, -2) @ paired.rotation[0]
     rotation = np.degrees(np.linalg.norm(so3_log(difference), axis=1))
     return TrajectoryError(
-        alignment=alignment,
-        stamp_ns=ours.stamp_ns,
+        alignment=paired.alignment,
+        stamp_ns=paired.stamp_ns,
         translation_m=translation,
         rotation_deg=rotation,
         translation=Statistics.of(translation),

@@ -25,7 +25,7 @@ class Comparison:
 
     before: Poses | None  # trajectory of the front-end; None to show that after adjustment alone
     after: Poses  # trajectory after adjustment
-    truth: Poses  # reference
+    truth: Poses | None  # reference, None if there is none
     cloud: FloatArray  # (n, 3) points of the map, in the frame of ``after``, m; may be empty
     kind: Kind = "se3"  # alignment of both trajectories to the truth
 
@@ -42,45 +42,58 @@ def draw(target: Path | IO[bytes], comparison: Comparison) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    before = None
-    if comparison.before is not None:
-        before = absolute_error(comparison.before, comparison.truth, comparison.kind)
-    after = absolute_error(comparison.after, comparison.truth, comparison.kind)
+    truth = comparison.truth
+    before, after = (
+        None if poses is None or truth is None else absolute_error(poses, truth, comparison.kind)
+        for poses in (comparison.before, comparison.after)
+    )
     figure = Figure(figsize=(12.0, 5.4), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     above, over_time = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
     _draw_site(above, comparison, before, after)
-    _draw_errors(over_time, before, after)
+    if after is not None:
+        _draw_errors(over_time, before, after)
+        change = f"{after.translation.rmse:.3f} m"
+        if before is not None:
+            change = f"{before.translation.rmse:.3f} m before, {change} after adjustment"
+        title = f"Trajectory error (RMSE, {comparison.kind} alignment): {change}"
+    else:
+        _draw_moved(over_time, comparison)
+        title = "Trajectory before and after adjustment"
     figure.legend(
         *above.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, markerscale=1.5
     )
-    change = f"{after.translation.rmse:.3f} m"
-    if before is not None:
-        change = f"{before.translation.rmse:.3f} m before, {change} after adjustment"
-    figure.suptitle(f"Trajectory error (RMSE, {comparison.kind} alignment): {change}", fontsize=13)
+    figure.suptitle(title, fontsize=13)
     figure.savefig(target, format="png", metadata={"Software": None})
 
 
-def _draw_site(axes: Any, comparison: Comparison, before: TrajectoryError | None, after: TrajectoryError) -> None:
-    truth = comparison.truth.position
-    cloud = after.alignment.apply(comparison.cloud)
+def _draw_site(
+    axes: Any, comparison: Comparison, before: TrajectoryError | None, after: TrajectoryError | None
+) -> None:
+    cloud = _aligned(comparison.cloud, after)
     if len(cloud):
         axes.scatter(cloud[:, 0], cloud[:, 1], s=5.0, c=_CLOUD, alpha=0.7, linewidths=0, label="map", rasterized=True)
-    paths = [truth]
-    if before is not None and comparison.before is not None:
-        before_path = before.alignment.apply(comparison.before.position)
+    path = _aligned(comparison.after.position, after)
+    paths = [path]
+    if comparison.before is not None:
+        before_path = _aligned(comparison.before.position, before)
         paths.append(before_path)
         axes.plot(before_path[:, 0], before_path[:, 1], ".--", color=_BEFORE, lw=1.3, ms=4.0, label="before")
-    axes.plot(truth[:, 0], truth[:, 1], "-", color=_TRUTH, lw=3.0, alpha=0.35, label="truth")
-    path = after.alignment.apply(comparison.after.position)
-    axes.plot(
-        path[:, 0], path[:, 1], ".-", color=_AFTER, lw=1.3, ms=5.0, label="estimate" if before is None else "after"
-    )
+    if comparison.truth is not None:
+        truth = comparison.truth.position
+        paths.append(truth)
+        axes.plot(truth[:, 0], truth[:, 1], "-", color=_TRUTH, lw=3.0, alpha=0.35, label="truth")
+    name = "estimate" if comparison.before is None else "after"
+    axes.plot(path[:, 0], path[:, 1], ".-", color=_AFTER, lw=1.3, ms=5.0, label=name)
     axes.set_aspect("equal")
-    _frame_site(axes, np.concatenate([*paths, path])[:, :2], cloud[:, :2])
+    _frame_site(axes, np.concatenate(paths)[:, :2], cloud[:, :2])
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.set_title("From above", fontsize=11)
+
+
+def _aligned(points: FloatArray, error: TrajectoryError | None) -> FloatArray:
+    return points if error is None else error.alignment.apply(points)
 
 
 def _frame_site(axes: Any, paths: FloatArray, cloud: FloatArray) -> None:
@@ -103,4 +116,17 @@ def _draw_errors(axes: Any, before: TrajectoryError | None, after: TrajectoryErr
     axes.set_xlabel("time [s]")
     axes.set_ylabel("position error [m]")
     axes.set_title("Error of each keyframe", fontsize=11)
+    axes.grid(alpha=0.3)
+
+
+def _draw_moved(axes: Any, comparison: Comparison) -> None:
+    """Show how far each keyframe was moved, where there is nothing to compare with."""
+    after, before = comparison.after, comparison.before
+    if before is not None and len(before) == len(after):
+        moved = np.linalg.norm(after.position - before.position, axis=1)
+        axes.plot((after.stamp_ns - after.stamp_ns[0]) / 1e9, moved, ".-", color=_AFTER, lw=1.3, ms=5.0)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("moved by [m]")
+    axes.set_title("What the adjustment moved", fontsize=11)
     axes.grid(alpha=0.3)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ba_node.measurements import CameraRig
-from ba_node.messages.topics import CAMERAS, INPUT_TYPES
+from ba_node.messages.topics import CAMERAS, INPUT_TYPES, TOPICS
 
 # Numbers of a camera that differ by less than this, relative or px, are the same: they may have gone through a text.
 _SAME = 1e-3
@@ -94,6 +94,8 @@ class Chooser:
         for name in INPUT_TYPES:
             if name == "camera_info" and "camera_rig" in self._result.taken:
                 break
+            if TOPICS[name].by_name and name not in choice.topics:
+                options[name] = [topic for topic in options[name] if topic.rpartition("/")[2] == name]
             candidates = options[name] if name == "keyframes" or name in choice.topics else self._related(options[name])
             topic = self._pick(name, candidates, options)
             if topic:
@@ -176,6 +178,8 @@ class Chooser:
                 if topic in taken:
                     continue
                 reason = f"{self._result.taken.get(name, 'no other')} is taken as {name}"
+                if TOPICS[name].by_name and name not in self._result.taken:
+                    reason = f"not named {name}: say --topic {name}={topic} to use it"
                 if name == "camera_info" and rig:
                     reason = f"{rig} tells the cameras{self._other_numbers(topic, rig)}"
                 self._result.left[topic] = reason

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write point clouds as binary PLY with the fields of the topic ``~/points``.
+"""Write, and read again, point clouds as binary PLY with the fields of the topic ``~/points``.
 
 Positions are doubles here: at the coordinates of a country, as UTM has them, a float32 has steps of 0.5 m.
 """
@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.estimate import Cloud
-from ba_node.io.files import whole_file
+from ba_node.io.files import open_regular, whole_file
 
 # One point in a file, little endian.
 _FIELDS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("rms_px", "<f4"), ("views", "<u4")]
+_MAX_BYTES = 2**34
 _KINDS = {"<f8": "double", "<f4": "float", "<u4": "uint"}
 
 
@@ -28,6 +30,22 @@ def write_ply(path: Path | str, cloud: Cloud, frame_id: str) -> None:
     with whole_file(path) as stream:
         stream.write(_header(len(cloud), frame_id).encode("ascii"))
         stream.write(points.tobytes())
+
+
+def read_ply_points(path: Path | str) -> FloatArray:
+    """Return the points (n, 3), m, of a file that :func:`write_ply` has written.
+
+    Raises:
+        ValueError: it is none.
+        OSError: it cannot be opened.
+    """
+    with open_regular(path, _MAX_BYTES) as stream:
+        _, found, body = stream.read().partition(b"end_header\n")
+    row = np.dtype(_FIELDS)
+    if not found or len(body) % row.itemsize:
+        raise ValueError(f"{path}: no point cloud of ba_node")
+    points = np.frombuffer(body, row)
+    return np.stack([points[axis] for axis in "xyz"], axis=1)
 
 
 def _header(count: int, frame_id: str) -> str:

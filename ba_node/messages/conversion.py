@@ -10,14 +10,26 @@ holds on to the buffer of a message or of a file.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.arrays import FloatArray
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import (
+    CameraRig,
+    FeatureTracks,
+    GlobalFix,
+    GravityDirection,
+    Keyframe,
+    LandmarkGuesses,
+    LandmarkPriors,
+    Measurement,
+    PosePrior,
+    RelativePose,
+    TrackMerge,
+)
 from ba_node.messages.camera_info import Lens, lens_of
 from ba_node.messages.factory import (
     ConversionError,
@@ -41,16 +53,9 @@ def measurement_from_message(type_name: str, msg: Any) -> Measurement:
     Raises:
         ConversionError: the type is not an input.
     """
-    if type_name == INPUT_TYPES["keyframes"]:
-        return _keyframe(msg)
-    if type_name == INPUT_TYPES["feature_tracks"]:
-        return _tracks(msg)
-    if type_name == INPUT_TYPES["landmark_guesses"]:
-        return _guesses(msg)
-    if type_name == INPUT_TYPES["camera_rig"]:
-        return _rig(str(msg.header.frame_id), msg.cameras, msg.body_from_camera)
-    if type_name == INPUT_TYPES["camera_info"]:
-        return _rig(str(msg.header.frame_id), [msg], None)
+    read = _READERS.get(type_name)
+    if read is not None:
+        return read(msg)
     raise ConversionError(f"type {type_name!r} is not an input: expected one of {', '.join(INPUT_TYPES.values())}")
 
 
@@ -67,7 +72,14 @@ def _keyframe(msg: Any) -> Keyframe:
         frame_id=str(msg.header.frame_id),
         position=_xyz(pose.position),
         orientation=_xyzw(pose.orientation),
+        covariance=_known(getattr(msg.pose, "covariance", ())),
     )
+
+
+def _known(covariance: Any) -> FloatArray:
+    """Return a covariance, empty where all is zero, which stands for unknown."""
+    values = _array(covariance, np.float64)
+    return values if values.any() else np.empty(0)
 
 
 def _tracks(msg: Any) -> FeatureTracks:
@@ -104,6 +116,59 @@ def _guesses(msg: Any) -> LandmarkGuesses:
         )
         track_id, position = track_id[:0], position[:0]
     return LandmarkGuesses(int(msg.session_id), track_id, position.reshape(-1, 3), malformed)
+
+
+def _relative(msg: Any) -> RelativePose:
+    pose = msg.pose.pose
+    return RelativePose(
+        int(msg.session_id),
+        int(msg.from_keyframe_id),
+        int(msg.to_keyframe_id),
+        int(msg.kind) == _LOOP,
+        _xyz(pose.position),
+        _xyzw(pose.orientation),
+        _array(msg.pose.covariance, np.float64),
+    )
+
+
+def _priors(msg: Any) -> LandmarkPriors:
+    track_id = _array(msg.track_id, np.uint64)
+    n, position, covariance = len(track_id), _array(msg.position, np.float64), _array(msg.covariance, np.float64)
+    malformed = ""
+    if len(position) != 3 * n or len(covariance) != 9 * n:
+        malformed = f"{n} tracks, {len(position)} coordinates and {len(covariance)} covariances: expected n, 3n, 9n"
+        track_id, position, covariance = track_id[:0], position[:0], covariance[:0]
+    rows = position.reshape(-1, 3), covariance.reshape(-1, 3, 3)
+    return LandmarkPriors(int(msg.session_id), str(msg.header.frame_id), track_id, *rows, malformed)
+
+
+def _merge(msg: Any) -> TrackMerge:
+    track_id, same_as = _array(msg.track_id, np.uint64), _array(msg.same_as, np.uint64)
+    malformed = ""
+    if len(track_id) != len(same_as):
+        malformed = f"track_id has {len(track_id)} entries, same_as {len(same_as)}: expected as many"
+        track_id, same_as = track_id[:0], same_as[:0]
+    return TrackMerge(int(msg.session_id), track_id, same_as, malformed)
+
+
+def _gravity(msg: Any) -> GravityDirection:
+    return GravityDirection(int(msg.session_id), int(msg.keyframe_id), _xyz(msg.down), float(msg.sigma_rad))
+
+
+def _pose_prior(msg: Any) -> PosePrior:
+    pose = msg.pose.pose
+    values = _xyz(pose.position), _xyzw(pose.orientation), _array(msg.pose.covariance, np.float64)
+    return PosePrior(stamp_ns_from_message(msg.header.stamp), str(msg.header.frame_id), *values)
+
+
+def _fix(msg: Any) -> GlobalFix:
+    return GlobalFix(
+        stamp_ns_from_message(msg.header.stamp),
+        str(msg.header.frame_id),
+        np.array([msg.latitude, msg.longitude, msg.altitude], dtype=np.float64),
+        _array(msg.position_covariance, np.float64),
+        int(msg.status.status) >= 0,
+    )
 
 
 def _rig(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
@@ -152,11 +217,11 @@ def _xyzw(quaternion: Any) -> FloatArray:
 
 
 def keyframe_message(factory: MessageFactory, keyframe: Keyframe) -> Any:
-    """Return a ``ba_msgs/Keyframe``, covariance unknown."""
+    """Return a ``ba_msgs/Keyframe``."""
     pose = factory.make(
         "geometry_msgs/msg/PoseWithCovariance",
         pose=pose_message(factory, keyframe.position, keyframe.orientation),
-        covariance=factory.fixed(np.zeros(36)),
+        covariance=factory.fixed(keyframe.covariance if len(keyframe.covariance) else np.zeros(36)),
     )
     return factory.make(
         INPUT_TYPES["keyframes"],
@@ -220,3 +285,66 @@ def _camera_info(factory: MessageFactory, rig: CameraRig, index: int, stamp_ns: 
         binning_y=0,
         roi=factory.make("sensor_msgs/msg/RegionOfInterest", **region),
     )
+
+
+def side_message(factory: MessageFactory, what: Measurement, stamp_ns: int = 0, frame_id: str = "") -> tuple[str, Any]:
+    """Return the input and the message of what is known beside pixels; ``frame_id`` is that of the body.
+
+    Raises:
+        ConversionError: it is none of these.
+    """
+    if isinstance(what, PosePrior | GlobalFix):
+        stamp_ns, frame_id = what.stamp_ns, what.frame_id
+    elif isinstance(what, LandmarkPriors):
+        frame_id = what.frame_id
+    fields = {"header": header_message(factory, stamp_ns, frame_id)}
+    if isinstance(what, RelativePose | PosePrior):
+        fields["pose"] = factory.make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=pose_message(factory, what.position, what.orientation),
+            covariance=factory.fixed(what.covariance),
+        )
+    if isinstance(what, PosePrior):
+        return _made(factory, "pose_prior", fields)
+    if isinstance(what, GlobalFix):
+        status = factory.make("sensor_msgs/msg/NavSatStatus", status=0 if what.is_fix else -1, service=1)
+        names = dict(zip(("latitude", "longitude", "altitude"), what.geodetic.tolist(), strict=True))
+        known = {"position_covariance": factory.fixed(what.covariance), "position_covariance_type": 3}
+        return _made(factory, "gnss", fields | {"status": status} | names | known)
+    if isinstance(what, RelativePose):
+        ends = {"from_keyframe_id": what.from_keyframe_id, "to_keyframe_id": what.to_keyframe_id}
+        return _made(factory, "relative_poses", fields | ends | _session(what) | {"kind": int(what.is_loop)})
+    if isinstance(what, LandmarkPriors | TrackMerge):
+        named = {key: factory.array(v.reshape(-1)) for key, v in vars(what).items() if isinstance(v, np.ndarray)}
+        name = "track_merges" if isinstance(what, TrackMerge) else "landmark_priors"
+        return _made(factory, name, fields | _session(what) | named)
+    if isinstance(what, GravityDirection):
+        down = factory.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", what.down.tolist(), strict=True)))
+        rest = {"keyframe_id": what.keyframe_id, "down": down, "sigma_rad": what.sigma_rad}
+        return _made(factory, "gravity", fields | _session(what) | rest)
+    raise ConversionError(f"{type(what).__name__} is not known beside pixels")
+
+
+def _made(factory: MessageFactory, name: str, fields: dict[str, Any]) -> tuple[str, Any]:
+    return name, factory.make(INPUT_TYPES[name], **fields)
+
+
+def _session(what: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> dict[str, Any]:
+    return {"session_id": what.session_id}
+
+
+# ``ba_msgs/RelativePose.LOOP``.
+_LOOP = 1
+_READERS: dict[str, Callable[[Any], Measurement]] = {
+    INPUT_TYPES["keyframes"]: _keyframe,
+    INPUT_TYPES["feature_tracks"]: _tracks,
+    INPUT_TYPES["landmark_guesses"]: _guesses,
+    INPUT_TYPES["relative_poses"]: _relative,
+    INPUT_TYPES["landmark_priors"]: _priors,
+    INPUT_TYPES["track_merges"]: _merge,
+    INPUT_TYPES["gravity"]: _gravity,
+    INPUT_TYPES["pose_prior"]: _pose_prior,
+    INPUT_TYPES["gnss"]: _fix,
+    INPUT_TYPES["camera_rig"]: lambda msg: _rig(str(msg.header.frame_id), msg.cameras, msg.body_from_camera),
+    INPUT_TYPES["camera_info"]: lambda msg: _rig(str(msg.header.frame_id), [msg], None),
+}

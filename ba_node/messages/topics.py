@@ -36,6 +36,8 @@ class Topic:
     text: str  # what it holds
     direction: Direction = Direction.TAKEN  # seen from the node
     delivery: Delivery = Delivery.RELIABLE  # quality of service
+    # many publish its type for other ends: in a recording it is taken by its name alone, or where a user says so
+    by_name: bool = False
 
     @property
     def is_shared(self) -> bool:
@@ -65,6 +67,23 @@ _ALL = (
     Topic("keyframes", "ba_msgs/msg/Keyframe", "Pose of the body at every keyframe, as the front-end has it."),
     Topic("feature_tracks", "ba_msgs/msg/FeatureTracks", "What one camera saw in one keyframe; one message a camera."),
     Topic("landmark_guesses", "ba_msgs/msg/LandmarkGuesses", "Optional: first positions of points."),
+    Topic("relative_poses", "ba_msgs/msg/RelativePose", "Optional: measured poses of one keyframe in another."),
+    Topic("landmark_priors", "ba_msgs/msg/LandmarkPriors", "Optional: points whose places are known."),
+    Topic("track_merges", "ba_msgs/msg/TrackMerge", "Optional: tracks that are the same point, as after a loop."),
+    Topic("gravity", "ba_msgs/msg/GravityDirection", "Optional: which way is down at a keyframe."),
+    Topic(
+        "pose_prior",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "Optional: where the body is in a frame fixed to the world; paired by stamp, see docs/factors.md.",
+        by_name=True,
+    ),
+    Topic(
+        "gnss",
+        "sensor_msgs/msg/NavSatFix",
+        "Optional: where an antenna is on the earth; paired by stamp, see docs/factors.md.",
+        delivery=Delivery.BEST_EFFORT,
+        by_name=True,
+    ),
     Topic(
         "camera_rig",
         "ba_msgs/msg/CameraRig",
@@ -126,10 +145,14 @@ _ALL = (
     Topic(CLOCK, "rosgraph_msgs/msg/Clock", "The time, with `use_sim_time: true`.", _IN, Delivery.BEST_EFFORT),
 )
 TOPICS = {topic.name: topic for topic in _ALL}
+# Of the inputs: it rises when one of their definitions changes in its fields, types or meanings. What is new comes on
+# topics of its own and leaves it as it is.
+INTERFACE_VERSION = 1
 # What a recording holds for a replay, and what a solve gives: type by name.
 INPUT_TYPES = {one.name: one.type_name for one in _ALL if one.direction is _IN and not one.is_shared}
 OUTPUT_TYPES = {one.name: one.type_name for one in _ALL if one.direction is _OUT and not one.is_shared}
-CAMERAS = tuple(name for name in INPUT_TYPES if TOPICS[name].delivery is not _RELIABLE)
+CAMERAS = ("camera_rig", "camera_info")
+# Every one comes from a front-end; what else is known beside pixels may come from elsewhere, and more seldom.
 CAMERA_TYPES = tuple(INPUT_TYPES[name] for name in CAMERAS)
 LATCHED_OUTPUTS = tuple(name for name in OUTPUT_TYPES if TOPICS[name].delivery is _LATCHED)
 ON_DEMAND = tuple(one.name for one in _ALL if one.direction is _SIDE)

@@ -15,8 +15,8 @@ import numpy as np
 from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
-from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, side_message, tracks_message
 from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message
 from ba_node.messages.topics import INPUT_TYPES, TF_STATIC
 from ba_node.messages.transforms import StaticTree
@@ -63,8 +63,10 @@ def record(
                     count += 1
             elif isinstance(measurement, LandmarkGuesses):
                 message = guesses_message(ROSBAGS_FACTORY, measurement, stamp_ns, fixed_frame)
-            else:
+            elif isinstance(measurement, FeatureTracks):
                 message = tracks_message(ROSBAGS_FACTORY, measurement, stamp_ns, names[measurement.camera_index])
+            else:
+                _, message = side_message(ROSBAGS_FACTORY, measurement, stamp_ns)
             writer.write(topic, INPUT_TYPES[topic], message, stamp_ns, latched=isinstance(measurement, CameraRig))
             count += 1
     return count

@@ -33,6 +33,7 @@ from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
+from ba_node.offline.run_folder import recording_facts, versions, write_details
 from ba_node.offline.session_record import SessionRecord
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
@@ -112,6 +113,8 @@ def replay(
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
         report["known_already"] = len(run.known_already)
+        report["recording"] = recording_facts(reader.paths)
+        report["versions"] = versions(report["kernels"])
         report["attention"] = attention(report)
         if options.save is not None:
             write_map(map_name(options.save), run.backend.snapshot())
@@ -218,6 +221,7 @@ def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dic
         write_tum(folder / "trajectory.tum", record.trajectory)
         write_tum(folder / "trajectory_input.tum", record.input_trajectory)
         write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
+        write_details(folder, record)
     summaries = [record.as_dict() | _against(truth, record) for record in sessions]
     for folder, entry in zip(folders[:-1], summaries, strict=False):
         entry["folder"] = folder.name

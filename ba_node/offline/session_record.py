@@ -12,7 +12,7 @@ import numpy as np
 
 from ba_node.arrays import BoolArray
 from ba_node.backend import MapSummary
-from ba_node.estimate import Estimate, Poses
+from ba_node.estimate import Estimate, Poses, SolveReport
 from ba_node.measurements import Keyframe
 
 _IDS_SHOWN = 6
@@ -28,9 +28,7 @@ class SessionRecord:
     inputs: dict[int, Keyframe] = field(default_factory=dict)  # accepted keyframe messages by id
     refined: set[int] = field(default_factory=set)  # ids of the keyframes that took part in a usable solve
     statuses: Counter[str] = field(default_factory=Counter)  # solves by status
-    solver_time_s: float = 0.0  # in all, s
-    slowest: tuple[float, int] = (0.0, 0)  # time and keyframe of the slowest solve
-    iterations: int = 0  # outer iterations in all
+    solves: list[tuple[int, SolveReport]] = field(default_factory=list)  # stamp of the newest keyframe, ns, and report
     reasons: dict[int, str] = field(default_factory=dict)  # why a solve gave nothing, by its newest keyframe
     unrefined: str = ""  # which keyframes were not refined and why, empty if all were; see :meth:`close`
     closed: MapSummary | None = None  # summary of the map at its end, None before :meth:`close`
@@ -55,9 +53,7 @@ class SessionRecord:
         self.last = estimate
         report = estimate.report
         self.statuses[report.status.name] += 1
-        self.iterations += report.iterations
-        self.solver_time_s += report.solve_time_s
-        self.slowest = max(self.slowest, (report.solve_time_s, report.newest_keyframe_id))
+        self.solves.append((estimate.stamp_ns, report))
         if not report.status.usable:
             self.reasons[report.newest_keyframe_id] = report.reason
         self.refined.update(refined.intersection(estimate.refined.keyframe_id.tolist()))
@@ -97,6 +93,8 @@ class SessionRecord:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entries of report.json."""
+        reports = [report for _, report in self.solves]
+        slowest = max(((one.solve_time_s, one.newest_keyframe_id) for one in reports), default=(0.0, 0))
         return {
             "session_id": self.session_id,
             "frame_id": self.last.frame_id,
@@ -107,10 +105,11 @@ class SessionRecord:
             **_figures(self.summary),
             "solves": sum(self.statuses.values()),
             "solves_by_status": dict(sorted(self.statuses.items())),
-            "iterations": self.iterations,
-            "solver_time_s": self.solver_time_s,
-            "slowest_solve_s": self.slowest[0],
-            "slowest_solve_keyframe_id": self.slowest[1],
+            "iterations": sum(one.iterations for one in reports),
+            "solver_time_s": sum(one.solve_time_s for one in reports),
+            "slowest_solve_s": slowest[0],
+            "slowest_solve_keyframe_id": slowest[1],
+            "solve_times_s": [one.solve_time_s for one in reports],
         }
 
 

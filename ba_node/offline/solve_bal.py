@@ -1,11 +1,11 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve a BAL problem as a whole, and report how it went."""
+"""Solve a problem of BAL or a scene of Bundler as a whole, and report how it went."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,12 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core.objective import rms_px
-from ba_node.core.problem import Problem
+from ba_node.core.problem import Problem, State
 from ba_node.core.result import Result
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
-from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated
+from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated, write_bal
+from ba_node.io.bundler import BundlerScene, from_bal, is_bundler, read_bundler, write_bundler
 from ba_node.offline.solver_settings import describe
 
 # Points that lie so many times their own extent from the origin are moved there: coordinates of a whole country, as UTM
@@ -42,6 +43,17 @@ class Solution:
     options: SolverOptions  # with which it was solved
     setup_s: float  # time to read and prepare it, s
     solve_s: float  # time in the solver, s
+    bundler: BundlerScene | None = None  # what else a file of Bundler holds
+
+    def write(self, path: Path) -> None:
+        """Write the problem with the solution as start: a scene of Bundler where the name ends in .out, else BAL."""
+        refined = self.refined()
+        if path.suffix != ".out":
+            write_bal(path, refined)
+        elif self.bundler is not None:
+            write_bundler(path, dataclasses.replace(self.bundler, bal=refined))
+        else:
+            write_bundler(path, from_bal(refined, np.full(refined.points.shape, 255)))
 
     def refined(self) -> BalProblem:
         """Return the problem with the solution as start, in the coordinates of the file."""
@@ -79,34 +91,44 @@ class Solution:
 
     def as_dict(self) -> dict[str, Any]:
         """Return statistics, options and trace for JSON; an infinite radius becomes null there."""
-        result = self.result
-        with np.errstate(all="ignore"):  # infinite where the solve failed
-            rms_before, rms_after = rms_px(self.problem, self.problem.start, result.state)
-        return {
-            "problem": {
-                "file": Path(self.source).name,
-                "cameras": self.problem.n_keyframes,
-                "points": self.problem.n_points,
-                "observations": len(self.problem.observations),
-            },
-            "method": result.method,
-            "linear_solver": result.linear_solver,
+        lines = self.attention()[0]
+        ends = [(self.problem, self.problem.start), (self.problem, self.result.state)]
+        return statistics(self.source, ends, self.result, self.options) | {
             "origin": self.origin.tolist(),
-            "attention": self.attention()[0],
-            "options": describe(self.options),
-            "status": result.status.name,
-            "reason": result.reason,
-            "objective_before": result.objective_before,
-            "objective_after": result.objective_after,
-            "rms_px_before": rms_before,
-            "rms_px_after": rms_after,
-            "iterations": max(0, len(result.trace) - 1),
-            "accepted_iterations": result.accepted_iterations,
-            "linear_iterations": result.linear_iterations,
+            "attention": lines,
             "setup_s": self.setup_s,
             "solve_s": self.solve_s,
-            "trace": [dataclasses.asdict(row) for row in result.trace],
         }
+
+
+def statistics(
+    source: str, ends: Sequence[tuple[Problem, State]], result: Result, options: SolverOptions
+) -> dict[str, Any]:
+    """Return what every solve of a file tells; ``ends`` are problem and state at the start and at the end."""
+    problem = ends[0][0]
+    with np.errstate(all="ignore"):  # infinite where the solve failed
+        before, after = (rms_px(of, state)[0] for of, state in ends)
+    return {
+        "problem": {
+            "file": Path(source).name,
+            "cameras": problem.n_keyframes,
+            "points": problem.n_points,
+            "observations": len(problem.observations),
+        },
+        "method": result.method,
+        "linear_solver": result.linear_solver,
+        "options": describe(options),
+        "status": result.status.name,
+        "reason": result.reason,
+        "objective_before": result.objective_before,
+        "objective_after": result.objective_after,
+        "rms_px_before": before,
+        "rms_px_after": after,
+        "iterations": max(0, len(result.trace) - 1),
+        "accepted_iterations": result.accepted_iterations,
+        "linear_iterations": result.linear_iterations,
+        "trace": [dataclasses.asdict(row) for row in result.trace],
+    }
 
 
 def solve_file(
@@ -123,19 +145,20 @@ def solve_file(
         ProblemError: it holds no well-formed problem.
     """
     began = clock()
-    bal = read_bal(path)
-    origin = _origin(bal)
+    scene = read_bundler(Path(path)) if is_bundler(Path(path)) else None
+    bal = read_bal(path) if scene is None else scene.bal
+    origin = middle_if_far(bal.points)
     bal = translated(bal, -origin) if origin.any() else bal
     problem = to_problem(bal)
     ready = clock()
     result = solve(problem, options, clock=clock, on_iteration=on_iteration)
-    return Solution(str(path), bal, problem, origin, result, options, ready - began, clock() - ready)
+    return Solution(str(path), bal, problem, origin, result, options, ready - began, clock() - ready, scene)
 
 
-def _origin(bal: BalProblem) -> FloatArray:
-    """Return the middle of the points if the origin of the file is far from all of them, otherwise zeros."""
-    if not len(bal.points):
+def middle_if_far(points: FloatArray) -> FloatArray:
+    """Return the middle of points (m, 3) if the origin is far from all of them, otherwise zeros."""
+    if not len(points):
         return np.zeros(3)
-    middle = np.median(bal.points, axis=0)
-    extent = float(np.median(np.linalg.norm(bal.points - middle, axis=1)))
+    middle = np.median(points, axis=0)
+    extent = float(np.median(np.linalg.norm(points - middle, axis=1)))
     return middle if float(np.linalg.norm(middle)) > _FAR * extent > 0.0 else np.zeros(3)

@@ -26,6 +26,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.ros.components.base import Component, Host
+from ba_node.ros.components.definitions import Definitions
 from ba_node.ros.components.diagnostics import Diagnostics
 from ba_node.ros.components.inputs import Inputs
 from ba_node.ros.components.map_transform import MapTransform
@@ -51,6 +52,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     Diagnostics,
     Silence,
     SimulatedTime,
+    Definitions,
     StaticFrames,
     Services,
     Optimize,

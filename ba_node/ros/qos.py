@@ -57,6 +57,8 @@ def profile(topic: Topic, depth: int = OUTPUT_DEPTH) -> Any:
     A latched subscription alone does not match a camera driver, which publishes camera_info volatile and often best
     effort; one with ``SENSOR_DATA`` alone misses what was latched before the node came. Cameras are taken from both.
     """
+    if topic.delivery is Delivery.BEST_EFFORT:
+        return SENSOR_DATA
     return reliable(depth) if topic.delivery is Delivery.RELIABLE else latched()
 
 
@@ -113,7 +115,7 @@ def _mismatch(node: Any, topic: str, role: str, event: Any) -> Notice:
     name = node.resolve_topic_name(topic)
     sides = node.get_publishers_info_by_topic(name), node.get_subscriptions_info_by_topic(name)
     others, own = sides if role == "publisher" else sides[::-1]
-    mine = [info.qos_profile for info in own if _is(info, node)]
+    mine = [info.qos_profile for info in own if is_of(info, node)]
     at_fault = [o for o in others if not any(_compatible(o.qos_profile, profile, role) for profile in mine)]
     text = (
         f"{name}: no messages pass between this node and {role} {_peers(at_fault)}: incompatible"
@@ -132,7 +134,8 @@ def peer_name(info: Any) -> str:
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
-def _is(info: Any, node: Any) -> bool:
+def is_of(info: Any, node: Any) -> bool:
+    """Return True for an endpoint of a node."""
     return bool((info.node_name, info.node_namespace) == (node.get_name(), node.get_namespace()))
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ba_node.core import geometry
-from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement, OfSession
 from ba_node.scene.ingest import plain_name
 from ba_node.scene.rejections import Refusal, RejectionLog
 from ba_node.scene.scene import Scene
@@ -96,7 +96,7 @@ class State:
 
     candidate: Candidate | None = None  # what is held
     # tracks and guesses of sessions that no keyframe has begun
-    waiting: tuple[FeatureTracks | LandmarkGuesses, ...] = ()
+    waiting: tuple[OfSession, ...] = ()
     # session and number of the keyframes in a row that are of a session before the current one
     lower: tuple[int, int] = (-1, 0)
     distrust: int = 0  # added to what is needed
@@ -192,13 +192,14 @@ def _refusal_text(candidate: Candidate, keyframe: Keyframe) -> str:
     return f"{text}, stamp {keyframe.stamp_ns * NS:.3f} s, and those after it do not agree"
 
 
-def never_began(item: FeatureTracks | LandmarkGuesses) -> Refusal:
+def never_began(item: OfSession) -> Refusal:
     """Turn away what waited for the first keyframe of its session in vain."""
     session = f"session {item.session_id}, which no keyframe began"
     if isinstance(item, FeatureTracks):
         text = f"tracks of camera {item.camera_index} wait for keyframe {item.keyframe_id} of {session}"
         return Refusal(item, "unknown_keyframe", text)
-    return Refusal(item, "pending_overflow", f"{len(item.track_id)} guesses wait for {session}")
+    what = f"{len(item.track_id)} guesses wait" if isinstance(item, LandmarkGuesses) else f"{type(item).__name__} waits"
+    return Refusal(item, "pending_overflow", f"{what} for {session}")
 
 
 def newest_ns(scene: Scene) -> int:

@@ -50,7 +50,7 @@ def keyframe_pose(keyframe: Keyframe, log: RejectionLog) -> Pose | None:
     if not _STAMP.min <= keyframe.stamp_ns <= _STAMP.max:
         log.reject("malformed", f"{name}: stamp {keyframe.stamp_ns} ns, expected 64 bits")
         return None
-    if not _within(position, MAX_POSITION_M) or not _is_rotation(quaternion):
+    if not _within(position, MAX_POSITION_M) or not is_rotation(quaternion):
         log.reject("bad_pose", f"{name}: position {position} m, quaternion {quaternion}, expected finite and not zero")
         return None
     _check_distance(name, keyframe.frame_id, position, log)
@@ -173,7 +173,7 @@ def rig_cameras(rig: CameraRig, log: RejectionLog) -> Cameras | None:
         return None
     model, params = np.zeros(n, np.uint8), np.zeros((n, cameras.N_PARAMS))
     for i in range(n):
-        if not _within(rig.position[i], MAX_POSITION_M) or not _is_rotation(rig.orientation[i]):
+        if not _within(rig.position[i], MAX_POSITION_M) or not is_rotation(rig.orientation[i]):
             pose = f"position {rig.position[i]} m, quaternion {rig.orientation[i]}"
             log.reject("bad_rig", f"camera {i}: {pose}, expected finite and not zero")
             return None
@@ -269,7 +269,8 @@ def _within(values: FloatArray, limit: float) -> bool:
         return bool((np.abs(values) <= limit).all())
 
 
-def _is_rotation(quaternion: FloatArray) -> bool:
+def is_rotation(quaternion: FloatArray) -> bool:
+    """Return True for a quaternion that is finite and not zero."""
     if not np.isfinite(quaternion).all() or np.abs(quaternion).max() > 1e6:
         return False
     return bool(np.linalg.norm(quaternion) > _MIN_QUATERNION_NORM)

@@ -23,13 +23,19 @@ REASONS: dict[str, str] = {
     "unknown_model": "A camera rig with a camera that cannot be used (distortion model, coefficients).",
     "rig_changed": "Another camera rig while a session has observations; it is used from the next session on.",
     "unknown_camera": "A tracks message whose camera_index is not in the rig.",
-    "unknown_keyframe": "A tracks message whose keyframe never came, or was turned away.",
+    "unknown_keyframe": "Tracks, a relative pose or gravity whose keyframe never came, or was turned away.",
     "duplicate_keyframe": "A keyframe whose id is known; the first one stays.",
     "bad_stamp": "A keyframe whose stamp lies far from those before it and those after it.",
     "frame_changed": "A keyframe in another frame than its session, which no second one confirmed.",
     "stray_session": "A keyframe of a higher session, which no second one confirmed.",
     "duplicate_observation": "A second observation of a track by one camera in one keyframe; the first one stays.",
     "stale_session": "A message of a session before the current one.",
+    "bad_factor": "A relative pose, a prior, a fix or gravity with numbers that cannot be, or of a keyframe in itself.",
+    "bad_covariance": "The same with a covariance that is not finite, symmetric and positive definite.",
+    "bad_merge": "A merge of two tracks that one image sees both, or that are one already or unknown.",
+    "other_world": "A prior in another frame than the one that came first, or in none.",
+    "no_geo": "A fix of GNSS where pymap3d is missing: pip install ba_node[geo].",
+    "unpaired": "A pose prior or a fix of GNSS without keyframes on both sides of its time.",
     "pending_overflow": "A message that waited for the camera rig, or for the first keyframe of its session, longer"
     " than scene.max_pending messages or until the end.",
 }
@@ -40,6 +46,8 @@ NOTICES: dict[str, str] = {
     "setup_unchecked": "A session whose set-up was not checked, as OpenCV (rosdep key python3-opencv) is missing.",
     "repeated_guess": "A second guess for a track; the first one stays.",
     "ids_reused": "A track whose views went over to another point; the older views keep theirs under another id.",
+    "repeated_factor": "A second relative pose of the same keyframes, or gravity at the same; the first one stays.",
+    "no_fix": "A message of a receiver that has no fix.",
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
     "empty_tracks": "A tracks message without rows.",
     "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
@@ -62,6 +70,7 @@ WARNINGS: dict[str, str] = {
     "frame_name": "The fixed frame of the keyframes has no name, or one that tf2 refuses.",
     "equal_stamps": "Two keyframes have one stamp.",
     "reused_id": "An id was used for a second keyframe of the session.",
+    "no_geo": "Fixes of GNSS are left out, as pymap3d is missing.",
     "setup": "A set-up that the tracks contradict: the likely mistake, and what to change. All solves are held.",
 }
 

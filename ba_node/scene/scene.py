@@ -13,11 +13,29 @@ import numpy as np
 from ba_node.arrays import BoolArray, IntArray
 from ba_node.config import SceneConfig
 from ba_node.core.problem import Cameras
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import (
+    CameraRig,
+    FeatureTracks,
+    GlobalFix,
+    GravityDirection,
+    Keyframe,
+    LandmarkGuesses,
+    LandmarkPriors,
+    Measurement,
+    OfSession,
+    OfTime,
+    PosePrior,
+    RelativePose,
+    TrackMerge,
+)
 from ba_node.scene import ingest
+from ba_node.scene.constraints import Constraints
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
+
+# Standard deviation of a fix that tells none, m.
+_FIX_SIGMA_M = 5.0
 
 
 class Scene(MapTables):
@@ -32,12 +50,16 @@ class Scene(MapTables):
         self.refused_rig = ""  # why the last rig that was refused was, empty if none was
         self.log = RejectionLog()  # what was turned away
         self.pending: list[FeatureTracks] = []
+        self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()
 
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement of this session (or a rig); what cannot be used is counted."""
         if isinstance(measurement, CameraRig):
             self._set_rig(measurement)
+            return
+        if isinstance(measurement, OfTime):
+            self._add_absolute(measurement)
             return
         if self.session_id is not None and measurement.session_id != self.session_id:
             if isinstance(measurement, Keyframe) and ingest.keyframe_pose(measurement, self.log) is None:
@@ -54,17 +76,33 @@ class Scene(MapTables):
             if tracks is not None:
                 self.log.notice("empty_tracks", len(measurement.track_id) == 0)
                 self._place(tracks)
-        else:
+        elif isinstance(measurement, LandmarkGuesses):
             self._add_guesses(measurement)
+        else:
+            self._add_constraint(measurement)
 
-    def usable(self, measurement: Keyframe | FeatureTracks | LandmarkGuesses) -> bool:
+    def _add_absolute(self, measured: PosePrior | GlobalFix) -> None:
+        if isinstance(measured, PosePrior):
+            self.constraints.add_pose(measured, self.log)
+        else:
+            self.constraints.add_fix(measured, _FIX_SIGMA_M, self.log)
+
+    def _add_constraint(self, measured: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> None:
+        if isinstance(measured, RelativePose):
+            self.constraints.add_relative(measured, self.log)
+        elif isinstance(measured, GravityDirection):
+            self.constraints.add_gravity(measured, self.log)
+        elif isinstance(measured, LandmarkPriors):
+            self.constraints.add_landmarks(measured, self.log)
+
+    def usable(self, measurement: Keyframe | OfSession) -> bool:
         """Return True if anything of a measurement passes the checks it can be given by itself; count nothing."""
         log = RejectionLog()
         if isinstance(measurement, Keyframe):
             return ingest.keyframe_pose(measurement, log) is not None
         if isinstance(measurement, FeatureTracks):
             return ingest.clean_tracks(measurement, log) is not None
-        return ingest.clean_guesses(measurement, log) is not None
+        return not isinstance(measurement, LandmarkGuesses) or ingest.clean_guesses(measurement, log) is not None
 
     def refuse(self, refusal: Refusal) -> None:
         """Turn away what was held, and the tracks that wait for it."""
@@ -91,6 +129,7 @@ class Scene(MapTables):
         for tracks in self.pending:
             self._reject_waiting(tracks)
         self.pending = []
+        self.constraints.reject_unknown(self.keyframes.keyframe_id, self.log)
 
     def _set_rig(self, rig: CameraRig) -> None:
         cameras = ingest.rig_cameras(rig, self.log)

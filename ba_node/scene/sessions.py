@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement, OfSession, OfTime
 from ba_node.scene import ingest
 from ba_node.scene.candidates import (
     NS,
@@ -83,7 +83,7 @@ class Sessions:
 
     def decide(self, scene: Scene, measurement: Measurement) -> Decision:
         """Return what becomes of a measurement."""
-        if isinstance(measurement, CameraRig):
+        if isinstance(measurement, CameraRig | OfTime):
             return Decision(self.state, (Admitted(measurement),))
         if isinstance(measurement, Keyframe):
             return self._keyframe(scene, measurement)
@@ -242,20 +242,20 @@ class Sessions:
         given_up = Decision(dataclasses.replace(state, candidate=None, distrust=worse), (Admitted(keyframe),))
         return dropped(doubted, given_up)
 
-    def _wait(self, scene: Scene, item: FeatureTracks | LandmarkGuesses) -> Decision:
+    def _wait(self, scene: Scene, item: OfSession) -> Decision:
         """Let tracks and guesses wait for the first keyframe of their session."""
         waiting, n = (*self.state.waiting, item), scene.config.max_pending
         refused = tuple(never_began(one) for one in waiting[:-n])
         return Decision(dataclasses.replace(self.state, waiting=waiting[-n:]), (), refused)
 
-    def _of_current(self, scene: Scene, item: FeatureTracks | LandmarkGuesses) -> Decision:
+    def _of_current(self, scene: Scene, item: OfSession) -> Decision:
         """Take in tracks and guesses, but hold those that belong to a keyframe that is held under a known id."""
         candidate = self.state.candidate
         taken = Decision(self.state, (Admitted(item),))
         if candidate is None or candidate.kind is Kind.HIGHER or item.session_id != scene.session_id:
             return taken
-        is_guess = isinstance(item, LandmarkGuesses)
-        theirs = bool(candidate.run) if isinstance(item, LandmarkGuesses) else _is_theirs(scene, candidate, item)
+        is_guess = not isinstance(item, FeatureTracks)
+        theirs = _is_theirs(scene, candidate, item) if isinstance(item, FeatureTracks) else bool(candidate.run)
         if not theirs or len(candidate.items) >= scene.config.max_pending:
             return taken
         held = dataclasses.replace(candidate, items=(*candidate.items, item))

@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry, objective, triangulation
 from ba_node.core.problem import Problem, State
@@ -105,12 +106,62 @@ def errors_px(scene: Scene, config: Config, state: str, *, outliers: bool = True
     return _in_front(_all_errors(scene, config, state, outliers=outliers))
 
 
+@dataclass(frozen=True)
+class Residuals:
+    """How well a map explains each of its observations of tracks with two views, and what its tracks are like."""
+
+    error: FloatArray  # (n, 2) predicted minus measured, px; NaN where the point is not in front
+    uv: FloatArray  # (n, 2) measured, px
+    sigma_px: FloatArray  # (n,) standard deviation of u and of v, px
+    camera: IntArray  # (n,) index into the rig
+    keyframe: IntArray  # (n,) place of the keyframe, oldest first
+    outlier: BoolArray  # (n,) True where it sits out the next solve
+    views: IntArray  # (n_pt,) observations of each track
+    parallax_deg: FloatArray  # (n_pt,) largest angle between two of its rays, deg; NaN where that is not known
+
+    @classmethod
+    def none(cls) -> Residuals:
+        """Return those of a map without observations."""
+        few, whole = np.empty(0), np.empty(0, np.intp)
+        return cls(np.empty((0, 2)), np.empty((0, 2)), few, whole, whole, np.empty(0, bool), whole, few)
+
+
+def residuals(scene: Scene, config: Config, state: str) -> Residuals:
+    """Return the residuals of all observations, outliers too.
+
+    Args: as of :func:`errors_px`.
+    """
+    problem, rows, error = _evaluated(scene, config, state, outliers=True)
+    if problem is None:
+        return Residuals.none()
+    obs = problem.observations
+    found = triangulation.triangulate(triangulation.rays_of(problem), problem.n_points)
+    return Residuals(
+        error,
+        obs.uv,
+        obs.sigma_px,
+        obs.camera,
+        obs.keyframe,
+        np.asarray(scene.observations.outlier[rows]),
+        np.bincount(obs.point, minlength=problem.n_points),
+        np.degrees(found.parallax_rad),
+    )
+
+
 def _all_errors(scene: Scene, config: Config, state: str, *, outliers: bool) -> FloatArray:
     """Return the same with NaN for those whose point is not in front."""
+    return _evaluated(scene, config, state, outliers=outliers)[2]
+
+
+def _evaluated(
+    scene: Scene, config: Config, state: str, *, outliers: bool
+) -> tuple[Problem | None, IntArray, FloatArray]:
+    """Return the problem of the observations, their rows in the scene, and the errors; no problem without any."""
     if state not in STATES:
         raise ValueError(f"state {state!r}: expected one of {', '.join(STATES)}")
+    none = None, np.empty(0, np.intp), np.empty((0, 2))
     if scene.cameras is None or len(scene.keyframes) == 0:
-        return np.empty((0, 2))
+        return none
     table = scene.landmarks
     seen_twice = table.views >= 2
     if not scene.keyframes.refined.any() and not table.has_position.any():
@@ -123,13 +174,13 @@ def _all_errors(scene: Scene, config: Config, state: str, *, outliers: bool) -> 
     if not outliers:
         rows = rows[~scene.observations.outlier[rows]]
     if not len(rows):
-        return np.empty((0, 2))
+        return none
     origin = scene.keyframes.position[scene.order[0]]
     positions = table.position[landmarks] - origin
     problem = problem_of(scene, rows, scene.order, landmarks, origin, positions, config)
     if state == "refined":
-        return objective.reprojection_errors(problem, problem.start)
-    return _input_errors(scene, problem, table.guess[landmarks] - origin, origin)
+        return problem, rows, objective.reprojection_errors(problem, problem.start)
+    return problem, rows, _input_errors(scene, problem, table.guess[landmarks] - origin, origin)
 
 
 def _input_errors(scene: Scene, problem: Problem, guess: FloatArray, origin: FloatArray) -> FloatArray:

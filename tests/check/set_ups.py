@@ -211,9 +211,14 @@ WRONG: dict[str, Wrong] = {
     "depth in mm": images(lambda one: dataclasses.replace(one, depth_m=1000.0 * one.depth_m)),
     "depth in cm": images(lambda one: dataclasses.replace(one, depth_m=100.0 * one.depth_m)),
     "depth in km": images(lambda one: dataclasses.replace(one, depth_m=0.001 * one.depth_m)),
+    "depth times 1.1": images(lambda one: dataclasses.replace(one, depth_m=1.1 * one.depth_m)),
     "inverse depth": images(lambda one: dataclasses.replace(one, depth_m=1.0 / one.depth_m)),
     "normalised": images(lambda one: dataclasses.replace(one, uv=(one.uv - [320.0, 240.0]) / 349.0)),
     "slots": _slots,
+    "ids modulo 200": images(lambda one: dataclasses.replace(one, track_id=one.track_id % np.uint64(200))),
+    "rows for ids": images(
+        lambda one: dataclasses.replace(one, track_id=np.arange(len(one.track_id), dtype=np.uint64))
+    ),
     "ids of each camera": images(
         lambda one: dataclasses.replace(one, track_id=one.track_id + np.uint64(37 * one.camera_index))
     ),

@@ -55,10 +55,13 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "depth in mm": (("rgbd",), "depth_m in millimetres"),
     "depth in cm": (("rgbd",), "depth_m in centimetres"),
     "depth in km": (("rgbd",), "depth_m in kilometres"),
+    "depth times 1.1": (("rgbd",), r"scale of depth_m: it is 1\.(09|1[0-2]?) times"),
     "inverse depth": (("rgbd",), "depth_m holds inverse depths"),
     "normalised": (("stereo", "mono"), "image coordinates are not in pixels"),
     "ids of each camera": (("stereo",), "track ids of cameras 0 and 1 do not name the same points"),
     "slots": (("stereo", "mono"), "ids reused"),
+    "ids modulo 200": (("stereo", "mono", "rgbd"), "ids reused"),
+    "rows for ids": (("stereo", "mono", "rgbd"), "ids reused"),
     "stamps in us": (("mono",), "stamps in another unit.*microseconds"),
     "stamps in ms": (("mono",), "stamps in another unit.*milliseconds"),
 }
@@ -69,7 +72,9 @@ CASES = [(wrong, mode) for wrong, (modes, _) in NAMED.items() for mode in modes]
 def test_mistake_is_named(wrong: str, mode: str) -> None:
     found = examine(seen(recording(wrong=wrong, mode=mode)))
     assert re.search(NAMED[wrong][1], found.causes()), found.summary()
-    assert found.harmful == (wrong != "slots" and not wrong.startswith("stamps"))
+    assert found.harmful == (
+        wrong not in ("slots", "ids modulo 200", "rows for ids") and not wrong.startswith("stamps")
+    )
     assert all(finding.changes for finding in found.findings)
 
 

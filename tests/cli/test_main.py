@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ba_node.cli import checkout
-from ba_node.cli.main import COMMANDS, main
+from ba_node.cli.main import COMMANDS, GROUPS, main
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
@@ -51,8 +52,26 @@ def test_overview_names_every_command_and_is_fast() -> None:
         check=True,
     )
     assert all(f"    {command} " in run.stdout for command in COMMANDS)
+    assert [line[:-1] for line in run.stdout.splitlines() if line[:-1] in GROUPS] == [*GROUPS]
     slow = [name for name in ("numpy", "scipy", "rosbags", "mcap", "rclpy") if f"| {name}\n" in run.stderr]
     assert not slow, f"ba --help imports {slow}, {time.perf_counter() - began:.2f} s"
+
+
+@pytest.mark.parametrize(
+    ("line", "among"),
+    [
+        ("ba re", ["replay"]),
+        ("ba replay --fi", ["--final-optimize"]),
+        ("ba evaluate a.tum b.tum --align s", ["se3", "sim3"]),
+    ],
+)
+def test_a_shell_completes_commands_options_and_values(line: str, among: list[str], tmp_path: Path) -> None:
+    answer = tmp_path / "answer"
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(answer)}
+    place = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9", "_ARGCOMPLETE_SHELL": "bash"}
+    environment = {**os.environ, **asked, **place}
+    subprocess.run([sys.executable, "-m", "ba_node.cli.main"], env=environment, check=True, timeout=60)
+    assert set(among) <= {word.strip() for word in answer.read_text().splitlines()}
 
 
 @pytest.mark.parametrize(

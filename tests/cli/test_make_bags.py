@@ -94,7 +94,7 @@ def test_convert_keeps_the_geometry(bal_file: Path, tmp_path: Path) -> None:
 
 def test_convert_refuses_what_it_cannot_do(bal_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(bal_file), str(tmp_path / "b.bag")]) == 2
-    assert "recordings are written as .mcap" in capsys.readouterr().err
+    assert "which format is this to be? Give --to, a name that ends in .mcap, .out" in capsys.readouterr().err
     text = bal_file.read_text().splitlines()
     text[1 + 120 + 6] = "-500.0"
     bad = tmp_path / "bad.txt"

@@ -38,7 +38,9 @@ def test_numbers_worked_out_by_hand() -> None:
     assert summary.max == pytest.approx(5.0)
     assert summary.rmse == pytest.approx(np.sqrt(30 / 4))
     assert summary.std == pytest.approx(np.sqrt(30 / 4 - 4))
-    assert set(summary.as_dict()) == {"rmse", "mean", "median", "max", "std", "count"}
+    assert summary.sse == pytest.approx(30.0)
+    assert summary.min == 0.0
+    assert set(summary.as_dict()) == {"rmse", "mean", "median", "max", "std", "count", "min", "sse"}
 
 
 def test_rotation_error_is_the_angle_between_the_poses() -> None:

@@ -17,12 +17,21 @@ from hypothesis.extra.numpy import arrays
 from ba_node.config import OutputConfig
 from ba_node.estimate import Cloud, Estimate, Poses, Status
 from ba_node.io.ros_types import decode
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.measurements import (
+    CameraRig,
+    FeatureTracks,
+    Keyframe,
+    LandmarkGuesses,
+    LandmarkPriors,
+    Measurement,
+    TrackMerge,
+)
 from ba_node.messages.conversion import (
     guesses_message,
     keyframe_message,
     measurement_from_message,
     rig_message,
+    side_message,
     tracks_message,
 )
 from ba_node.messages.factory import ConversionError, stamp_ns_from_message
@@ -84,6 +93,35 @@ def test_measurements_survive_the_way_through_messages(
         assert_same(measurement, measurement_from_message(INPUT_TYPES[topic], message))
     assert messages["feature_tracks"][1].header.frame_id == "left_optical"
     assert not messages["keyframes"][1].pose.covariance.any()
+
+
+def test_what_is_known_beside_pixels_survives_too(beside_pixels: list[Measurement]) -> None:
+    seen = set()
+    for measurement in beside_pixels:
+        topic, message = side_message(FACTORY, measurement, 5, "base_link")
+        assert message.type_name == INPUT_TYPES[topic]
+        assert_same(measurement, measurement_from_message(INPUT_TYPES[topic], message))
+        seen.add(topic)
+    assert seen == {"relative_poses", "landmark_priors", "track_merges", "gravity", "pose_prior", "gnss"}
+
+
+def test_a_covariance_of_a_keyframe_is_read_and_all_zero_is_unknown(keyframe: Keyframe) -> None:
+    told = dataclasses.replace(keyframe, covariance=np.arange(36.0))
+    for one in (keyframe, told):
+        assert_same(one, measurement_from_message(INPUT_TYPES["keyframes"], keyframe_message(FACTORY, one)))
+
+
+def test_arrays_of_priors_and_merges_that_do_not_fit_are_named(beside_pixels: list[Measurement]) -> None:
+    _, priors = side_message(FACTORY, beside_pixels[1])
+    priors.covariance = priors.covariance[:-1]
+    found = measurement_from_message(INPUT_TYPES["landmark_priors"], priors)
+    assert isinstance(found, LandmarkPriors)
+    assert found.malformed.startswith("2 tracks, 6 coord")
+    _, merge = side_message(FACTORY, beside_pixels[2])
+    merge.same_as = merge.same_as[:-1]
+    found = measurement_from_message(INPUT_TYPES["track_merges"], merge)
+    assert isinstance(found, TrackMerge)
+    assert found.malformed.startswith("track_id has 2 entries")
 
 
 def test_lone_camera_is_a_rig_of_one_at_the_origin(rig: CameraRig) -> None:

@@ -18,11 +18,12 @@ from ba_node.config import Config
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.bal import read_bal
 from ba_node.io.mcap import BagReader
+from ba_node.io.model import from_bal
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.outputs import POINT_DTYPE
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
-from ba_node.offline.bal_timeline import timeline
+from ba_node.offline.model_timeline import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
@@ -215,9 +216,10 @@ def test_kitti_stereo(shared_data: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ladybug_as_a_recording(shared_data: Path, tmp_path: Path) -> None:
     bag = tmp_path / "ladybug.mcap"
-    record(bag, timeline(read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt")))
+    record(bag, timeline(from_bal(read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt"))))
     with BagReader(bag) as reader:
-        assert set(reader.topics.values()) == set(INPUT_TYPES.values()) - {INPUT_TYPES["camera_info"]}
+        names = ("camera_rig", "keyframes", "feature_tracks", "landmark_guesses")
+        assert set(reader.topics.values()) == {INPUT_TYPES[name] for name in names}
     report = replay(bag, tmp_path / "out", Config())
     trajectory = read_tum(tmp_path / "out" / "trajectory.tum")
     assert report["keyframes_refined"] == len(trajectory) == 49

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from ba_node.config import Config
 from ba_node.estimate import Estimate
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.conversion import (
     guesses_message,
     keyframe_message,
     measurement_from_message,
     rig_message,
+    side_message,
     tracks_message,
 )
 from ba_node.messages.outputs import output_messages
@@ -45,14 +47,19 @@ def test_an_unknown_type_is_named(name: str) -> None:
 
 
 def test_inputs_survive_the_wire(
-    keyframe: Keyframe, tracks: FeatureTracks, guesses: LandmarkGuesses, rig: CameraRig
+    keyframe: Keyframe,
+    tracks: FeatureTracks,
+    guesses: LandmarkGuesses,
+    rig: CameraRig,
+    beside_pixels: list[Measurement],
 ) -> None:
-    sent = {
+    sent: dict[str, tuple[Measurement, Any]] = {
         "keyframes": (keyframe, keyframe_message(FACTORY, keyframe)),
         "feature_tracks": (tracks, tracks_message(FACTORY, tracks, 5, "left_optical")),
         "landmark_guesses": (guesses, guesses_message(FACTORY, guesses, 5, "map")),
         "camera_rig": (rig, rig_message(FACTORY, rig, 5)),
     }
+    sent |= {topic: (one, message) for one in beside_pixels for topic, message in [side_message(FACTORY, one)]}
     for topic, (measurement, message) in sent.items():
         kind = INPUT_TYPES[topic]
         received = deserialize_message(serialize_message(message), message_class(kind))

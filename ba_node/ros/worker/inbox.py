@@ -8,18 +8,19 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from ba_node.backend import Backend
 from ba_node.estimate import Estimate
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement, OfSession, OfTime
 
 # What it returns is published.
 Command = Callable[[Backend], Estimate | None]
 
 # What is given up first when the inbox is full. A keyframe without some of its tracks still moves;
 # tracks without their keyframe, or anything without cameras, are worth nothing.
-_DROP_ORDER = (FeatureTracks, LandmarkGuesses, Keyframe, CameraRig)
+_FIRST, _LAST = (FeatureTracks, LandmarkGuesses), (Keyframe, CameraRig)
+_DROP_ORDER = (*_FIRST, *(kind for kind in get_args(OfTime | OfSession) if kind not in _FIRST), *_LAST)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement, OfSession
 from experiments.robustness.faults.recording import Entry, Recording
 
 _RESTART_NS = 10**9
@@ -51,7 +51,7 @@ def session_lowered(recording: Recording, amount: float, _rng: np.random.Generat
     first, second = 10, max(0, 10 - int(amount))
     seen = 0
 
-    def session(measurement: Keyframe | FeatureTracks | LandmarkGuesses) -> int:
+    def session(measurement: Measurement) -> int:
         nonlocal seen
         seen += isinstance(measurement, Keyframe)
         return second if seen > half else first
@@ -59,7 +59,7 @@ def session_lowered(recording: Recording, amount: float, _rng: np.random.Generat
     timeline: list[Entry] = []
     for topic, time_ns, measurement in recording.timeline:
         moved = measurement
-        if not isinstance(measurement, CameraRig):
+        if isinstance(measurement, Keyframe | OfSession):
             moved = dataclasses.replace(measurement, session_id=session(measurement))
         timeline.append((topic, time_ns, moved))
     return dataclasses.replace(recording, timeline=tuple(timeline))

@@ -20,10 +20,11 @@ from rosgraph_msgs.msg import Clock
 from ba_node.config import Config
 from ba_node.io.bal import read_bal
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.model import from_bal
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.topics import CAMERAS, INPUT_TYPES
-from ba_node.offline.bal_timeline import timeline
+from ba_node.offline.model_timeline import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.ros import qos
@@ -207,7 +208,7 @@ def test_a_whole_map_comes_back_as_in_a_replay(
 ) -> None:
     """Ladybug-49: 49 cameras, one a keyframe. The node gives the topics of a replay, and every keyframe finite."""
     bag = tmp_path / "ladybug.mcap"
-    record(bag, timeline(read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt")))
+    record(bag, timeline(from_bal(read_bal(shared_data / "ladybug-49-7776" / "problem-49-7776-pre.txt"))))
     assert replay(bag, tmp_path / "out", Config())["keyframes_refined"] == 49
     with BagReader(tmp_path / "out" / "refined.mcap") as offline:
         wanted = dict(offline.topics)

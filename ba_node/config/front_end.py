@@ -1,0 +1,57 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Declare how images become keyframes and tracks: options of ``ba track``, ``ba run`` and the node ``ba_front_end``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ba_node.config.declaration import Checked, option
+
+
+@dataclass(frozen=True)
+class FrontEndOptions(Checked):
+    """Options of the front-end. A value of the wrong type or out of range raises ConfigError."""
+
+    max_features: int = option(800, "Most features that are followed at a time.", within=(50, 10_000))
+    patch_px: int = option(21, "Side of the square of pixels that is compared around a feature.", within=(7, 63))
+    max_error_px: float = option(
+        2.0,
+        "A feature farther than this from where its point should appear is an outlier.",
+        unit="px",
+        within=(0.1, 100.0),
+    )
+    sigma_px: float = option(
+        0.15, "Least standard deviation of a feature; noise and blur come on top.", unit="px", within=(0.01, 10.0)
+    )
+    keyframe_parallax_px: float = option(
+        16.0,
+        "An image becomes a keyframe when features have moved this far since the last one (median), turning left out.",
+        unit="px",
+        within=(1.0, 1000.0),
+    )
+    keyframe_min_shared: float = option(
+        0.6, "Or when a smaller share of the last keyframe's features is still seen.", within=(0.0, 1.0)
+    )
+    min_points: int = option(
+        15, "Fewest features that must agree with a pose; with less the image is lost.", within=(6, 1000)
+    )
+    max_lost: int = option(
+        10, "After so many images in a row without a pose a new session begins.", within=(1, 100_000)
+    )
+    max_gap_s: float = option(
+        2.0,
+        "A new session begins where stamps are further apart and what was seen before is not found again.",
+        unit="s",
+        within=(0.01, 1e6),
+    )
+    max_skew_s: float = option(
+        0.005,
+        "Left and right image, or image and depth, whose stamps differ by more are no pair.",
+        unit="s",
+        within=(0.0, 1.0),
+    )
+    min_depth_m: float = option(0.2, "Points nearer than this are not taken.", unit="m", within=(1e-3, 1e3))
+    max_depth_m: float = option(
+        0.0, "Depths of a depth camera beyond this are not taken; 0 takes all.", unit="m", within=(0.0, 1e4)
+    )

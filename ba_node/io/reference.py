@@ -1,0 +1,137 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read a trajectory to compare with: TUM, KITTI, EuRoC's CSV, or a topic of poses in a recording.
+
+KITTI has no stamps: such a file is compared pose by pose in its order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ba_node.core.geometry import quaternion_from_matrix
+from ba_node.estimate import Poses
+from ba_node.io.files import open_regular
+from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.trajectory import MAX_BYTES, TrajectoryError, read_tum
+from ba_node.messages.factory import stamp_ns_from_message
+
+# Topics of these types hold poses; what gives the stamped poses of a message.
+_POSES: dict[str, Callable[[Any], Iterator[tuple[Any, Any]]]] = {
+    "geometry_msgs/msg/PoseStamped": lambda message: iter([(message.header, message.pose)]),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: iter([(message.header, message.pose.pose)]),
+    "nav_msgs/msg/Odometry": lambda message: iter([(message.header, message.pose.pose)]),
+    "nav_msgs/msg/Path": lambda message: ((one.header, one.pose) for one in message.poses),
+}
+_RECORDINGS = (".mcap", ".db3", ".zstd")
+_TRUTH = "ground_truth/pose"
+_MAX_MESSAGES = 10**6
+# A KITTI file has no stamps: poses are numbered, a second apart.
+_SECOND_NS = 1_000_000_000
+
+
+def read_pair(estimate: Path, reference: Path, topic: str = "") -> tuple[Poses, Poses]:
+    """Return two trajectories to be paired by stamp; ``topic`` is that of a recording.
+
+    Raises:
+        TrajectoryError: one cannot be read, or has no stamps and another number of poses than the other.
+        BagError: a recording cannot be read.
+    """
+    (ours, stamped), (theirs, also) = (_read(path, topic) for path in (estimate, reference))
+    if stamped and also:
+        return ours, theirs
+    if len(ours) != len(theirs):
+        raise TrajectoryError(
+            f"{estimate if also else reference}: {len(ours)} and {len(theirs)} poses, of which one file has no stamps"
+            " (KITTI): such are compared in their order, which needs as many in both"
+        )
+    if stamped:
+        return ours, dataclasses.replace(theirs, stamp_ns=ours.stamp_ns)
+    return dataclasses.replace(ours, stamp_ns=theirs.stamp_ns), theirs
+
+
+def read_poses(path: Path, topic: str = "") -> Poses:
+    """Return a trajectory of any of the formats, numbered from 0.
+
+    Raises:
+        TrajectoryError: it cannot be read.
+        BagError: the recording cannot be read, or has no such topic.
+    """
+    return _read(path, topic)[0]
+
+
+def _read(path: Path, topic: str) -> tuple[Poses, bool]:
+    """Return a trajectory, and whether it has stamps."""
+    if path.is_dir() or path.suffix in _RECORDINGS:
+        return _read_topic(path, topic), True
+    columns = first_line(path)
+    if "," in columns:
+        return _read_table(path, ",", 8, "stamp[ns],x,y,z,qw,qx,qy,qz,... (EuRoC)"), True
+    if len(columns.split()) == 12:
+        return _read_table(path, None, 12, "the first three rows of a pose (KITTI)"), False
+    return read_tum(path), True
+
+
+def first_line(path: Path) -> str:
+    """Return the first line of a file that is no comment, empty if it has none or cannot be read."""
+    try:
+        with open_regular(path, MAX_BYTES) as stream:
+            lines = (line.decode(errors="replace").strip() for line in itertools.islice(stream, 1000))
+            return next((line for line in lines if line and not line.startswith("#")), "")
+    except (OSError, ValueError):
+        return ""  # read_tum says what is wrong
+
+
+def _read_table(path: Path, separator: str | None, width: int, expected: str) -> Poses:
+    with open_regular(path, MAX_BYTES) as stream:
+        lines = stream.read().decode(errors="replace").splitlines()
+    rows: list[list[float]] = []
+    stamps: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = line.split(separator)
+        try:
+            stamps.append(int(words[0]) if separator else _SECOND_NS * len(stamps))
+            rows.append([float(word) for word in words[:width]])
+        except ValueError:
+            raise TrajectoryError(f"{path}:{number}: {line[:60]!r} is no row of numbers: expected {expected}") from None
+        if len(rows[-1]) < width or (separator is None and len(words) > width) or not np.isfinite(rows[-1]).all():
+            raise TrajectoryError(f"{path}:{number}: expected {width} finite numbers: {expected}")
+    values = np.array(rows)
+    if separator:
+        position, orientation = values[:, 1:4], values[:, [5, 6, 7, 4]]
+    else:
+        matrix = values.reshape(-1, 3, 4)
+        position, orientation = matrix[:, :, 3], quaternion_from_matrix(matrix[:, :, :3])
+    if (np.linalg.norm(orientation, axis=1) == 0.0).any():
+        raise TrajectoryError(f"{path}: a quaternion is zero: expected {expected}")
+    return Poses(np.arange(len(rows), dtype=np.uint64), np.array(stamps, dtype=np.int64), position, orientation)
+
+
+def _read_topic(path: Path, topic: str) -> Poses:
+    with BagReader(path) as reader:
+        found = {name: kind for name, kind in reader.topics.items() if kind in _POSES}
+        wanted = [name for name in found if name.lstrip("/") == topic.lstrip("/")]
+        if not topic:
+            wanted = [name for name in found if f"/{name}".endswith(f"/{_TRUTH}")] or list(found)
+        if len(wanted) != 1:
+            there = ", ".join(sorted(found)) or "none"
+            raise BagError(f"{path}: name the topic of the reference with --reference-topic; topics of poses: {there}")
+        poses: dict[int, tuple[float, ...]] = {}
+        for name, kind, _, data in itertools.islice(reader.messages(wanted), _MAX_MESSAGES):
+            for header, pose in _POSES[kind](reader.decode(name, data)):
+                position, turn = pose.position, pose.orientation
+                row = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
+                poses[stamp_ns_from_message(header.stamp)] = row
+    if not poses:
+        raise BagError(f"{path}: topic {wanted[0]} holds no pose")
+    values = np.array(list(poses.values()))
+    stamps = np.array(list(poses), dtype=np.int64)
+    return Poses(np.arange(len(stamps), dtype=np.uint64), stamps, values[:, :3], values[:, 3:])

@@ -1,0 +1,269 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read and write rigs as YAML: our own form, Kalibr's camchain, and the camera_info of ROS's calibrator.
+
+Our own form has a row for each camera, `position` and `orientation` being those of body from camera optical frame::
+
+    frame_id: base_link
+    cameras:
+    - name: left
+      distortion_model: plumb_bob
+      intrinsics: [458.7, 457.3, 367.2, 248.4]    # fx fy cx cy, px
+      distortion: [-0.28, 0.07, 0.0002, 0.00002]
+      image_size: [752, 480]
+      position: [0.0, 0.0, 0.0]                   # m
+      orientation: [0.0, 0.0, 0.0, 1.0]           # x y z w
+
+Kalibr has ``T_cam_imu`` (camera from IMU) or, without an IMU, ``T_cn_cnm1`` (camera n from camera n - 1); the body is
+the IMU or the first camera. Of camera_info, one file is one camera; of two the second is the right one of a pair.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ba_node.arrays import FloatArray
+from ba_node.core import geometry
+from ba_node.io.files import FileKindError
+from ba_node.io.yaml_file import YamlError, read_yaml
+from ba_node.measurements import CameraRig
+from ba_node.messages.factory import ConversionError
+from ba_node.messages.rig import rig_from_infos
+
+FORMS = ("own", "kalibr", "camera_info")
+# Kalibr's names of distortions, and ROS's.
+_KALIBR = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": ""}
+
+
+class RigError(ValueError):
+    """A file that holds no rig, or one that the form asked for cannot hold."""
+
+
+def read_rig(*paths: Path | str, rectified: bool = False) -> CameraRig:
+    """Return the rig in a file of any form, or in one camera_info file a camera, the left one first.
+
+    ``rectified``: take ``projection_matrix`` of camera_info files, for rectified images.
+
+    Raises:
+        RigError: a file cannot be read, or holds no rig; names the file and the entry.
+    """
+    contents = [_content(path) for path in paths]
+    where = ", ".join(str(path) for path in paths)
+    try:
+        if all("camera_matrix" in content for content in contents):
+            infos = [_info(content, f"camera{i}") for i, content in enumerate(contents)]
+            return rig_from_infos(infos, rectified=rectified)
+        if len(contents) > 1:
+            raise RigError("several files are one rig only as camera_info, one a camera")
+        if "cameras" in contents[0]:
+            return _from_own(contents[0])
+        if "cam0" in contents[0]:
+            return _from_kalibr(contents[0])
+    except KeyError as error:
+        raise RigError(f"{where}: entry {error.args[0]!r} is missing") from error
+    except (RigError, ConversionError) as error:
+        raise RigError(f"{where}: {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:  # whatever a wrong value leads numpy to
+        raise RigError(f"{where}: an entry is of the wrong kind: {error}") from error
+    raise RigError(
+        f"{where}: no rig: expected `cameras` (our own form), `cam0` (Kalibr) or `camera_matrix` (camera_info);"
+        f" there are: {', '.join(map(str, contents[0]))}"
+    )
+
+
+def rig_yaml(rig: CameraRig, form: str = "own") -> list[str]:
+    """Return the text of each file that holds a rig in one of :data:`FORMS`: one, or one a camera for camera_info.
+
+    Raises:
+        RigError: the form cannot say what the rig is.
+    """
+    if form == "own":
+        return [_dump({"frame_id": rig.frame_id, "cameras": [_own_row(rig, i) for i in range(len(rig))]})]
+    if form == "kalibr":
+        return [_dump({f"cam{i}": _kalibr_row(rig, i) for i in range(len(rig))})]
+    return [_dump(row) for row in _info_rows(rig)]
+
+
+def _content(path: Path | str) -> dict[Any, Any]:
+    try:
+        content = read_yaml(path)
+    except OSError as error:
+        raise RigError(f"{path}: cannot be opened: {error.strerror}") from error
+    except (YamlError, FileKindError) as error:
+        raise RigError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    if not isinstance(content, dict) or not content:
+        raise RigError(f"{path}: expected a mapping with a rig, got {type(content).__name__}")
+    return content
+
+
+def _from_own(content: Mapping[Any, Any]) -> CameraRig:
+    rows = content["cameras"]
+    return CameraRig(
+        frame_id=str(content["frame_id"]),
+        names=tuple(str(row["name"]) for row in rows),
+        models=tuple(str(row.get("distortion_model", "")) for row in rows),
+        intrinsics=_numbers(rows, "intrinsics", 4),
+        distortion=tuple(np.array(row.get("distortion", []), np.float64).reshape(-1) for row in rows),
+        image_size=_numbers(rows, "image_size", 2).astype(np.int64),
+        position=_numbers(rows, "position", 3),
+        orientation=_numbers(rows, "orientation", 4),
+    )
+
+
+def _numbers(rows: Sequence[Mapping[Any, Any]], name: str, size: int) -> FloatArray:
+    """Return an entry of each camera, (n, size)."""
+    for i, row in enumerate(rows):
+        values = np.array(row[name], np.float64)
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise RigError(f"camera {i}: {name} = {row[name]}: expected {size} finite numbers")
+    return np.array([row[name] for row in rows], np.float64).reshape(-1, size)
+
+
+def _from_kalibr(content: Mapping[Any, Any]) -> CameraRig:
+    names = list(itertools.takewhile(content.__contains__, (f"cam{i}" for i in range(len(content)))))
+    rows = [content[name] for name in names]
+    for name, row in zip(names, rows, strict=True):
+        if row["camera_model"] != "pinhole" or row["distortion_model"] not in _KALIBR:
+            model = f"{row['camera_model']}-{row['distortion_model']}"
+            raise RigError(f"{name}: {model}: expected pinhole with one of {', '.join(_KALIBR)}")
+    with_imu = all("T_cam_imu" in row for row in rows)
+    steps = [_pose(row, "T_cam_imu" if with_imu else "T_cn_cnm1", name) for name, row in zip(names, rows, strict=True)]
+    placed = list(steps if with_imu else itertools.accumulate(steps, lambda before, step: step @ before))
+    body_from_camera = np.linalg.inv(np.array(placed))
+    return CameraRig(
+        frame_id="imu" if with_imu else names[0],
+        names=tuple(names),
+        models=tuple(_KALIBR[row["distortion_model"]] for row in rows),
+        intrinsics=_numbers(rows, "intrinsics", 4),
+        distortion=tuple(np.array(row.get("distortion_coeffs") or [], np.float64) for row in rows),
+        image_size=_numbers(rows, "resolution", 2).astype(np.int64),
+        position=body_from_camera[:, :3, 3],
+        orientation=geometry.quaternion_from_matrix(body_from_camera[:, :3, :3]),
+    )
+
+
+def _pose(row: Mapping[Any, Any], key: str, name: str) -> FloatArray:
+    """Return a transform of Kalibr, (4, 4); the first camera has no camera before it."""
+    if key == "T_cn_cnm1" and name == "cam0":
+        return np.eye(4)
+    matrix = np.array(row[key], np.float64)
+    rigid = matrix.shape == (4, 4) and np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3)
+    if not rigid or np.linalg.det(matrix[:3, :3]) < 0.0:
+        raise RigError(f"{name}: {key} is no rigid transform of 4 x 4 numbers")
+    return np.block([[geometry.nearest_rotation(matrix[:3, :3]), matrix[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def _info(content: Mapping[Any, Any], name: str) -> SimpleNamespace:
+    """Return a camera_info file with the fields of the message."""
+
+    def data(key: str, default: Sequence[float]) -> FloatArray:
+        return np.array(content.get(key, {"data": default})["data"], np.float64).reshape(-1)
+
+    size = int(content["image_width"]), int(content["image_height"])
+    header = SimpleNamespace(frame_id=str(content.get("camera_name") or name))
+    return SimpleNamespace(
+        header=header,
+        width=size[0],
+        height=size[1],
+        k=data("camera_matrix", ()),
+        d=data("distortion_coefficients", ()),
+        r=data("rectification_matrix", np.eye(3).reshape(-1).tolist()),
+        p=data("projection_matrix", [0.0] * 12),
+        distortion_model=str(content.get("distortion_model", "")),
+        binning_x=0,
+        binning_y=0,
+    )
+
+
+def _own_row(rig: CameraRig, i: int) -> dict[str, Any]:
+    return {
+        "name": rig.names[i],
+        "distortion_model": rig.models[i],
+        "intrinsics": rig.intrinsics[i].tolist(),
+        "distortion": rig.distortion[i].tolist(),
+        "image_size": rig.image_size[i].tolist(),
+        "position": rig.position[i].tolist(),
+        "orientation": rig.orientation[i].tolist(),
+    }
+
+
+def _kalibr_row(rig: CameraRig, i: int) -> dict[str, Any]:
+    distortion = rig.distortion[i]
+    model = next((name for name, ours in _KALIBR.items() if ours == rig.models[i]), "")
+    if not distortion.any():
+        model, distortion = "none", distortion[:0]
+    elif not model or distortion[4:].any():
+        raise RigError(f"camera {rig.names[i]!r}: Kalibr has no {rig.models[i]} with {len(distortion)} coefficients")
+    row = {
+        "camera_model": "pinhole",
+        "intrinsics": rig.intrinsics[i].tolist(),
+        "distortion_model": model,
+        "distortion_coeffs": distortion[:4].tolist(),
+        "resolution": rig.image_size[i].tolist(),
+        "T_cam_imu": np.linalg.inv(_body_from_camera(rig, i)).tolist(),
+    }
+    if i > 0:
+        row["T_cn_cnm1"] = (np.linalg.inv(_body_from_camera(rig, i)) @ _body_from_camera(rig, i - 1)).tolist()
+    return row
+
+
+def _body_from_camera(rig: CameraRig, i: int) -> FloatArray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = geometry.matrix_from_quaternion(rig.orientation[i])
+    matrix[:3, 3] = rig.position[i]
+    return matrix
+
+
+def _info_rows(rig: CameraRig) -> list[dict[str, Any]]:
+    """Return a camera_info for each camera; where others sit relative to the first is in r and p (REP-104).
+
+    The rectified frame has its x axis from the first to the second camera, and its z axis as near as may be to that of
+    the first.
+    """
+    if len(rig) > 2:
+        raise RigError(f"camera_info says where one camera or the two of a pair sit, not {len(rig)}: choose own")
+    first_from = [np.linalg.inv(_body_from_camera(rig, 0)) @ _body_from_camera(rig, i) for i in range(len(rig))]
+    rectified = np.eye(3)
+    baseline = 0.0
+    if len(rig) == 2:
+        offset = first_from[1][:3, 3]
+        baseline = float(np.linalg.norm(offset))
+        if baseline == 0.0 or offset[0] <= np.abs(offset[1:]).max():
+            raise RigError(f"the second camera is at {offset} m from the first, not to its right: choose own")
+        y = np.cross([0.0, 0.0, 1.0], offset)
+        y /= np.linalg.norm(y)
+        rectified = np.array([offset / baseline, y, np.cross(offset / baseline, y)])
+    focal, centre = float(rig.intrinsics[0, 1]), rig.intrinsics[0, 2:].tolist()
+    rows = []
+    for i, pose in enumerate(first_from):
+        fx, fy, cx, cy = rig.intrinsics[i].tolist()
+        shift = -focal * baseline if i else 0.0
+        p = [focal, 0.0, centre[0], shift, 0.0, focal, centre[1], 0.0, 0.0, 0.0, 1.0, 0.0]
+        rows.append(
+            {
+                "image_width": int(rig.image_size[i, 0]),
+                "image_height": int(rig.image_size[i, 1]),
+                "camera_name": rig.names[i],
+                "camera_matrix": _matrix([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], 3),
+                "distortion_model": rig.models[i],
+                "distortion_coefficients": _matrix(rig.distortion[i].tolist(), 1),
+                "rectification_matrix": _matrix((rectified @ pose[:3, :3]).reshape(-1).tolist(), 3),
+                "projection_matrix": _matrix(p, 3),
+            }
+        )
+    return rows
+
+
+def _matrix(data: Sequence[float], rows: int) -> dict[str, Any]:
+    return {"rows": rows, "cols": len(data) // rows, "data": list(data)}
+
+
+def _dump(content: Mapping[str, Any]) -> str:
+    return str(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))

@@ -1,0 +1,352 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Draw the results of replays: each figure is data and layout as plotly.js takes them.
+
+The first run has the colours of before and after; where several stand side by side each has a colour of its own.
+Colours are those of Okabe and Ito, told apart by colour-blind readers.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.arrays import FloatArray
+from ba_node.estimate import Poses
+from ba_node.evaluation.alignment import EvaluationError
+from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Run
+
+TRUTH, BEFORE, CLOUD = "#000000", "#D55E00", "#9AA0A6"
+COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
+_BAD = {"HELD": "#E69F00", "FAILED": "#D55E00", "SKIPPED": "#9AA0A6"}
+# Points that are drawn at most, in space and from above, and residuals.
+_POINTS, _ABOVE, _ARROWS = 100_000, 6_000, 3_000
+# Beyond it a float32 has steps of more than a centimetre.
+_FAR = 1e5
+# Length of a drawn residual: the 90th percentile takes this share of the image's width.
+_ARROW_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a page."""
+
+    key: str  # name of its picture
+    title: str
+    caption: str
+    data: list[dict[str, Any]]  # traces, as of plotly.js
+    layout: dict[str, Any]
+    wide: bool = False  # takes the whole width
+
+
+def figures(runs: Sequence[Run]) -> list[Figure]:
+    """Return all figures that there is something to draw for."""
+    shown = [_Shown(run, COLOURS[n % len(COLOURS)], several=len(runs) > 1) for n, run in enumerate(runs)]
+    found = [make(shown) for make in _FIGURES]
+    return [figure for figure in found if figure.data]
+
+
+class _Shown:
+    """A run in its colour, with its errors."""
+
+    def __init__(self, run: Run, colour: str, *, several: bool) -> None:
+        self.run, self.colour, self.several = run, colour, several
+        self.before, self.after = (_error(poses, run.truth) for poses in (run.before, run.after))
+        self.details = run.details
+
+    def name(self, what: str) -> str:
+        return f"{self.run.name}: {what}" if self.several else what
+
+    def aligned(self, points: FloatArray, error: TrajectoryError | None) -> FloatArray:
+        return points if error is None else error.alignment.apply(points)
+
+    def seconds(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        return np.asarray((stamp_ns - self.run.after.stamp_ns[0]) * 1e-9)
+
+    @property
+    def solve_s(self) -> FloatArray:
+        return self.seconds(self.details["solve_stamp_ns"])
+
+
+def _error(poses: Poses, truth: Poses | None) -> TrajectoryError | None:
+    try:
+        return None if truth is None else absolute_error(poses, truth)
+    except EvaluationError:
+        return None
+
+
+def array(values: Any) -> dict[str, str]:
+    """Return numbers as plotly.js takes them: bytes in base64, of float32 where that is precise enough."""
+    values = np.asarray(values, float)
+    kind = "f8" if len(values) and np.nanmax(np.abs(values), initial=0.0) > _FAR else "f4"
+    return {"dtype": kind, "bdata": base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()}
+
+
+def line(x: Any, y: Any, name: str, colour: str, **more: Any) -> dict[str, Any]:
+    """Return a trace of lines and markers."""
+    style: dict[str, Any] = {"line": {"color": colour, "width": 1.8}, "marker": {"color": colour, "size": 4}}
+    return {"type": "scatter", "mode": "lines+markers", "x": array(x), "y": array(y), "name": name} | style | more
+
+
+def _paths(one: _Shown) -> list[tuple[str, FloatArray, str, str]]:
+    """Return name, positions, colour and dash of the trajectories of a run, in the frame of the truth if it has one."""
+    run = one.run
+    found = [("after", one.aligned(run.after.position, one.after), one.colour, "solid")]
+    if not one.several:
+        found.insert(0, ("before", one.aligned(run.before.position, one.before), BEFORE, "dash"))
+    if run.truth is not None and one.after is not None:
+        found.insert(0, ("reference", run.truth.position, TRUTH, "dot"))
+    return found
+
+
+def _above(shown: Sequence[_Shown]) -> Figure:
+    data: list[dict[str, Any]] = []
+    for number, one in enumerate(shown):
+        cloud = _few(one.aligned(one.run.cloud, one.after), _ABOVE)
+        if len(cloud) and number == 0:
+            low, high = np.percentile(cloud[:, :2], [0.5, 99.5], axis=0)
+            cloud = cloud[((cloud[:, :2] >= low) & (cloud[:, :2] <= high)).all(axis=1)]
+            marker = {"color": CLOUD, "size": 3, "opacity": 0.6}
+            data.append(line(cloud[:, 0], cloud[:, 1], "map", CLOUD, mode="markers", marker=marker, hoverinfo="skip"))
+        for name, path, colour, dash in _paths(one):
+            if name != "reference" or number == 0:
+                drawn = line(path[:, 0], path[:, 1], one.name(name), colour)
+                data.append(drawn | {"line": {"color": colour, "width": 2, "dash": dash}})
+    layout = {"xaxis": {"title": "x [m]"}, "yaxis": {"title": "y [m]", "scaleanchor": "x"}}
+    return Figure("above", "From above", "Trajectories, and points of the map.", data, layout)
+
+
+def _space(shown: Sequence[_Shown]) -> Figure:
+    data: list[dict[str, Any]] = []
+    for number, one in enumerate(shown):
+        cloud = _few(one.aligned(one.run.cloud, one.after), _POINTS)
+        for name, path, colour, dash in _paths(one):
+            if name != "reference" or number == 0:
+                style = {"mode": "lines", "line": {"color": colour, "width": 5, "dash": dash}}
+                data.append(_in_space(path, one.name(name)) | style)
+        if len(cloud):
+            marker = {"color": CLOUD if number == 0 else one.colour, "size": 1.5, "opacity": 0.6}
+            data.append(_in_space(cloud, one.name("map")) | {"mode": "markers", "marker": marker, "hoverinfo": "skip"})
+    axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
+    note = f" {_POINTS} of its points are drawn." if any(len(one.run.cloud) > _POINTS for one in shown) else ""
+    return Figure("space", "In space", f"Drag to turn.{note}", data, {"scene": axes | {"aspectmode": "data"}})
+
+
+def _in_space(points: FloatArray, name: str) -> dict[str, Any]:
+    x, y, z = (array(column) for column in points.T)
+    return {"type": "scatter3d", "x": x, "y": y, "z": z, "name": name}
+
+
+def _over_time(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    for one in shown:
+        for name, error, colour in (("before", one.before, BEFORE), ("after", one.after, one.colour)):
+            if error is not None and not (name == "before" and one.several):
+                data.append(line(one.seconds(error.stamp_ns), error.translation_m, one.name(name), colour))
+    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "position error [m]", "type": "log"}}
+    text = "Distance of each keyframe to the reference, after SE(3) alignment."
+    if not data:
+        for one in shown:
+            moved = np.linalg.norm(one.run.after.position - one.run.before.position, axis=1)
+            data.append(line(one.seconds(one.run.after.stamp_ns), moved, one.name("moved"), one.colour))
+        layout["yaxis"] = {"title": "moved by [m]", "rangemode": "tozero"}
+        text = "No reference to compare with: how far the adjustment moved each keyframe."
+    return Figure("error", "Error over time", text, data, layout)
+
+
+def _objective(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    for one in shown:
+        for name, key, colour in (("before", "objective_before", BEFORE), ("after", "objective_after", one.colour)):
+            if len(one.solve_s) and not (name == "before" and one.several):
+                values = np.where(one.details[key] > 0.0, one.details[key], np.nan)
+                data.append(line(one.solve_s, values, one.name(name), colour))
+    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "objective", "type": "log"}}
+    return Figure("objective", "Objective of each solve", "At its start and at its end.", data, layout)
+
+
+def _arrows(shown: Sequence[_Shown]) -> Figure:
+    """Draw the residuals of the first run as vectors, one image for each camera."""
+    details = shown[0].details
+    cameras = np.unique(details["camera"])[:4]
+    length = np.linalg.norm(details["error"][~details["outlier"]], axis=1)
+    width = float(np.ptp(details["uv"][:, 0])) if len(details["uv"]) else 1.0
+    scale = max(1.0, round(_ARROW_SHARE * width / max(float(np.percentile(length, 90)), 1e-3))) if len(length) else 1.0
+    data, layout = [], {}
+    for place, camera in enumerate(cameras):
+        axis = str(place + 1) if place else ""
+        for outlier, name, colour in ((False, "inliers", shown[0].colour), (True, "outliers", BEFORE)):
+            rows = np.flatnonzero((details["camera"] == camera) & (details["outlier"] == outlier))
+            rows = _few(rows, _ARROWS // len(cameras))
+            end = details["uv"][rows] + (scale if not outlier else 1.0) * details["error"][rows]
+            x, y = (_segments(details["uv"][rows, k], end[:, k]) for k in (0, 1))
+            drawn = line(x, y, name, colour, mode="lines", xaxis=f"x{axis}", yaxis=f"y{axis}")
+            drawn |= {"line": {"color": colour, "width": 1}, "showlegend": place == 0, "legendgroup": name}
+            data.append(drawn | {"visible": "legendonly" if outlier else True})
+        share = 1.0 / len(cameras)
+        low, high = details["uv"].min(axis=0), details["uv"].max(axis=0)
+        domain = [place * share, (place + 1) * share - (0.04 if len(cameras) > 1 else 0.0)]
+        layout[f"xaxis{axis}"] = {
+            "title": f"u [px], camera {camera}",
+            "domain": domain,
+            "range": [float(low[0]), float(high[0])],
+        }
+        layout[f"yaxis{axis}"] = {
+            "title": "v [px]" if place == 0 else "",
+            "anchor": f"x{axis}",
+            "scaleanchor": f"x{axis}",
+            "range": [float(high[1]), float(low[1])],
+        }
+    text = f"Predicted minus measured; inliers {scale:g} times as long as they are. A click on outliers shows them."
+    if len(shown) > 1:
+        text += f" Of {shown[0].run.name}."
+    return Figure("residuals", "Reprojection errors in the image", text, data if len(length) else [], layout, wide=True)
+
+
+def _segments(begin: FloatArray, end: FloatArray) -> FloatArray:
+    return np.stack([begin, end, np.full(len(begin), np.nan)], axis=1).ravel()
+
+
+def _histogram(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    middle, width = 0.5 * (BINS[1:] + BINS[:-1]), BINS[1] - BINS[0]
+    for one in shown:
+        count = one.details["histogram"]
+        if count.sum():
+            density = count / (count.sum() * width)
+            steps = {"line": {"shape": "hvh", "color": one.colour}, "fill": "none" if one.several else "tozeroy"}
+            data.append(line(middle, density, one.name("inliers"), one.colour, mode="lines") | steps)
+    if data:
+        gauss = np.exp(-0.5 * middle**2) / np.sqrt(2.0 * np.pi)
+        data.append(line(middle, gauss, "Gaussian", TRUTH, mode="lines") | {"line": {"color": TRUTH, "dash": "dot"}})
+    layout = {"xaxis": {"title": "residual along u and v [sigma]"}, "yaxis": {"title": "density"}}
+    text = "Wider than the Gaussian: sigma_px is too small, or the calibration is off; narrower: it is too large."
+    return Figure("histogram", "Residuals against the Gaussian", text, data, layout)
+
+
+def _tracks(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    for one in shown:
+        views, parallax = one.details["views"], one.details["parallax"]
+        length = np.arange(len(views))
+        style = {"marker": {"color": one.colour}, "legendgroup": one.run.name, "name": one.run.name}
+        data.append({"type": "bar", "x": array(length[2:]), "y": array(views[2:]), **style, "showlegend": False})
+        edges = np.maximum(PARALLAX_DEG, 0.03)
+        middle = np.sqrt(edges[1:] * edges[:-1])
+        bar = {"x": array(middle), "width": array(np.diff(edges)), "y": array(parallax), "xaxis": "x2", "yaxis": "y2"}
+        data.append({"type": "bar", **bar, **style, "showlegend": len(shown) > 1})
+    layout = {
+        "xaxis": {"title": "observations of a track", "domain": [0.0, 0.46]},
+        "yaxis": {"title": "tracks"},
+        "xaxis2": {"title": "parallax [deg]", "type": "log", "domain": [0.54, 1.0], "anchor": "y2"},
+        "yaxis2": {"anchor": "x2"},
+        "barmode": "group",
+    }
+    text = "Long tracks with parallax hold a map together; below a degree distances are not told."
+    return Figure("tracks", "Tracks: length and parallax", text, data, layout)
+
+
+def _health(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    for one in shown:
+        if len(one.solve_s):
+            data.append(line(one.solve_s, 100.0 * one.details["inlier_share"], one.name("inliers [%]"), one.colour))
+        if len(one.solve_s) and not one.several:
+            style = {"line": {"color": "#56B4E9", "dash": "dash"}, "yaxis": "y2", "marker": {"size": 3}}
+            data.append(line(one.solve_s, one.details["parallax_deg"], one.name("parallax"), "#56B4E9") | style)
+        for status, colour in _BAD.items():
+            rows = one.details["status"] == status
+            if rows.any():
+                marker = {"color": colour, "symbol": "x", "size": 10}
+                words = [f"{status}: {reason}" for reason in one.details["reason"][rows].tolist()]
+                drawn = line(one.solve_s[rows], np.full(rows.sum(), 100.0), one.name(status.lower()), colour)
+                data.append(drawn | {"mode": "markers", "marker": marker, "text": words, "hoverinfo": "text"})
+    layout = {
+        "xaxis": {"title": "time [s]"},
+        "yaxis": {"title": "inliers [%]", "range": [0, 105]},
+        "yaxis2": {
+            "title": "parallax [deg]",
+            "overlaying": "y",
+            "side": "right",
+            "showgrid": False,
+            "rangemode": "tozero",
+        },
+    }
+    text = "Share of a window's observations that agree with its solution, median parallax, and what the guard held."
+    return Figure("health", "Health of each window", text, data, layout)
+
+
+def _held_out(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    for one in shown:
+        for name, key, colour in (("before", "held_out_px_before", BEFORE), ("after", "held_out_px_after", one.colour)):
+            values = one.details[key] if len(one.solve_s) else np.empty(0)
+            if values.any() and not (name == "before" and one.several):
+                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
+    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "median residual [px]", "type": "log"}}
+    text = "Tracks that took no part in a solve, by the front-end's poses and by the solution."
+    return Figure("held_out", "Tracks held out", text, data, layout)
+
+
+def _latency(shown: Sequence[_Shown]) -> Figure:
+    data = []
+    for one in shown:
+        times = 1e3 * np.array(one.run.report.get("solve_times_s", []))
+        if times.any() and len(times) == len(one.solve_s):
+            p50, p95 = np.percentile(times, [50, 95])
+            name = one.name(f"median {p50:.1f} ms, p95 {p95:.1f} ms")
+            data.append(line(one.solve_s, times, name, one.colour, mode="markers"))
+    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "time of a solve [ms]", "rangemode": "tozero"}}
+    caption = "Time in the solver for each keyframe, on the machine of the replay."
+    return Figure("latency", "Latency", caption, data, layout)
+
+
+def _rejected(shown: Sequence[_Shown]) -> Figure:
+    data: list[dict[str, Any]] = []
+    for one in shown:
+        counts: Counter[str] = Counter(one.run.report["bag_rejected"])
+        counts.update(one.run.report["rejected"])
+        counts["outlier"] += one.run.report["outliers"]
+        rows = [(reason, count) for reason, count in sorted(counts.items()) if count]
+        if rows:
+            reasons, values = zip(*rows, strict=True)
+            bar = {"type": "bar", "orientation": "h", "x": list(values), "y": list(reasons), "text": list(values)}
+            data.append(bar | {"name": one.run.name, "marker": {"color": one.colour}})
+    layout = {"xaxis": {"title": "observations or messages"}, "yaxis": {"automargin": True}}
+    return Figure("rejected", "Left out, by reason", "What was turned away, and outliers.", data, layout)
+
+
+def _few(rows: NDArray[Any], most: int) -> NDArray[Any]:
+    """Return at most so many rows, evenly spread."""
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).astype(np.intp)]
+
+
+_FIGURES: tuple[Callable[[Sequence[_Shown]], Figure], ...] = (
+    _above,
+    _space,
+    _over_time,
+    _objective,
+    _arrows,
+    _histogram,
+    _tracks,
+    _health,
+    _held_out,
+    _latency,
+    _rejected,
+)
+
+
+def verdicts(report: Mapping[str, Any], details: Mapping[str, NDArray[Any]]) -> list[tuple[str, int]]:
+    """Return why solves were not taken, in words, and how many were for each reason; most first."""
+    bad = np.isin(details["status"], list(_BAD)) if report["solves"] else np.empty(0, bool)
+    words = zip(details["status"][bad].tolist(), details["reason"][bad].tolist(), strict=True)
+    return Counter(f"{status}: {reason}" for status, reason in words).most_common(8)

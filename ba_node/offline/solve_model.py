@@ -1,0 +1,139 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Solve a model of COLMAP as a whole: poses, points, and what is asked for of the cameras, shared as in the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ba_node.arrays import FloatArray
+from ba_node.config import SolverOptions
+from ba_node.core.objective import reprojection_errors
+from ba_node.core.problem import Cameras, Problem, State
+from ba_node.core.result import Result
+from ba_node.core.self_calibration import Unknown, calibrate, place_of
+from ba_node.core.solver import solve
+from ba_node.estimate import Iteration
+from ba_node.io.colmap import ColmapModel, read_colmap, write_colmap
+from ba_node.io.model import LENSES, Reconstruction
+from ba_node.offline.solve_bal import middle_if_far, statistics
+
+# What of the cameras can be refined: columns of their parameters, and their places in a rig.
+FOCAL, PRINCIPAL_POINT, DISTORTION, RIG = "focal", "principal_point", "distortion", "rig"
+_COLUMNS = {FOCAL: (0, 1), PRINCIPAL_POINT: (2, 3), DISTORTION: tuple(range(4, 12))}
+GROUPS = (FOCAL, PRINCIPAL_POINT, DISTORTION, RIG)
+# What COLMAP's own adjuster refines unless it is told otherwise.
+DEFAULT_GROUPS = (FOCAL, DISTORTION, RIG)
+# Observations behind their cameras from which on somebody has to look at the model.
+_MANY_BEHIND = 0.01
+
+
+@dataclass(frozen=True)
+class ModelSolution:
+    """A solved model."""
+
+    source: str  # the folder
+    colmap: ColmapModel
+    problem: Problem  # in our terms, moved by minus the origin
+    origin: FloatArray  # (3,) of the coordinates in which it was solved, in those of the model
+    result: Result  # state and trace
+    cameras: Cameras  # at the end
+    unknowns: tuple[Unknown, ...]  # of the cameras
+    options: SolverOptions  # with which it was solved
+    setup_s: float  # time to read and prepare it, s
+    solve_s: float  # time in the solver, s
+
+    def refined(self) -> Reconstruction:
+        """Return the solution, in the coordinates of the model."""
+        return self.colmap.model.with_state(moved(self.result.state, self.origin), self.cameras)
+
+    def write(self, path: Path) -> None:
+        """Write the model with the solution, binary as COLMAP does by itself; ids and all else are those read."""
+        self.colmap.take(self.refined())
+        write_colmap(path, self.colmap.world)
+
+    def attention(self) -> tuple[list[str], bool]:
+        """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
+        count = len(self.problem.observations)
+        before, after = (int(np.isnan(reprojection_errors(*end)[:, 0]).sum()) for end in self._ends())
+        lines = []
+        if before or after:
+            lines.append(
+                f"{before} of {count} observations are of points behind their camera at the start, {after} at the end:"
+                " those at the start take no part in the solve"
+            )
+        result, grave = self.result, max(before, after) > _MANY_BEHIND * count
+        if result.status.usable and not result.objective_after <= result.objective_before:
+            grave = True
+            lines.append(f"the objective at the end, {result.objective_after:.8g}, is worse than at the start")
+        return lines, grave
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return statistics, options and trace for JSON."""
+        return statistics(self.source, self._ends(), self.result, self.options) | {
+            "origin": self.origin.tolist(),
+            "attention": self.attention()[0],
+            "camera_unknowns": len(self.unknowns),
+            "camera_models": dict(zip(map(str, self.colmap.camera_ids), self.colmap.model.lens, strict=True)),
+            "setup_s": self.setup_s,
+            "solve_s": self.solve_s,
+        }
+
+    def _ends(self) -> list[tuple[Problem, State]]:
+        end = replace(self.problem, cameras=self.cameras)
+        return [(self.problem, self.problem.start), (end, self.result.state)]
+
+
+def solve_model(
+    path: Path,
+    options: SolverOptions,
+    groups: Collection[str],
+    *,
+    clock: Callable[[], float],
+    on_iteration: Callable[[Iteration], bool] | None = None,
+) -> ModelSolution:
+    """Read and solve a model; see :func:`ba_node.core.solver.solve` for the arguments.
+
+    ``groups`` of the cameras' numbers, some of GROUPS, are refined along.
+
+    Raises:
+        ModelError: the model cannot be read.
+        ProblemError: it holds no well-formed problem.
+        ConfigError: cameras cannot be refined with these options.
+    """
+    began = clock()
+    colmap = read_colmap(path)
+    problem = colmap.model.problem()
+    origin = middle_if_far(problem.start.points)
+    problem = replace(problem, start=moved(problem.start, -origin))
+    unknowns = tuple(unknowns_of(colmap.model, groups))
+    ready = clock()
+    if unknowns:
+        result, cameras = calibrate(problem, unknowns, options, clock=clock, on_iteration=on_iteration)
+    else:
+        result, cameras = solve(problem, options, clock=clock, on_iteration=on_iteration), problem.cameras
+    return ModelSolution(
+        str(path), colmap, problem, origin, result, cameras, unknowns, options, ready - began, clock() - ready
+    )
+
+
+def unknowns_of(model: Reconstruction, groups: Collection[str]) -> list[Unknown]:
+    """Return what of the cameras is free: those that see nothing, and the first of a rig, stay in place."""
+    columns = {column for group in groups if group != RIG for column in _COLUMNS[group]}
+    found: list[Unknown] = []
+    for camera in np.unique(model.camera).tolist():
+        found += [Unknown(camera, of) for of in LENSES[model.lens[camera]][1] if of[0] in columns]
+        is_first = (model.cameras.rotation[camera] == np.eye(3)).all() and not model.cameras.translation[camera].any()
+        if RIG in groups and not is_first:
+            found += place_of(camera)
+    return found
+
+
+def moved(state: State, offset: FloatArray) -> State:
+    """Return the same state in a world whose points lie ``offset`` further, (3,)."""
+    return replace(state, translation=state.translation - state.rotation @ offset, points=state.points + offset)

@@ -1,0 +1,210 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Hold what is known beside pixels in one session: relative poses, priors of poses and points, gravity.
+
+Each is judged by itself as it comes; what it names (keyframes, tracks) may come later. Covariances are kept by the
+order of the tangent, rotation (rad) before translation (m), see ``core/geometry.py``. All that is absolute, poses and
+positions by stamp and landmark priors, is in one frame fixed to the world, the first that is named; fixes of a
+receiver are in east, north, up about the first of them (or ``priors.origin_*``).
+"""
+
+from __future__ import annotations
+
+import bisect
+import importlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from ba_node.arrays import FloatArray, IdArray
+from ba_node.core import geometry
+from ba_node.measurements import GlobalFix, GravityDirection, LandmarkPriors, PosePrior, RelativePose
+from ba_node.scene import ingest
+from ba_node.scene.rejections import RejectionLog
+
+# Frame of the fixes of a receiver where none is named.
+ENU = "enu"
+# Entries of a covariance in the order of ROS (x, y, z, rotations) by the order of the tangent.
+_TANGENT = np.array([3, 4, 5, 0, 1, 2])
+_SYMMETRIC = 1e-6
+_STRANGE_M = 1e7
+
+
+@dataclass(frozen=True)
+class RelativeMeasure:
+    """A measured pose of one keyframe in another."""
+
+    rotation: FloatArray  # (3, 3) body at the first from body at the second
+    position: FloatArray  # (3,) the same, m
+    covariance: FloatArray  # (6, 6) rotation about the axes of the second body, translation along those of the first
+    is_loop: bool
+
+
+@dataclass(frozen=True)
+class Absolute:
+    """A position in the world, of the body or of an antenna, and perhaps an orientation of the body."""
+
+    stamp_ns: int
+    position: FloatArray  # (3,) m
+    rotation: FloatArray | None  # (3, 3) world from body; None: unknown
+    covariance: FloatArray  # (6, 6), rotation about the axes of the body, or (3, 3) of the position alone
+    of_antenna: bool  # of the antenna, not the body
+
+
+class Constraints:
+    """What is known beside pixels.
+
+    Attributes:
+        relative: by the ids of both keyframes.
+        gravity: by id of the keyframe: down (3,) in the body, unit; standard deviation, rad.
+        landmarks: by track id: position (3,) in the world, m; covariance (3, 3), m^2.
+        absolute: by stamp, oldest first.
+        world_frame: name of the frame that all that is absolute is in; empty before the first.
+        origin: (3,) latitude, longitude (deg), altitude (m) of the origin of east, north, up; None before a fix.
+    """
+
+    def __init__(self) -> None:
+        self.relative: dict[tuple[int, int], RelativeMeasure] = {}
+        self.gravity: dict[int, tuple[FloatArray, float]] = {}
+        self.landmarks: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self.absolute: list[Absolute] = []
+        self.world_frame = ""
+        self.origin: FloatArray | None = None
+
+    def add_relative(self, measured: RelativePose, log: RejectionLog) -> None:
+        """Take in a relative pose; the first between two keyframes stays."""
+        key = measured.from_keyframe_id, measured.to_keyframe_id
+        name = f"relative pose of keyframe {key[1]} in {key[0]}"
+        if key[0] == key[1]:
+            log.reject("bad_factor", f"{name}: expected two keyframes")
+            return
+        pose = _pose(name, measured.position, measured.orientation, log)
+        covariance = _covariance(name, measured.covariance, 6, log)
+        if pose is None or covariance is None:
+            return
+        if key in self.relative or key[::-1] in self.relative:
+            log.notice("repeated_factor")
+            return
+        # A turn about the axes of the first body is one about those of the second, seen from there.
+        turn = np.eye(6)
+        turn[:3, :3] = pose.rotation.T
+        covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
+        self.relative[key] = RelativeMeasure(pose.rotation, pose.position, covariance, measured.is_loop)
+
+    def add_gravity(self, measured: GravityDirection, log: RejectionLog) -> None:
+        """Take in a direction of gravity; the first at a keyframe stays."""
+        name, down = f"gravity at keyframe {measured.keyframe_id}", np.asarray(measured.down, float)
+        length = float(np.linalg.norm(down)) if down.shape == (3,) else 0.0
+        if not (np.isfinite(length) and length > 0.0):
+            log.reject("bad_factor", f"{name}: down = {down}, expected three finite numbers, not all zero")
+        elif not (np.isfinite(measured.sigma_rad) and measured.sigma_rad > 0.0):
+            log.reject("bad_covariance", f"{name}: sigma_rad = {measured.sigma_rad}, expected > 0")
+        elif measured.keyframe_id in self.gravity:
+            log.notice("repeated_factor")
+        else:
+            self.gravity[measured.keyframe_id] = down / length, float(measured.sigma_rad)
+
+    def add_landmarks(self, priors: LandmarkPriors, log: RejectionLog) -> None:
+        """Take in places of points; the last of a track counts."""
+        if priors.malformed:
+            log.reject("malformed", f"landmark priors: {priors.malformed}")
+            return
+        if not self._same_world("landmark priors", priors.frame_id, log):
+            return
+        for track, position, covariance in zip(
+            priors.track_id.tolist(), priors.position, priors.covariance, strict=True
+        ):
+            name = f"prior of track {track}"
+            known = _covariance(name, covariance, 3, log)
+            if known is None:
+                continue
+            if not _finite(position):
+                log.reject("bad_factor", f"{name}: position {position} m, expected finite")
+                continue
+            self.landmarks[track] = np.array(position), known
+
+    def add_pose(self, prior: PosePrior, log: RejectionLog) -> None:
+        """Take in a pose of the body in the world."""
+        name = f"pose prior at {prior.stamp_ns * 1e-9:.3f} s"
+        pose = _pose(name, prior.position, prior.orientation, log)
+        covariance = _covariance(name, prior.covariance, 6, log)
+        if pose is None or covariance is None or not self._same_world(name, prior.frame_id, log):
+            return
+        turn = np.eye(6)
+        turn[:3, :3] = pose.rotation.T
+        covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
+        self._insert(Absolute(prior.stamp_ns, pose.position, pose.rotation, covariance, of_antenna=False))
+
+    def add_fix(self, fix: GlobalFix, sigma_m: float, log: RejectionLog) -> None:
+        """Take in a fix of a receiver; ``sigma_m`` is its standard deviation where it tells none."""
+        name, place = f"fix at {fix.stamp_ns * 1e-9:.3f} s", np.asarray(fix.geodetic, float)
+        if not fix.is_fix:
+            log.notice("no_fix")
+            return
+        if not _finite(place) or abs(place[0]) > 90.0 or abs(place[1]) > 180.0:
+            log.reject("bad_factor", f"{name}: latitude, longitude, altitude {place}, expected within 90, 180 deg")
+            return
+        told = np.asarray(fix.covariance, float)
+        covariance = _covariance(name, told if told.any() else sigma_m**2 * np.eye(3), 3, log)
+        if covariance is None or not self._same_world(name, ENU, log):
+            return
+        try:
+            pymap3d = importlib.import_module("pymap3d")
+        except ImportError:
+            log.reject("no_geo", f"{name}: needs pymap3d: pip install ba_node[geo]")
+            log.warn("no_geo", "fixes of GNSS are left out: pymap3d is missing; pip install ba_node[geo]")
+            return
+        self.origin = place if self.origin is None else self.origin
+        position = np.array(pymap3d.geodetic2enu(*place, *self.origin), float)
+        if np.linalg.norm(position) > _STRANGE_M:
+            log.reject("bad_factor", f"{name}: {np.linalg.norm(position):.0f} m from the first one")
+            return
+        self._insert(Absolute(fix.stamp_ns, position, None, covariance, of_antenna=True))
+
+    def reject_unknown(self, keyframes: IdArray, log: RejectionLog) -> None:
+        """Give up what names keyframes that never came."""
+        known = set(keyframes.tolist())
+        for key in [key for key in self.relative if not known.issuperset(key)]:
+            missing = next(one for one in key if one not in known)
+            log.reject("unknown_keyframe", f"relative pose of keyframe {key[1]} in {key[0]}: {missing} never came")
+            del self.relative[key]
+        for one in [one for one in self.gravity if one not in known]:
+            log.reject("unknown_keyframe", f"gravity at keyframe {one}, which never came")
+            del self.gravity[one]
+
+    def _insert(self, one: Absolute) -> None:
+        bisect.insort(self.absolute, one, key=lambda known: known.stamp_ns)
+
+    def _same_world(self, name: str, frame_id: str, log: RejectionLog) -> bool:
+        frame = ingest.plain_name(frame_id)
+        self.world_frame = self.world_frame or frame
+        if frame == self.world_frame and frame:
+            return True
+        expected = f"{self.world_frame!r} as what came first" if self.world_frame else "a name"
+        log.reject("other_world", f"{name} is in frame {frame!r}, expected {expected}")
+        return False
+
+
+def _pose(name: str, position: FloatArray, orientation: FloatArray, log: RejectionLog) -> ingest.Pose | None:
+    position, quaternion = np.asarray(position, float), np.asarray(orientation, float)
+    if not _finite(position) or not ingest.is_rotation(quaternion):
+        log.reject("bad_factor", f"{name}: position {position} m, quaternion {quaternion}, expected finite, not zero")
+        return None
+    return ingest.Pose(geometry.matrix_from_quaternion(quaternion), position)
+
+
+def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
+    """Return a covariance (size, size), or None (counted) if it is not positive definite."""
+    matrix = np.asarray(values, float).reshape(size, size)
+    if np.isfinite(matrix).all() and np.abs(matrix - matrix.T).max() <= _SYMMETRIC * np.abs(matrix).max():
+        lowest = float(np.linalg.eigvalsh(matrix).min())
+        if lowest > 0.0:
+            return np.asarray(0.5 * (matrix + matrix.T))
+        log.reject("bad_covariance", f"{name}: lowest eigenvalue {lowest:g}, expected > 0")
+        return None
+    log.reject("bad_covariance", f"{name}: {matrix.tolist()}, expected finite and symmetric")
+    return None
+
+
+def _finite(position: FloatArray) -> bool:
+    return position.shape == (3,) and bool(np.isfinite(position).all()) and float(np.abs(position).max()) < 1e9

@@ -1,0 +1,152 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""`ba solve` and `ba convert` on models of other tools."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from ba_node.cli import solve as solve_command
+from ba_node.cli.main import main
+from ba_node.io.bal import read_bal
+from ba_node.io.bundler import read_bundler
+from ba_node.io.pose_files import read_g2o
+from ba_node.io.reference import read_poses
+from ba_node.offline import solve_model
+from tests.models import LENSES, adjusted, make_model, objective, written
+
+
+def solved(path: Path, out: Path, *options: str) -> dict[str, Any]:
+    trace = out.with_suffix(".json")
+    assert main(["solve", str(path), "--out", str(out), "--json", str(trace), *options]) == 0
+    figures: dict[str, Any] = json.loads(trace.read_text())
+    return figures
+
+
+@pytest.mark.parametrize("cameras_per_rig", [1, 2])
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_a_model_is_solved_as_far_as_colmap_does(lens: str, cameras_per_rig: int, tmp_path: Path) -> None:
+    world = make_model(lens, cameras_per_rig=cameras_per_rig)
+    figures = solved(written(world, tmp_path / "model"), tmp_path / "refined")
+    assert figures["objective_before"] == pytest.approx(objective(world), rel=1e-9)
+    assert figures["objective_after"] <= adjusted(world) * (1.0 + 1e-6)
+    again = pycolmap.Reconstruction(tmp_path / "refined")
+    assert objective(again) == pytest.approx(figures["objective_after"], rel=1e-9)
+    assert len(again.cameras) == 2, "cameras stay shared"
+
+
+def test_cameras_are_refined_as_asked_for(tmp_path: Path) -> None:
+    model = written(make_model("OPENCV"), tmp_path / "model", text=True)
+    ends = {
+        what: solved(model, tmp_path / "_".join(what), "--refine", *what)
+        for what in (("none",), ("focal",), ("focal", "distortion"), ("focal", "distortion", "principal_point"))
+    }
+    counts = [end["camera_unknowns"] for end in ends.values()]
+    assert counts == [0, 4, 12, 16]
+    after = [end["objective_after"] for end in ends.values()]
+    assert after == sorted(after, reverse=True) and after[0] > 1.05 * after[1] > 0.0
+    held = pycolmap.Reconstruction(tmp_path / "none").cameras
+    for number, camera in pycolmap.Reconstruction(model).cameras.items():
+        np.testing.assert_allclose(held[number].params, camera.params, rtol=1e-12)
+    assert solve_model.GROUPS == solve_command._GROUPS
+
+
+def test_points_behind_a_camera_and_seen_twice_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    world = make_model("PINHOLE")
+    image = world.images[min(world.images)]
+    centre, forward = image.projection_center(), image.viewing_direction()
+    world.points3D[1].xyz = centre - 2.0 * forward
+    twice = image.get_observation_points2D()[3].point3D_id
+    free = next(i for i, point in enumerate(image.points2D) if not point.has_point3D())
+    image.point2D(free).xy = image.get_observation_points2D()[3].xy + 1.0
+    world.add_observation(twice, pycolmap.TrackElement(image.image_id, free))
+    model = written(world, tmp_path / "model")
+    figures = solved(model, tmp_path / "refined", "--refine", "none")
+    assert figures["problem"]["observations"] == 1001
+    assert any("of points behind their camera at the start" in line for line in figures["attention"])
+    capsys.readouterr()
+    assert main(["convert", str(model), str(tmp_path / "scene.mcap")]) == 0
+    assert "without 1 observations of points that an image saw already" in capsys.readouterr().out
+
+
+def test_one_scene_in_every_format_has_one_objective(bal_file: Path, tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("a.out", "a.txt", "model", "text", "b.out", "b.bz2")]
+    forms = ("bundler", "bal", "colmap", "colmap-text", "bundler", "bal")
+    source = bal_file
+    for path, form in zip(paths, forms, strict=True):
+        assert main(["convert", str(source), str(path), "--to", form]) == 0
+        source = path
+    before, after = [], []
+    for number, path in enumerate([bal_file, *paths]):
+        name = tmp_path / f"solved_{number}"
+        figures = solved(path, name.with_suffix(path.suffix) if path.suffix else name, "--method", "auto")
+        before.append(figures["objective_before"])
+        after.append(figures["objective_after"])
+    np.testing.assert_allclose(before, before[0], rtol=1e-9)
+    assert max(after) < 1e-6 * before[0]
+    np.testing.assert_allclose(read_bal(paths[-1]).cameras, read_bal(bal_file).cameras, atol=1e-9)
+    assert read_bundler(paths[0]).n_cameras == 4
+
+
+def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["convert", str(bag), str(tmp_path / "model")]) == 0
+    world = pycolmap.Reconstruction(tmp_path / "model")
+    assert (world.num_rigs(), world.num_reg_frames(), world.num_reg_images()) == (1, 8, 16)
+    assert objective(world) / (2.0 * world.compute_num_observations()) < 1.0, "half a px^2 each coordinate, or so"
+    assert main(["convert", str(tmp_path / "model"), str(tmp_path / "again.mcap")]) == 0
+    assert main(["replay", str(tmp_path / "again.mcap"), "--out", str(tmp_path / "out")]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["keyframes_refined"] == 8
+    assert report["rms_px"]["refined"] < 1.02 * report["rms_px"]["input"]
+    capsys.readouterr()
+    names = [tmp_path / name for name in ("p.tum", "p.kitti", "p.g2o", "points.ply")]
+    for name in names:
+        assert main(["convert", str(bag), str(name)]) == 0
+        assert capsys.readouterr().out.startswith(f"{name}: 8 keyframes, 2 cameras, ")
+    tum, kitti, graph = read_poses(names[0]), read_poses(names[1]), read_g2o(names[2])
+    assert len(tum) == len(kitti) == len(graph) == 8
+    np.testing.assert_allclose(kitti.position, tum.position, atol=1e-12)
+    np.testing.assert_array_equal(graph.position, tum.position)
+    np.testing.assert_array_equal(graph.orientation, tum.orientation)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("poses.tum", "model"), "poses alone are written as tum, kitti or g2o, not as colmap: there are no points"),
+        (("empty.g2o", "a.tum"), "no VERTEX_SE3:QUAT in it"),
+        (("bad.g2o", "a.tum"), "bad.g2o:1: expected a new id and a pose"),
+        (("none.txt", "a.tum"), "none.txt: cannot be opened"),
+        (("empty", "a.tum"), "empty"),
+    ],
+)
+def test_what_cannot_be_converted_is_one_line(
+    arguments: tuple[str, str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "poses.tum").write_text("1.0 0 0 0 0 0 0 1\n")
+    (tmp_path / "empty.g2o").write_text("FIX 0\n")
+    (tmp_path / "bad.g2o").write_text("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 0\n")
+    (tmp_path / "empty").mkdir()
+    source, target = arguments
+    assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and words in error, error
+    assert not (tmp_path / target).exists()
+
+
+def test_what_the_formats_do_not_have_is_refused(
+    bal_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["solve", str(bal_file), "--refine", "focal"]) == 2
+    assert "BAL and Bundler have f, k1, k2 of each image free" in capsys.readouterr().err
+    model = written(make_model("OPENCV"), tmp_path / "model")
+    assert main(["convert", str(model), str(tmp_path / "a.txt")]) == 2
+    assert "camera 0 (OPENCV): BAL and Bundler have cameras of f, k1 and k2 alone" in capsys.readouterr().err
+    assert main(["solve", str(model), "--method", "local_dinm"]) == 2
+    assert "trust_region = inc: cameras are refined with trust_region = none alone" in capsys.readouterr().err
