@@ -276,6 +276,8 @@ class Backend:
             self.map.hold(f"a solve of everything: {self.refusal}")
             return None
         assert found.state is not None
+        if taken.calibration is not None:
+            self.map.calibrate(taken.calibration)
         followed = full.merge_snapshot(self.scene, self.config, taken, found.state)
         if followed is None:
             return None

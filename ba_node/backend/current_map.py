@@ -20,6 +20,7 @@ from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
+from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
 from ba_node.estimate import Cloud, Correction, Estimate, Extras, Iteration, Poses, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
@@ -89,6 +90,7 @@ class CurrentMap:
         completion: which keyframes are complete.
         report: of the last solve.
         correction: map from odom.
+        calibration: what the last solve of everything found of the cameras, None if it was not asked for.
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
@@ -96,6 +98,7 @@ class CurrentMap:
         self.completion = Completion()
         self.report = SolveReport(reason="not solved yet")
         self.correction = MapCorrection()
+        self.calibration: Calibration | None = None
         self._trust = Trust()
 
     @property
@@ -299,6 +302,11 @@ class CurrentMap:
             correction=self._published(),
             map_index=self.index,
         )
+
+    def calibrate(self, found: Calibration) -> None:
+        """Take refined cameras for all that follows, and say what was refined and what the data do not tell."""
+        self.scene.refine_cameras(found.cameras)
+        self.calibration = found
 
     def with_covariances(self, estimate: Estimate, taken: full.Optimization) -> Estimate:
         """Return an estimate of everything with the covariances of a solve of everything that was merged."""

@@ -17,12 +17,11 @@ standard deviation after it is less than a quarter of the prior's.
 Parameters of camera c, in their order:
 
 - fx, fy, cx, cy (px), and the first two coefficients of its distortion;
-- its place on the body, as a local step of camera from body, rotation (rad) and translation (m). That of the first
-  camera moves all cameras alike: tracks do not see it, only the front-end's steps do (hand-eye). Those of the others are
-  against the first;
-- its time offset (s): its images show what the body saw so much later than the stamp says, on the way that the keyframes
-  before and after tell. That of the first camera shifts all; those of the others are against the first. The pixels are
-  brought to the time of the stamp: ``u - (du/dt) offset`` with ``dX_body/dt = -(omega x X_body) - v``.
+- its place on the body, as a local step of camera from body, rotation (rad) and translation (m), against the first
+  camera. The place of the first one is held: no track sees where on the body a whole rig sits;
+- its time offset (s): its images show what the body saw so much later than the stamp says, on the way that the
+  keyframes before and after tell. That of the first camera shifts all; those of the others are against the first. The
+  pixels are brought to the time of the stamp: ``u - (du/dt) offset`` with ``dX_body/dt = -(omega x X_body) - v``.
 """
 
 from __future__ import annotations
@@ -32,7 +31,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+from scipy import interpolate, sparse
+from scipy.spatial import transform
 
 from ba_node.arrays import FloatArray
 from ba_node.config import CalibrationConfig, SolverOptions
@@ -111,16 +111,17 @@ def parameters_of(problem: Problem, config: CalibrationConfig) -> tuple[Paramete
 
 
 def motion_of(state: State, stamp_s: FloatArray) -> Motion:
-    """Return the motion at each keyframe from those before and after it, (n_kf,) stamps ascending."""
+    """Return the motion at each keyframe, by cubic splines through all of them; stamps are (n_kf,), ascending.
+
+    Differences of neighbours would tell too small a velocity where it changes from keyframe to keyframe. At rest where
+    two keyframes have one stamp, or there are fewer than three.
+    """
     rotation, position = geometry.inverse(state.rotation, state.translation)
-    n = len(position)
-    before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
-    span = stamp_s[after] - stamp_s[before]
-    rate = np.where(span > 0.0, 1.0 / np.where(span > 0.0, span, 1.0), 0.0)[:, None]
-    back = np.swapaxes(rotation, 1, 2)
-    velocity = (back @ (position[after] - position[before])[:, :, None])[..., 0]
-    turn = geometry.so3_log(np.swapaxes(rotation[before], 1, 2) @ rotation[after])
-    return Motion(velocity * rate, turn * rate)
+    if len(stamp_s) < 3 or np.diff(stamp_s).min() <= 0.0:
+        return Motion(np.zeros_like(position), np.zeros_like(position))
+    velocity = interpolate.CubicSpline(stamp_s, position)(stamp_s, 1)
+    turn = transform.RotationSpline(stamp_s, transform.Rotation.from_matrix(rotation))(stamp_s, 1)
+    return Motion((np.swapaxes(rotation, 1, 2) @ velocity[:, :, None])[..., 0], turn)
 
 
 def calibrate(
@@ -251,14 +252,13 @@ def _columns(problem: Problem, state: State, found: Calibration, motion: Motion)
     by_time[:, 2:] = 0.0  # a depth is not moved to the time of the stamp
     out = np.zeros((*at.residual.shape, len(found.parameters)))
     for i, parameter in enumerate(found.parameters):
-        # What is asked of the first camera's place and clock holds for all of them.
         of = obs.camera == parameter.camera
-        of |= (parameter.camera == 0) & (parameter.name not in _INTRINSICS)
         if parameter.name in _INTRINSICS:
             out[of, :2, i] = _by_intrinsics(problem, state, parameter)[of]
         elif parameter.name == _TIME:
+            of |= parameter.camera == 0
             out[of, :, i] = by_time[of]
-        else:
+        elif parameter.camera > 0:
             out[of, :, i] = by_place[of, :, _PLACE.index(parameter.name)]
     return out[np.any(at.d_point != 0.0, axis=2)]
 
@@ -282,13 +282,12 @@ def _stepped(found: Calibration, step: FloatArray) -> Calibration:
     changed = []
     for parameter, size in zip(found.parameters, step, strict=True):
         by = parameter.prior * float(size)
-        of = slice(None) if parameter.camera == 0 else parameter.camera
         if parameter.name in _INTRINSICS:
             params[parameter.camera, _INTRINSICS.index(parameter.name)] += by
         elif parameter.name == _TIME:
-            offset[of] += by
+            offset[parameter.camera or slice(None)] += by
         else:
-            place[of, _PLACE.index(parameter.name)] += by
+            place[parameter.camera, _PLACE.index(parameter.name)] += by
         changed.append(dataclasses.replace(parameter, change=parameter.change + by))
     rotation, translation = parameterisation.retract("local", cams.rotation, cams.translation, place)
     refined = dataclasses.replace(cams, params=params, rotation=rotation, translation=translation)

@@ -27,15 +27,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
-from ba_node.config import Config, SolverConfig, SolverOptions
+from ba_node.config import CalibrationConfig, Config, SolverConfig, SolverOptions
 from ba_node.core import geometry, methods, native_kernels, solver
+from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
+from ba_node.window.calibration import calibrated
 from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
@@ -86,10 +89,13 @@ class Optimization:
     placed: BoolArray  # (n_pt,) True where the point had a position
     position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
     held: BoolArray  # (n_kf,) keyframes that are fixed but for the one that holds a floating scale
+    stamp_ns: NDArray[np.int64]  # (n_kf,) ns
+    refine: CalibrationConfig  # what of the cameras is refined too
     wanted: Extras = NOTHING  # what is to be worked out beside the solution
     # result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`
     solved: tuple[Result, FloatArray] | None = None
     covariances: Covariances | None = None  # None likewise, and if they were not asked for
+    calibration: Calibration | None = None  # None likewise
 
     def solve(
         self,
@@ -102,6 +108,8 @@ class Optimization:
     ) -> None:
         """Solve, on any thread; the map is not touched. Arguments as of :func:`options` and ``solver.solve``."""
         chosen = options(config, method, max_iterations)
+        if self.refine.wanted:
+            self.selection, self.calibration = calibrated(self.selection, self.held, self.stamp_ns, chosen, self.refine)
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
@@ -165,6 +173,8 @@ def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Opt
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
         problem.fixed,
+        scene.keyframes.stamp_ns[selection.keyframes],
+        config.calibration,
         wanted,
     )
 
