@@ -90,7 +90,7 @@ class CurrentMap:
         completion: which keyframes are complete.
         report: of the last solve.
         correction: map from odom.
-        calibration: what the last solve of everything found of the cameras, None if it was not asked for.
+        calibration: what solves of everything found of the cameras, against those that came; None if not asked for.
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
@@ -304,9 +304,10 @@ class CurrentMap:
         )
 
     def calibrate(self, found: Calibration) -> None:
-        """Take refined cameras for all that follows, and say what was refined and what the data do not tell."""
+        """Take refined cameras for all that follows."""
         self.scene.refine_cameras(found.cameras)
-        self.calibration = found
+        assert self.scene.given_cameras is not None
+        self.calibration = found.since(self.scene.given_cameras)
 
     def with_covariances(self, estimate: Estimate, taken: full.Optimization) -> Estimate:
         """Return an estimate of everything with the covariances of a solve of everything that was merged."""

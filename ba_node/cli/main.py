@@ -23,7 +23,7 @@ from ba_node.cli.checkout import CheckoutCommand
 
 # Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "refine": ("replay", "solve", "map"),
+    "refine": ("replay", "solve", "calibrate", "map"),
     "look": ("check", "report", "evaluate"),
     "recordings and files": ("convert", "synth"),
     "the running node": ("play", "demo", "params"),

@@ -11,12 +11,13 @@ is left::
 for priors sigma_0 about the given values q_0. Then poses and points are solved again for the cameras that this gives.
 
 Only what is observable moves: in the directions of ``P^-1/2 S_q P^-1/2 = V diag(lambda) V'`` the data tell lambda times
-as much as the priors, and those of less than :data:`LEAST_TOLD` stay where they are. A parameter is told where the
-standard deviation after it is less than a quarter of the prior's.
+as much as the priors, and those of less than 1 stay where they are. A parameter counts as told where the standard
+deviation after it is less than a quarter of the prior's (lambda = :data:`LEAST_TOLD`).
 
 Parameters of camera c, in their order:
 
-- fx, fy, cx, cy (px), and the first two coefficients of its distortion;
+- fx, cx, cy (px), and the first two coefficients of its distortion; fy, which follows fx but for what its pixels are
+  not square, as it is hardly told where a body drives on a plane;
 - its place on the body, as a local step of camera from body, rotation (rad) and translation (m), against the first
   camera. The place of the first one is held: no track sees where on the body a whole rig sits;
 - its time offset (s): its images show what the body saw so much later than the stamp says, on the way that the
@@ -29,6 +30,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import interpolate, sparse
@@ -46,6 +48,7 @@ LEAST_TOLD = 16.0
 _ROUNDS = 12
 # A step of less than this share of the priors' sigmas is none.
 _SMALL = 2e-3
+_NONE = 1e-9  # rounding
 # No parameter steps by more than this many of the priors' sigmas at once.
 _MOST = 2.0
 # While the cameras are wrong the loss is as wide as this many times the median residual.
@@ -54,6 +57,8 @@ _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2")
 _PLACE = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
 _TIME = "time_offset"
 _STEP = 1e-6
+# Standard deviation of fy / fx, which is that of the pixels.
+_NOT_SQUARE = 0.003
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,10 @@ class Parameter:
     sigma: float = np.nan  # standard deviation after; NaN where nothing is known
     told: bool = False  # the data tell it
 
+    def text(self) -> str:
+        """Return its change and standard deviation in words."""
+        return f"{self.name} {self.change:+.4g} +- {self.sigma:.2g}{' ' * bool(self.unit)}{self.unit}"
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -77,9 +86,42 @@ class Calibration:
     time_offset: FloatArray  # (n_cam,) s
     parameters: tuple[Parameter, ...]
 
-    def moved(self) -> bool:
-        """Return True if anything was refined."""
-        return any(parameter.told for parameter in self.parameters)
+    def lines(self) -> list[str]:
+        """Return what was found, in words: of each camera what was refined, then what the data do not tell."""
+        found = []
+        for camera in range(len(self.time_offset)):
+            own = [parameter for parameter in self.parameters if parameter.camera == camera]
+            told = [one.text() for one in own if one.told]
+            hardly = [one.text() for one in own if not one.told and one.change]
+            untold = [one.name for one in own if not one.told and not one.change]
+            parts = [", ".join(told)] if told else []
+            parts += [f"hardly told by the data: {', '.join(hardly)}"] if hardly else []
+            parts += [f"not told by the data, left as given: {', '.join(untold)}"] if untold else []
+            found += ["; ".join(parts)] if own else []
+        return found
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Return the parameters for a JSON file; sigma is None where nothing is known."""
+        rows = [dataclasses.asdict(one) for one in self.parameters]
+        return [row | {"sigma": row["sigma"] if np.isfinite(row["sigma"]) else None} for row in rows]
+
+    def since(self, given: Cameras) -> Calibration:
+        """Return the same with the changes from cameras that were given some rounds ago."""
+        back = np.swapaxes(given.rotation, 1, 2)
+        turn = geometry.so3_log(back @ self.cameras.rotation)
+        moved = (back @ (self.cameras.translation - given.translation)[:, :, None])[..., 0]
+        place, params = np.concatenate([turn, moved], axis=1), self.cameras.params - given.params
+        changes = [
+            params[one.camera, _INTRINSICS.index(one.name)]
+            if one.name in _INTRINSICS
+            else place[one.camera, _PLACE.index(one.name)]
+            if one.name in _PLACE
+            else one.change
+            for one in self.parameters
+        ]
+        pairs = zip(self.parameters, changes, strict=True)
+        parameters = tuple(dataclasses.replace(one, change=float(change)) for one, change in pairs)
+        return dataclasses.replace(self, parameters=parameters)
 
 
 @dataclass(frozen=True)
@@ -88,6 +130,9 @@ class Motion:
 
     velocity: FloatArray  # (n_kf, 3) along its own axes, m/s
     turn: FloatArray  # (n_kf, 3) angular velocity along its own axes, rad/s
+    # by what share of how they change from keyframe to keyframe the velocities may be wrong: keyframes do not tell what
+    # the body does between them
+    doubt: float = 0.0
 
 
 Solve = Callable[[Problem, SolverOptions], State]
@@ -100,7 +145,10 @@ def parameters_of(problem: Problem, config: CalibrationConfig) -> tuple[Paramete
         focal = float(problem.cameras.params[camera, 0])
         if config.intrinsics == "refined":
             share = config.intrinsics_sigma
-            found += [Parameter(camera, name, "px", share * focal) for name in _INTRINSICS[:4]]
+            priors = np.array([share, _NOT_SQUARE, share, share]) * focal
+            found += [
+                Parameter(camera, name, "px", prior) for name, prior in zip(_INTRINSICS, priors.tolist(), strict=False)
+            ]
             found += [Parameter(camera, name, "", config.distortion_sigma) for name in _INTRINSICS[4:]]
         if config.extrinsics == "refined":
             found += [Parameter(camera, name, "rad", config.rotation_sigma_rad) for name in _PLACE[:3]]
@@ -121,7 +169,10 @@ def motion_of(state: State, stamp_s: FloatArray) -> Motion:
         return Motion(np.zeros_like(position), np.zeros_like(position))
     velocity = interpolate.CubicSpline(stamp_s, position)(stamp_s, 1)
     turn = transform.RotationSpline(stamp_s, transform.Rotation.from_matrix(rotation))(stamp_s, 1)
-    return Motion((np.swapaxes(rotation, 1, 2) @ velocity[:, :, None])[..., 0], turn)
+    straight = (position[2:] - position[:-2]) / (stamp_s[2:] - stamp_s[:-2])[:, None]
+    changes = float(np.sum(np.diff(velocity, axis=0) ** 2))
+    doubt = np.sqrt(np.sum((velocity[1:-1] - straight) ** 2) / changes) if changes > 0.0 else 0.0
+    return Motion((np.swapaxes(rotation, 1, 2) @ velocity[:, :, None])[..., 0], turn, float(doubt))
 
 
 def calibrate(
@@ -189,10 +240,11 @@ class _Border:
     def __init__(
         self, problem: Problem, state: State, options: SolverOptions, found: Calibration, motion: Motion
     ) -> None:
-        self._parameters, self._squared = found.parameters, options.loss == "squared"
+        self._parameters, self._cameras = found.parameters, found.cameras
+        self._squared = options.loss == "squared"
         self._prior = np.array([parameter.prior for parameter in found.parameters])
         self._change = np.array([parameter.change for parameter in found.parameters])
-        self._n = 6 * int(np.count_nonzero(~problem.fixed))
+        self._n, self._doubt = 6 * int(np.count_nonzero(~problem.fixed)), motion.doubt
         with np.errstate(all="ignore"):
             self._rows = _with_columns(rows_of(problem, state, options), _columns(problem, state, found, motion))
 
@@ -207,9 +259,9 @@ class _Border:
         slope = gradient[n:] - s[n:, :n] @ poses[:, -1]
         values, vectors = np.linalg.eigh(own * self._prior[:, None] * self._prior)
         along = vectors.T @ (self._prior * slope + self._change / self._prior)
-        # What has changed so far came from steps in directions that are told.
-        step = vectors @ np.where(values > LEAST_TOLD, -along / (1.0 + np.maximum(values, 0.0)), 0.0)
-        return np.asarray(step * min(1.0, _MOST / max(float(np.abs(step).max(initial=0.0)), 1e-300)))
+        step = vectors @ np.where(values > 1.0, -along / (1.0 + np.maximum(values, 0.0)), 0.0)
+        step[np.abs(step) < _NONE] = 0.0
+        return np.asarray(step * min(1.0, _MOST / max(float(np.abs(step).max(initial=0.0)), _NONE)))
 
     def described(self) -> tuple[Parameter, ...]:
         """Return the parameters with what is known of them."""
@@ -227,12 +279,27 @@ class _Border:
         found = covariance.uncertainty_of_rows(joined([rows, priors]), self._squared, conditions)
         if found is None:
             return self._parameters
-        sigma = np.sqrt(np.diagonal(found.of(self._n + np.arange(q))))
-        told = sigma * np.sqrt(1.0 + LEAST_TOLD) < self._prior
+        follow = self._following()
+        sigma = np.sqrt(np.diagonal(follow @ found.of(self._n + np.arange(q)) @ follow.T))
+        prior = np.sqrt(np.sum((follow * self._prior) ** 2, axis=1))
+        # The clock of the first camera shows in how velocities change, that of another one in the velocities.
+        shared = [parameter.name == _TIME and parameter.camera == 0 for parameter in self._parameters]
+        sigma = np.hypot(sigma, np.where(shared, self._doubt * np.abs(self._change), 0.0))
+        told = sigma * np.sqrt(1.0 + LEAST_TOLD) < prior
+        rows_of_all = zip(self._parameters, prior, follow @ self._change, sigma, told, strict=True)
         return tuple(
-            dataclasses.replace(parameter, sigma=float(sigma[i]), told=bool(told[i]))
-            for i, parameter in enumerate(self._parameters)
+            dataclasses.replace(one, prior=float(p), change=float(c), sigma=float(s), told=bool(t))
+            for one, p, c, s, t in rows_of_all
         )
+
+    def _following(self) -> FloatArray:
+        """Return the matrix (q, q) by which fy follows fx."""
+        follow = np.eye(len(self._parameters))
+        for i, parameter in enumerate(self._parameters):
+            if parameter.name == "fy":
+                params = self._cameras.params[parameter.camera]
+                follow[i, i - 1] = params[1] / params[0]
+        return follow
 
 
 def _with_columns(rows: Rows, columns: FloatArray) -> Rows:
@@ -269,10 +336,17 @@ def _by_intrinsics(problem: Problem, state: State, parameter: Parameter) -> Floa
     errors = []
     for sign in (1.0, -1.0):
         params = problem.cameras.params.copy()
-        params[parameter.camera, _INTRINSICS.index(parameter.name)] += sign * step
+        _change_intrinsics(params[parameter.camera], parameter.name, sign * step)
         changed = dataclasses.replace(problem, cameras=dataclasses.replace(problem.cameras, params=params))
         errors.append(Objective(changed, SolverOptions()).errors(state))
     return np.nan_to_num((errors[0] - errors[1]) / (2.0 * step)) / problem.observations.sigma_px[:, None]
+
+
+def _change_intrinsics(params: FloatArray, name: str, by: float) -> None:
+    """Change a parameter of a camera (12,) in place; fy follows fx."""
+    if name == "fx":
+        params[1] *= 1.0 + by / params[0]
+    params[_INTRINSICS.index(name)] += by
 
 
 def _stepped(found: Calibration, step: FloatArray) -> Calibration:
@@ -283,7 +357,7 @@ def _stepped(found: Calibration, step: FloatArray) -> Calibration:
     for parameter, size in zip(found.parameters, step, strict=True):
         by = parameter.prior * float(size)
         if parameter.name in _INTRINSICS:
-            params[parameter.camera, _INTRINSICS.index(parameter.name)] += by
+            _change_intrinsics(params[parameter.camera], parameter.name, by)
         elif parameter.name == _TIME:
             offset[parameter.camera or slice(None)] += by
         else:

@@ -27,7 +27,7 @@ each kind of factor):
 
     sum psi^2 = sum v d (1 - 2 h d) + sum d^2 J Sigma J'
 
-  with Sigma of all components together; the sigma that a factor states counts as ten rows more.
+  with Sigma of all components together; the sigma that a factor states counts as two rows more.
 
 The keyframes' part needs S = B - E C^-1 E' of A alone (3.64-3.67): with C the points' blocks, and ``u = J_c - J_p C^-1
 E'`` of a row, the error of the keyframes is ``delta_c = -S^-1 sum u' psi``, and that of a point ``-C^-1 (sum J_p' psi +
@@ -71,7 +71,7 @@ _NEWEST = 5
 # Rows with more leverage are taken to have this: they tell next to nothing about the noise.
 _MOST_LEVERAGE = 0.9
 # What the sigma that a factor states counts, in rows.
-_STATED = 10.0
+_STATED = 2.0
 # Its variance is at least this share of what it states.
 _LEAST = 0.1
 # Rows at a time whose leverage is worked out, and points whose covariance is.
