@@ -218,7 +218,7 @@ setup(
         # Optional parts, each of which says what to install where its library is missing.
         "front_end": ["poselib"],
         "report": ["plotly"],
-        "tune": ["optuna"],
+        "tune": ["optuna>=5"],
         "fleet": ["distributed", "fsspec"],
         "geo": ["pymap3d"],
         "mpi": ["mpi4py"],
@@ -234,6 +234,7 @@ setup(
         "console_scripts": [
             "ba = ba_node.cli.main:main",
             "ba_adapter = ba_node.ros.tools.adapter:main",
+            "ba_front_end = ba_node.ros.front_end.main:main",
             "ba_node = ba_node.ros.main:main",
         ],
         # So that the linter ament_copyright understands the second line of this file.

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
+from foxglove import layouts
 
 from ba_node.estimate import SolveReport
 from ba_node.io.parameters import NODE_NAME
@@ -80,3 +81,32 @@ def test_every_panel_of_the_foxglove_layout_has_a_place() -> None:
     layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
     placed = {text for text in strings(layout["layout"]) if "!" in text}
     assert placed == set(layout["configById"])
+
+
+def test_the_library_of_foxglove_knows_every_setting_of_the_layout() -> None:
+    """A setting that the app does not know is passed over in silence."""
+    configs = {
+        "3D": layouts.ThreeDeeConfig,
+        "Plot": layouts.PlotConfig,
+        "DiagnosticSummary": layouts.DiagnosticsSummaryConfig,
+        "RawMessages": layouts.RawMessagesConfig,
+    }
+    topics = {
+        "PointCloud2": layouts.BaseRendererPointCloudTopicSettings,
+        "Path": layouts.BaseRendererPosesTopicSettings,
+        "MarkerArray": layouts.BaseRendererRosMarkerTopicSettings,
+        "PoseWithCovarianceStamped": layouts.BaseRendererPoseTopicSettings,
+    }
+
+    def unknown(given: dict[str, Any], config: Any) -> set[str]:
+        return set(given) - set(config()._to_dict()) - {"foxglovePanelTitle"}
+
+    panels = json.loads((CONFIG / "foxglove_layout.json").read_text())["configById"]
+    for name, panel in panels.items():
+        assert not unknown(panel, configs[name.split("!")[0]]), name
+        for topic, settings in panel.get("topics", {}).items():
+            kind = TOPICS[topic].type_name.rpartition("/")[2]
+            assert not unknown(settings, topics[kind]), topic
+        for series in panel.get("paths", ()):
+            assert not unknown(series, lambda: layouts.PlotSeries(value="")), name
+    assert not unknown(panels["3D!map"]["cameraState"], layouts.ThreeDeeCameraState)

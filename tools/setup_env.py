@@ -268,7 +268,7 @@ class Environment:
         links |= {share / name: self.root / name for name in ("package.xml", "config", "bags")}
         # `ros2 launch` looks for files, and not behind links to folders.
         links |= {share / "launch" / path.name: path for path in (self.root / "launch").glob("*.launch.py")}
-        links |= {programs / name: self.venv / "bin" / name for name in ("ba", "ba_adapter", "ba_node")}
+        links |= {programs / name: self.venv / "bin" / name for name in ("ba", "ba_adapter", "ba_front_end", "ba_node")}
         if (share / "launch").is_symlink():
             (share / "launch").unlink()
         for link, target in links.items():

@@ -45,7 +45,7 @@ from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
 from ba_node.scene.map_content import MapContent
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
-from ba_node.window import full, guard, quality
+from ba_node.window import adjustment, full, guard, quality
 
 __all__ = ["FINISHED_KEPT", "Admitted", "Backend", "Check"]
 
@@ -202,7 +202,34 @@ class Backend:
             return None
         wrong = self.setup.look(self.scene) if self._checks_setup else ""
         self.solve_count += 1
-        return self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
+        estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
+        return estimate if wrong else self.adjust() or estimate
+
+    def adjust(self, *, final: bool = False) -> Estimate | None:
+        """Bend the map and refine all of it, if a loop or what is absolute asks for it, see ``window/adjustment.py``.
+
+        ``final``: nothing more will come. Returns what is known then, None if nothing changed.
+        """
+        what = adjustment.due(self.scene, self.config, final=final)
+        if what is None:
+            return None
+        before = self.scene.poses_and_points()
+        why = adjustment.bend(self.scene, self.config, what)
+        merged = None
+        if not why:
+            begun = self.begin_optimization()
+            if isinstance(begun, str):
+                why = begun
+            else:
+                begun.solve(self.config.solver)
+                merged = self.merge(begun)
+                why = self.refusal or ("" if merged else "nothing came of a solve of everything")
+        if why:
+            self.scene.restore(before)
+            self.scene.log.warn("not_adjusted", f"{what.cause}; the map stays as it is: {why}")
+            return None
+        assert merged is not None
+        return merged[0]
 
     def replay(self, stream: Iterable[Measurement]) -> Iterator[Estimate | Keyframe | MapEnded]:
         """Take in a stream to its end, with a solve for every keyframe, just before the next one begins.
@@ -219,6 +246,9 @@ class Backend:
         self.flush(final=True)
         while self.ready:
             yield from self._solved()
+        last = self.adjust(final=True) if not self.setup.reason(self.scene) else None
+        if last is not None:
+            yield last
 
     def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
         if self.completes(admitted):
@@ -259,6 +289,11 @@ class Backend:
     def begin_optimization(self) -> full.Optimization | str:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""
         return full.take_snapshot(self.scene, self.config, self.extras)
+
+    def copied(self) -> Callable[[], full.Optimization | str]:
+        """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called on any thread."""
+        scene, clone, config, wanted = self.scene, self.scene.clone(), self.config, self.extras
+        return lambda: full.take_snapshot(clone, config, wanted, scene)
 
     def is_current(self, optimization: full.Optimization) -> bool:
         """Return True if a solve of everything is of the current map."""

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from ba_node import window
-from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.arrays import FloatArray, IdArray, IntArray
 from ba_node.backend.summary import MapSummary, summary_of
+from ba_node.backend.whole_map import MapCloud, MapPoses, poses_of
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
@@ -22,7 +23,7 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
-from ba_node.estimate import Cloud, Correction, Estimate, Extras, Iteration, Poses, SolveReport, Status, Transform
+from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
 from ba_node.window import full, quality, view
@@ -129,7 +130,7 @@ class CurrentMap:
     @property
     def stamp_ns(self) -> int:
         """Return the stamp of the newest keyframe, 0 before the first."""
-        return int(self.scene.keyframes.stamp_ns[self.scene.order[-1]]) if len(self.scene.order) else 0
+        return self.scene.newest_ns if self.keyframe_count else 0
 
     @property
     def odom_frame(self) -> str:
@@ -141,10 +142,15 @@ class CurrentMap:
         row = self.scene.find_keyframe(keyframe_id) if session_id == self.scene.session_id else None
         return None if row is None else bool(self.scene.keyframes.solved[row])
 
-    def refined_keyframes(self) -> set[int]:
-        """Return the ids of the keyframes that took part in a usable solve."""
-        table = self.scene.keyframes
-        return set(table.keyframe_id[table.refined].tolist())
+    @property
+    def refined_count(self) -> int:
+        """Return how many keyframes took part in a usable solve."""
+        return int(np.count_nonzero(self.scene.keyframes.refined))
+
+    def refined_among(self, keyframe_ids: Iterable[int]) -> set[int]:
+        """Return which of some keyframes took part in a usable solve."""
+        rows = ((key, self.scene.find_keyframe(key)) for key in keyframe_ids)
+        return {key for key, row in rows if row is not None and self.scene.keyframes.refined[row]}
 
     def input_keyframes(self) -> list[Keyframe]:
         """Return the keyframes as the front-end sent them, in order of arrival."""
@@ -230,6 +236,7 @@ class CurrentMap:
         elif state is not None:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
+            self.scene.moved(np.array(tried.without, np.intp))
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}
@@ -248,7 +255,7 @@ class CurrentMap:
 
     def _young(self) -> bool:
         """Return True while no more was refined than two windows hold."""
-        return int(np.count_nonzero(self.scene.keyframes.refined)) <= 2 * self.config.window.max_keyframes
+        return self.refined_count <= 2 * self.config.window.max_keyframes
 
     def hold_all(self, solve_count: int, reason: str) -> None:
         """Report that the set-up is wrong; the front-end's poses stand, and its frame is the map's."""
@@ -291,13 +298,13 @@ class CurrentMap:
         """Return all that is known, the refined keyframes being those in some rows, or all."""
         scene = self.scene
         scene.propagate_corrections()
-        trajectory = _poses_of(scene, scene.order)
+        trajectory = MapPoses.taken(scene)
         return Estimate(
             stamp_ns=self.stamp_ns,
             frame_id=self.config.frames.map_frame,
-            refined=trajectory[scene.places()[scene.order if refined is None else refined]],
+            refined=trajectory if refined is None else poses_of(scene, refined),
             trajectory=trajectory,
-            cloud=_cloud_of(scene, scene.landmark_order),
+            cloud=MapCloud.taken(scene),
             report=self.report,
             correction=self._published(),
             map_index=self.index,
@@ -329,13 +336,6 @@ class CurrentMap:
         return _end_of_solve(self.scene, due, self.config.window.max_keyframes)
 
 
-def _cloud_of(scene: Scene, rows: IntArray) -> Cloud:
-    """Return those of some landmarks that have a position and two views."""
-    points = scene.landmarks
-    rows = rows[points.has_position[rows] & (points.views[rows] >= 2)]
-    return Cloud(points.track_id[rows], points.position[rows], points.rms_px[rows], points.views[rows])
-
-
 def _rows_by_id(wanted: IdArray, ids: IdArray, values: FloatArray) -> FloatArray:
     """Return the values of some ids, NaN for those that have none."""
     out = np.full((len(wanted), *values.shape[1:]), np.nan)
@@ -344,43 +344,21 @@ def _rows_by_id(wanted: IdArray, ids: IdArray, values: FloatArray) -> FloatArray
     return out
 
 
-def _poses_of(scene: Scene, rows: IntArray) -> Poses:
-    """Return the poses of some keyframes."""
-    table = scene.keyframes
-    return Poses(
-        table.keyframe_id[rows],
-        table.stamp_ns[rows],
-        table.position[rows],
-        geometry.quaternion_from_matrix(table.rotation[rows]),
-    )
-
-
 def _taking_part_of(scene: Scene, selection: window.Selection) -> IntArray:
     """Return the keyframes of the window and of the problem, oldest first."""
-    marked = np.zeros(len(scene.keyframes), bool)
-    marked[selection.window] = True
-    marked[selection.keyframes] = True
-    return scene.order[marked[scene.order]]
+    return scene.by_time(scene.distinct(np.concatenate([selection.window, selection.keyframes])))
 
 
 def _end_of_solve(scene: Scene, due: IntArray, window_size: int) -> int:
     """Return how many keyframes, oldest first, there are up to the newest that the next solve is to refine."""
-    n = len(scene.order)
-    waiting = np.flatnonzero(_marked(scene, due)[scene.order])
+    n = len(scene.keyframes)
+    first = int(scene.places()[due].min(initial=n))
     # With one solved keyframe at least in the window the newest can be reached at once.
-    if not len(waiting) or n - waiting[0] < window_size or n <= window_size:
+    if first == n or n - first < window_size or n <= window_size:
         return n
-    return int(waiting[0]) + window_size // 2
+    return first + window_size // 2
 
 
 def _reached(scene: Scene, due: IntArray, end: int) -> IntArray:
     """Return which keyframes of those that are due stand among the first ``end``, oldest first."""
-    first = scene.order[:end]
-    rows: IntArray = first[_marked(scene, due)[first]]
-    return rows
-
-
-def _marked(scene: Scene, due: IntArray) -> BoolArray:
-    marked = np.zeros(len(scene.keyframes), bool)
-    marked[due] = True
-    return marked
+    return scene.by_time(due[scene.places()[due] < end])

@@ -6,7 +6,8 @@ Prints how well the usual mistakes explain the tracks, the likely one, and what 
 stand the share of the tracks that agree with a hypothesis, and by how much it is off what the tracks say by themselves.
 
 Exit code: 0 the set-up fits the tracks, 2 the recording cannot be read or has too little to tell, 3 a mistake is
-likely, or something else is to be looked at: stamps that jump, messages that were turned away.
+likely, or something else is to be looked at: stamps that jump, messages that were turned away. Of several recordings a
+table says what each gives; the code is the highest of any but one that cannot be read, which is named: 3.
 """
 
 from __future__ import annotations
@@ -20,10 +21,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import add_parameter_options, parameters, require_folder, table
+from ba_node.cli.console import (
+    add_fleet_options,
+    add_parameter_options,
+    parameters,
+    progress_bar,
+    table,
+    write_result,
+)
 
 if TYPE_CHECKING:
     from ba_node.backend import Diagnosis, Row
+    from ba_node.config import Config
 
 SUMMARY = "test calibration and conventions of a recording against its tracks"
 EXAMPLE = "ba check bags/stereo_loop.mcap"
@@ -37,19 +46,19 @@ _SHOWN = {"free": "best fit to the tracks, whatever is given"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("bag", type=Path, metavar="RECORDING")
+    parser.add_argument("bag", nargs="+", metavar="RECORDING", help="a file, a folder, or a URL; repeatable")
+    add_fleet_options(parser)
     add_parameter_options(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all of it as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    from ba_node.io.files import write_json  # noqa: PLC0415
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
-    require_folder(args.json)
     config = parameters(args)
-    sessions = check_recording(args.bag, config)
+    if len(args.bag) > 1 or args.scheduler or "://" in args.bag[0]:
+        return _check_all(args, config)
+    sessions = check_recording(Path(args.bag[0]), config)
     for number, session in enumerate(sessions, start=1):
         if len(sessions) > 1:
             first, last = (stamp_ns * 1e-9 for stamp_ns in session.stamps_ns)
@@ -60,11 +69,27 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         for text in session.warnings:
             print(f"ba: warning: {text}", file=sys.stderr)
-    if args.json is not None:
-        write_json(args.json, {"sessions": [session.as_dict() for session in sessions]})
+    write_result(args.json, {"sessions": [session.as_dict() for session in sessions]})
     if any(session.found.findings or session.warnings for session in sessions):
         return MISTAKE
     return 0 if any(session.found.sound for session in sessions) else TOO_LITTLE
+
+
+def _check_all(args: argparse.Namespace, config: Config) -> int:
+    """Check many recordings."""
+    from ba_node.io.mcap import TopicChoice  # noqa: PLC0415
+    from ba_node.offline import batch  # noqa: PLC0415
+    from ba_node.offline.fleet import Fleet, expand  # noqa: PLC0415
+
+    tasks = [batch.ReplayTask((place,), "", config, TopicChoice()) for place in expand(args.bag)]
+    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("check", "recordings") as progress:
+        rows = batch.check_all(fleet, tasks, progress)
+    for row in rows:
+        print(f"{row['recording']}: {row['state']}", *_wrapped(row["note"], _WIDTH, "    ", "    "), sep="\n")
+    write_result(args.json, {"recordings": rows})
+    if all(row["state"] == batch.FAILED for row in rows):
+        return TOO_LITTLE
+    return 0 if all(row["state"] == batch.OK for row in rows) else MISTAKE
 
 
 def _print(found: Diagnosis) -> None:

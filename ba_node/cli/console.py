@@ -5,15 +5,22 @@
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ba_node.config import Config
     from ba_node.io.bag_topics import TopicChoice
+
+
+STANDARD_OUTPUT = Path("-")
+_out: list[IO[str]] = []
+_written: list[Path | None] = []
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -34,6 +41,18 @@ def facts(rows: Sequence[tuple[str, str]]) -> str:
     """Return pairs of name and value, one a line."""
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name.ljust(width)}  {value}".rstrip() for name, value in rows)
+
+
+# By the first letters of what is shown, as on every terminal: red, yellow, green.
+_COLOURS = {"WORSE": 31, "MISSING": 31, "error": 31, "warning": 33, "better": 32, "ok": 32}
+
+
+def coloured(text: str) -> str:
+    """Return a word in its colour if somebody looks at a terminal that shows it (NO_COLOR: no), else as it is."""
+    code = _COLOURS.get(text)
+    if code is None or not sys.stdout.isatty() or "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb":
+        return text
+    return f"\x1b[{code}m{text}\x1b[0m"
 
 
 @contextmanager
@@ -67,6 +86,46 @@ def require_mcap(path: Path, otherwise: str = "") -> None:
         raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so{otherwise}")
 
 
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Declare the option that has a command's result written for programs, unless the command has one of its own."""
+    if "--json" not in parser.format_usage():
+        words = "write the result as JSON; - for standard output, instead of the text"
+        parser.add_argument("--json", type=Path, metavar="FILE", help=words)
+        parser.set_defaults(common_json=True)
+
+
+def write_result(path: Path | None, content: Mapping[str, Any]) -> None:
+    """Write what a command found as JSON where it was asked for."""
+    from ba_node.io.files import json_text, write_json  # noqa: PLC0415
+
+    _written.append(path)
+    if path == STANDARD_OUTPUT:
+        _out[-1].write(json_text(content))
+    elif path is not None:
+        write_json(path, content)
+
+
+def conclude(args: argparse.Namespace, code: int) -> None:
+    """Write the exit code as the result of a command that has no other."""
+    if args.json is not None and args.json not in _written and getattr(args, "common_json", False):
+        write_result(args.json, {"command": args.command, "exit_code": code})
+    _written.clear()
+
+
+@contextmanager
+def json_alone(path: Path | None) -> Iterator[None]:
+    """Keep the text of a command from standard output while the block runs, if its JSON is to go there."""
+    if path != STANDARD_OUTPUT:
+        yield
+        return
+    _out.append(sys.stdout)
+    try:
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        _out.pop().flush()
+
+
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of commands that read the inputs of the node from a recording."""
     parser.add_argument(
@@ -88,6 +147,14 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="set a parameter, after the file; repeatable"
+    )
+
+
+def add_fleet_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that work on many recordings."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes on this machine (default: 1)")
+    parser.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="scheduler of a Dask cluster, e.g. tcp://host:8786"
     )
 
 

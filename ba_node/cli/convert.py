@@ -11,6 +11,11 @@ A recording comes out as the back-end refines it with its defaults, as in `ba re
 image as a keyframe, 0.1 s apart, its points as landmark guesses and its ids as the indices in the file; pixels are
 float32 in the messages. Pixels of COLMAP count from the corner of the image, those here from the middle of the first
 pixel: half a pixel is added and taken away.
+
+With --from, IN is a recording of what another front-end published, and OUT its keyframes and tracks: openvins
+(loop_pose, loop_feats, loop_extrinsic, loop_intrinsics), vins_fusion (keyframe_pose, keyframe_point, extrinsic),
+vins_mono (feature, keyframe_pose or odometry, extrinsic), rtabmap (odom, odom_info; without these mapData, which is
+rtabmap_map). --topic then names these. Exit code 3: messages were there that could not be read.
 """
 
 from __future__ import annotations
@@ -18,13 +23,24 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import add_topic_options, require_folder, require_mcap, topic_choice
+from ba_node.cli.console import (
+    TargetError,
+    add_topic_options,
+    require_folder,
+    require_mcap,
+    topic_choice,
+    write_result,
+)
 
 SUMMARY = "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY"
 EXAMPLE = (
     "ba convert sparse/0 scene.mcap\n  ba convert bags/stereo_loop.mcap model/\n"
-    "  ba convert problem-49-7776-pre.txt ladybug.mcap\n  ba convert out/trajectory.tum poses.txt --to kitti"
+    "  ba convert problem-49-7776-pre.txt ladybug.mcap\n  ba convert out/trajectory.tum poses.txt --to kitti\n"
+    "  ba convert openvins.mcap keyframes.mcap --from openvins"
 )
+NEEDS_A_LOOK = 3
+# What no sound recording of another front-end has.
+_FAULTS = ("malformed", "undecodable", "inexact_id", "not_finite", "bad_camera", "unknown_camera")
 _FORMATS = ("mcap", "colmap", "colmap-text", "bundler", "bal", "tum", "kitti", "g2o", "ply")
 
 
@@ -34,10 +50,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", type=Path, metavar="OUT")
     parser.add_argument("--to", choices=_FORMATS, help="format of OUT, where its name does not tell it")
     add_topic_options(parser)
+    _add_front_end_options(parser.add_argument_group("recordings of other front-ends"))
+
+
+def _add_front_end_options(parser: argparse._ArgumentGroup) -> None:
+    from ba_node.messages.adapters import SOURCES  # noqa: PLC0415  # slow to import
+
+    parser.add_argument("--from", dest="front_end", choices=SOURCES, help="which of them it is")
+    parser.add_argument("--rig", type=Path, nargs="+", metavar="FILE", help="cameras, in any form that ba rig reads")
+    parser.add_argument("--tolerance", type=float, default=1e-3, metavar="S", help="stamps pair within (%(default)s)")
+    parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")
+    parser.add_argument("--cameras", type=int, default=1, metavar="N", help="NUM_OF_CAM of vins_mono (%(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Convert."""
+    if args.front_end:
+        return _convert_front_end(args)
     from ba_node.offline import convert  # noqa: PLC0415
 
     form = convert.format_of(args.target, args.to)
@@ -47,4 +76,24 @@ def run(args: argparse.Namespace) -> int:
     what = convert.read(args.source, topic_choice(args))
     left_out = convert.write(args.target, what, form)
     print(f"{args.target}: {convert.counts(what)}{f', without {left_out}' if left_out else ''}")
+    write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})
     return 0
+
+
+def _convert_front_end(args: argparse.Namespace) -> int:
+    from ba_node.messages.adapters import AdapterOptions  # noqa: PLC0415
+    from ba_node.offline.adapt import adapt  # noqa: PLC0415
+    from ba_node.offline.rig import load_rig  # noqa: PLC0415
+
+    require_mcap(args.target)
+    topics = dict(text.split("=", 1) for text in args.topic if "=" in text)
+    if len(topics) < len(args.topic):
+        raise TargetError(f"--topic {' '.join(args.topic)}: expected NAME=TOPIC, each name once")
+    rig = load_rig(args.rig) if args.rig else None
+    options = AdapterOptions(args.tolerance, args.parallax, rig=rig)
+    adapter = adapt(args.source, args.target, args.front_end, options, args.cameras, topics)
+    print(f"{args.target}: {adapter.summary()}")
+    write_result(args.json, {"summary": adapter.summary(), "notes": list(adapter.told())})
+    for note in adapter.told():
+        print(f"  {note}")
+    return NEEDS_A_LOOK if any(adapter.counted[reason] for reason in _FAULTS) else 0

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ba_node.cli import interrupts
-from ba_node.cli.console import facts, table
+from ba_node.cli.console import facts, table, write_result
 
 if TYPE_CHECKING:
     from ba_node.offline.demo import Outcome
@@ -48,6 +48,14 @@ def run(args: argparse.Namespace) -> int:
             rows.append([f"{kind} {name} [{unit}]", *(f"{x:.4f}" for x in shown)])
     print(f"\n{table(['error to ground truth', 'rmse', 'median', 'max'], rows)}\n")
     print(facts(_rows(outcome)))
+    write_result(
+        args.json,
+        {
+            "error_m": {name: error.translation.as_dict() for name, error in errors.items()},
+            "error_deg": {name: error.rotation.as_dict() for name, error in errors.items()},
+            "facts": dict(_rows(outcome)),
+        },
+    )
     print(f"written to {args.out}: trajectory.png, trajectory.tum, points.ply, ...")
     return 0
 

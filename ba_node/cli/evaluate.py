@@ -14,7 +14,7 @@ import csv
 import io
 from pathlib import Path
 
-from ba_node.cli.console import require_folder, table
+from ba_node.cli.console import require_folder, table, write_result
 
 SUMMARY = "compare a trajectory with a reference"
 EXAMPLE = "ba evaluate out/trajectory.tum ground_truth.tum --align se3 --interval 1 --unit m"
@@ -48,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest difference of the stamps of a pair, s (default: 0.01)",
     )
     parser.add_argument("--reference-topic", default="", metavar="TOPIC", help="topic of poses in a recording")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the errors as JSON too")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the errors as CSV too")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw both trajectories and the error over time")
 
@@ -57,10 +56,10 @@ def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from ba_node.evaluation import relative  # noqa: PLC0415
     from ba_node.evaluation.metrics import absolute_error_of, pair  # noqa: PLC0415
-    from ba_node.io.files import whole_file, write_json  # noqa: PLC0415
+    from ba_node.io.files import whole_file  # noqa: PLC0415
     from ba_node.io.reference import read_pair  # noqa: PLC0415
 
-    for path in (args.json, args.csv, args.plot):
+    for path in (args.csv, args.plot):
         require_folder(path)
     estimate, reference = read_pair(args.estimate, args.reference, args.reference_topic)
     paired = pair(estimate, reference, args.align, args.max_difference)
@@ -76,9 +75,8 @@ def run(args: argparse.Namespace) -> int:
     print(_table(found, f"{interval}, {len(moved.pairs)} pairs"))
     if args.align == "sim3":
         print(f"scale {paired.alignment.scale:.9f}")
-    if args.json:
-        about = {"align": args.align, "scale": paired.alignment.scale, "interval": args.interval, "unit": args.unit}
-        write_json(args.json, about | found)
+    about = {"align": args.align, "scale": paired.alignment.scale, "interval": args.interval, "unit": args.unit}
+    write_result(args.json, about | found)
     if args.csv:
         text = io.StringIO(newline="")
         rows = csv.writer(text, lineterminator="\n")

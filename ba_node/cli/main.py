@@ -20,14 +20,44 @@ from typing import Any, NoReturn
 from ba_node import __version__
 from ba_node.cli import interrupts
 from ba_node.cli.checkout import CheckoutCommand
+from ba_node.cli.console import add_json_option, conclude, json_alone, require_folder
 
 # Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "refine": ("replay", "solve", "calibrate", "map"),
-    "look": ("check", "report", "evaluate"),
-    "recordings and files": ("convert", "synth"),
-    "the running node": ("play", "demo", "params"),
-    "in a checkout of the repository": ("steps", "robustness", "thesis"),
+    "refine": (
+        "replay",
+        "tune",
+        "sweep",
+        "solve",
+        "calibrate",
+        "map",
+    ),
+    "look": (
+        "info",
+        "check",
+        "view",
+        "report",
+        "evaluate",
+        "regress",
+    ),
+    "recordings and files": (
+        "cut",
+        "merge",
+        "convert",
+        "rig",
+        "synth",
+    ),
+    "the running node": (
+        "record",
+        "play",
+        "demo",
+        "params",
+    ),
+    "in a checkout of the repository": (
+        "steps",
+        "robustness",
+        "thesis",
+    ),
 }
 _IN_A_CHECKOUT = (
     CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
@@ -120,6 +150,8 @@ def build_parser(command: str) -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         module.add_arguments(sub)
+        if module is entry:
+            add_json_option(sub)
     return parser
 
 
@@ -155,7 +187,12 @@ def _run(argv: Sequence[str] | None) -> int:
     command = next((word for word in arguments if not word.startswith("-")), "")
     try:
         args = build_parser(command).parse_args(arguments)
-        code: int = COMMANDS[args.command].run(args)
+        asked = getattr(args, "json", None)
+        require_folder(asked)
+        with json_alone(asked):
+            code: int = COMMANDS[args.command].run(args)
+            if asked is not None:
+                conclude(args, code)
         sys.stdout.flush()
         return code
     except BrokenPipeError:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import TargetError, facts, require_folder
+from ba_node.cli.console import TargetError, facts, require_folder, write_result
 
 SUMMARY = "look into a saved map, or export it"
 EXAMPLE = "ba map export site.npz --tum poses.tum --ply points.ply"
@@ -36,8 +36,10 @@ def run(args: argparse.Namespace) -> int:
         require_folder(path)
     backend = saved_map.open_map(args.map)
     estimate = backend.estimate()
+    known = saved_map.facts(backend)
+    write_result(args.json, dict(known))
     if args.what == "info":
-        print(facts(saved_map.facts(backend)))
+        print(facts(known))
     if args.tum:
         write_tum(args.tum, estimate.trajectory)
         print(f"{args.tum}: {len(estimate.trajectory)} poses")

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import argparse
 
+from ba_node.cli.console import write_result
+
 SUMMARY = "print all parameters with their defaults"
 EXAMPLE = "ba params > my.yaml"
 
@@ -22,5 +24,6 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.config import Config  # noqa: PLC0415
     from ba_node.io.parameters import parameters_markdown, parameters_yaml  # noqa: PLC0415
 
+    write_result(args.json, Config().values())
     print(parameters_markdown() if args.markdown else parameters_yaml(Config()), end="")
     return 0

@@ -8,11 +8,12 @@ Play begins when the node listens, and ends when everything has been acknowledge
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
 
 from ba_node.cli import interrupts
-from ba_node.cli.console import progress_bar
+from ba_node.cli.console import progress_bar, write_result
 
 SUMMARY = "publish a recording on live topics"
 EXAMPLE = (
@@ -74,5 +75,6 @@ def run(args: argparse.Namespace) -> int:
         summary = play(args.bag, options, Listener(progress, lambda text: print(f"ba: {text}", file=sys.stderr)))
     for topic, count in summary.published.items():
         print(f"{topic}: {count} messages")
+    write_result(args.json, dataclasses.asdict(summary))
     print(f"played in {summary.duration_s:.1f} s")
     return 0 if not summary.unconfirmed else 1

@@ -11,6 +11,11 @@ Exit code: 0 all is well, 2 nothing was written (keyframes, tracks or cameras ar
 written, but something has to be looked at: input that was turned away, solutions that were not taken, nothing refined
 at all (empty tracks, one keyframe, all known already), stamps that jumped, a set-up that looks wrong. Each has a line
 of its own on the terminal and stands under "attention" in report.json.
+
+Several recordings are replayed each by itself, into DIR/NAME, by as many processes as --jobs says or by a Dask cluster;
+results.csv, results.json and index.html in DIR hold them all. One that fails is named and stops no other: the code is 3
+then, and 2 if all have failed. Files called NAME_0, NAME_1, ... are parts of one recording, unless --each is given.
+Recordings and DIR may be URLs (s3://..., with wildcards), see docs/fleet.md.
 """
 
 from __future__ import annotations
@@ -20,23 +25,30 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ba_node.cli.console import (
+    TargetError,
+    add_fleet_options,
     add_parameter_options,
     add_topic_options,
     facts,
     parameters,
     progress_bar,
     require_folder,
+    table,
     topic_choice,
+    write_result,
 )
 from ba_node.config import ConfigError
 from ba_node.offline.attention import HARMLESS
 
+if TYPE_CHECKING:
+    from ba_node.config import Config
+
 SUMMARY = "run the back-end on a recording, without a middleware"
 # Results were written, and something in them has to be looked at.
-ATTENTION = 3
+ATTENTION, NOTHING = 3, 2
 
 EXAMPLE = "ba replay bags/stereo_loop.mcap --out out/replay --set window.max_keyframes=30"
 
@@ -49,11 +61,14 @@ _ERRORS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "bag", type=Path, nargs="+", metavar="BAG", help="recording: .mcap or .db3, a folder, or files in any order"
+        "bag", nargs="+", metavar="BAG", help="recording: .mcap or .db3, a folder, files in any order, or a URL"
     )
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the results; made if missing")
+    parser.add_argument("--each", action="store_true", help="every BAG is a recording by itself, whatever it is called")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the results; made if missing"
+        "--resume", action="store_true", help="of several, leave alone those whose results are there already"
     )
+    add_fleet_options(parser)
     add_topic_options(parser)
     add_parameter_options(parser)
     parser.add_argument(
@@ -73,6 +88,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay."""
+    from ba_node.offline.batch import recordings  # noqa: PLC0415
+    from ba_node.offline.fleet import is_url  # noqa: PLC0415
     from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
 
     require_folder(args.save_map)
@@ -81,6 +98,10 @@ def run(args: argparse.Namespace) -> int:
     config = parameters(args)
     if config.calibration.wanted and not args.final_optimize:
         raise ConfigError("calibration.* = refined is for a solve of everything: add --final-optimize")
+    found = recordings(args.bag, each=args.each)
+    if len(found) > 1 or args.scheduler or any(map(is_url, (args.bag[0], args.out))):
+        return _replay_all(args, config, found)
+    args.bag, args.out = list(map(Path, found[0])), Path(args.out)
     with progress_bar("replay", "messages") as progress:
         wanted = args.final_optimize, args.final_optimize and args.covariance
         options = MapOptions(args.load_map, *wanted, args.save_map, topic_choice(args))
@@ -88,7 +109,49 @@ def run(args: argparse.Namespace) -> int:
     print(facts(_rows(report)))
     _tell(report)
     print(f"written to {args.out}{'' if args.no_report else _pictures(args.out)}")
+    write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
+
+
+def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str, ...]]) -> int:
+    """Replay many recordings."""
+    from ba_node.offline import batch  # noqa: PLC0415
+    from ba_node.offline.fleet import Fleet, is_url  # noqa: PLC0415
+
+    alone = [name for name in ("load_map", "save_map", "final_optimize") if getattr(args, name)]
+    if alone:
+        raise TargetError(f"--{alone[0].replace('_', '-')} is for one recording: give it alone, by its path")
+    tasks = [
+        batch.ReplayTask(
+            group, f"{args.out}/{name}", config, topic_choice(args), not args.no_report, args.resume, time.perf_counter
+        )
+        for group, name in zip(found, batch.folder_names(found), strict=True)
+    ]
+    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("replay", "recordings") as progress:
+        rows = batch.replay_all(fleet, tasks, progress)
+    print(table(list(batch.COLUMNS.values())[:-1], [batch.cells(row)[:-1] for row in rows]))
+    for row in rows:
+        if row["state"] == batch.LOOK:
+            print(f"ba: warning: {_named(row)}", file=sys.stderr)
+    failed = [row for row in rows if row["state"] == batch.FAILED]
+    for row in failed:
+        print(f"ba: error: {row['note'] if row['recording'] in row['note'] else _named(row)}", file=sys.stderr)
+    if not is_url(args.out):
+        missing = batch.write_results(Path(args.out), rows)
+        print(f"written to {args.out}: {missing or 'index.html, results.csv, results.json, a folder a recording'}")
+        lost = [row for row in rows if row not in failed and not (Path(row["folder"]) / "report.json").is_file()]
+        if lost:
+            raise TargetError(
+                f"{args.out}: {len(lost)} results are not there: the workers wrote them to disks of their own; give a"
+                " folder that all machines share, or a URL"
+            )
+    if len(failed) == len(rows):
+        return NOTHING
+    return 0 if all(row["state"] == batch.OK for row in rows) else ATTENTION
+
+
+def _named(row: Mapping[str, Any]) -> str:
+    return f"{row['recording']}: {row['note']}"
 
 
 def _pictures(out: Path) -> str:

@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import require_folder
+from ba_node.cli.console import require_folder, write_result
 
 if TYPE_CHECKING:
     from ba_node.estimate import Iteration
@@ -64,7 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help=f"change an option, one of {', '.join(name for name in options if name != 'method')}; repeatable",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write trace, options and statistics as JSON")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the refined problem in its own format")
     parser.add_argument(
         "--refine",
@@ -78,15 +77,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve."""
-    from ba_node.io.files import write_json  # noqa: PLC0415
-
-    require_folder(args.json)
     require_folder(args.out)
     solution = _solved(args)
     summary = solution.as_dict()
     summary["peak_rss_mb"] = _peak_rss_mb()
-    if args.json:
-        write_json(args.json, summary)
+    write_result(args.json, summary)
     if not solution.result.status.usable:
         print(f"ba: error: {args.problem}: {solution.result.status.name.lower()}: {summary['reason']}", file=sys.stderr)
         return NOTHING

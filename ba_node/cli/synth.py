@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ba_node.cli import checkout
-from ba_node.cli.console import TargetError, require_folder, require_mcap
+from ba_node.cli.console import TargetError, require_folder, require_mcap, write_result
 
 if TYPE_CHECKING:
     from ba_node.config import Parameter
@@ -88,6 +88,8 @@ def _recording(args: argparse.Namespace, given: dict[str, Any]) -> int:
     data = generate(SyntheticOptions(**given))
     count = record(args.target, data.timeline(), data.truth)
     observations = sum(len(image.track_id) for images in data.tracks for image in images)
+    made = {"messages": count, "keyframes": len(data.keyframes), "tracks": len(data.track_id)}
+    write_result(args.json, made | {"observations": observations})
     print(
         f"{args.target}: {count} messages; {len(data.keyframes)} keyframes, {len(data.track_id)} tracks,"
         f" {observations} observations"
@@ -102,7 +104,9 @@ def _sphere(args: argparse.Namespace, given: dict[str, Any]) -> int:
             f"{args.target}: BAL problems are written as {', '.join(_BAL)}: give a name that ends so,"
             f" or leave out --kind {_SPHERE} for a recording"
         )
-    print(_spheres().make(args.target, args.preset, given))
+    text = _spheres().make(args.target, args.preset, given)
+    write_result(args.json, {"made": text})
+    print(text)
     return 0
 
 

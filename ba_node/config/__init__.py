@@ -19,6 +19,7 @@ from ba_node.config.declaration import (
     Choice,
     ConfigError,
     Parameter,
+    Tune,
     Value,
     declared,
     option,
@@ -27,6 +28,7 @@ from ba_node.config.declaration import (
 )
 from ba_node.config.estimation import (
     CalibrationConfig,
+    FactorsConfig,
     GuardConfig,
     OdometryConfig,
     SceneConfig,
@@ -43,6 +45,7 @@ __all__ = [
     "Config",
     "ConfigError",
     "DiagnosticsConfig",
+    "FactorsConfig",
     "FramesConfig",
     "GuardConfig",
     "NodeConfig",
@@ -53,6 +56,7 @@ __all__ = [
     "SolverConfig",
     "SolverOptions",
     "TracksConfig",
+    "Tune",
     "Value",
     "WindowConfig",
     "declarations",
@@ -80,6 +84,7 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    factors: FactorsConfig = field(default_factory=FactorsConfig)
     solver: SolverConfig = field(default_factory=lambda: _defaults(SolverConfig))
     guard: GuardConfig = field(default_factory=GuardConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)

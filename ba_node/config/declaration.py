@@ -31,6 +31,16 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Tune:
+    """The range in which an option is worth tuning, and for what."""
+
+    low: float
+    high: float
+    presets: tuple[str, ...] = ("accuracy",)  # sets of parameters that it belongs to: accuracy, latency
+    log: bool = True  # by its logarithm: half and twice as much are as far away
+
+
+@dataclass(frozen=True)
 class Parameter:
     """One declared option."""
 
@@ -44,6 +54,7 @@ class Parameter:
     maximum: float | None = None  # largest allowed number, None if unbounded
     allowed: tuple[Choice, ...] = ()  # what it may be, if it is chosen by name; empty if not
     aliases: tuple[str, ...] = ()  # other names of the option
+    tune: Tune | None = None  # where it is worth tuning; None if it is not, or chosen by name
     live: bool = True  # True if a change takes effect at the next solve, False if only at start
 
     @property

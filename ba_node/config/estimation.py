@@ -6,21 +6,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ba_node.config.declaration import Choice, option
+from ba_node.config.declaration import Choice, Tune, option
 
 
 @dataclass(frozen=True)
 class WindowConfig:
     """Which keyframes and tracks take part in a solve."""
 
-    max_keyframes: int = option(20, "Newest keyframes whose poses are refined in each solve.", within=(2, 100_000))
+    max_keyframes: int = option(
+        20,
+        "Newest keyframes whose poses are refined in each solve.",
+        within=(2, 100_000),
+        tune=Tune(4, 60, ("accuracy", "latency")),
+    )
     max_fixed_keyframes: int = option(
         20,
         "Older keyframes that see the window's points and take part with fixed poses; most shared tracks first.",
         within=(0, 100_000),
+        tune=Tune(0, 40, ("accuracy", "latency"), log=False),
     )
     max_landmarks: int = option(
-        5000, "Points in a solve; beyond it those with the fewest observations are left out.", within=(10, 10_000_000)
+        5000,
+        "Points in a solve; beyond it those with the fewest observations are left out.",
+        within=(10, 10_000_000),
+        tune=Tune(200, 20_000, ("latency",)),
     )
 
 
@@ -55,21 +64,27 @@ class TracksConfig:
         "Smallest angle between two viewing rays of a track for it to be triangulated.",
         unit="deg",
         within=(0.0, 90.0),
+        tune=Tune(0.1, 5.0),
     )
     max_triangulation_px: float = option(
         12.0,
         "Largest reprojection error, in sigmas, of a view that agrees where a point begins; half of it for two views.",
         unit="px",
         within=(0.1, 1e6),
+        tune=Tune(3.0, 40.0),
     )
     outlier_px: float = option(
         6.0,
         "Observations beyond this many sigmas (at least 4.4 x the median) sit out the next solve; 0 keeps all.",
         unit="px",
         within=(0.0, 1e6),
+        tune=Tune(1.5, 20.0),
     )
     depth_sigma_ratio: float = option(
-        0.02, "Standard deviation of a measured depth, as a share of the depth.", within=(1e-6, 10.0)
+        0.02,
+        "Standard deviation of a measured depth, as a share of the depth.",
+        within=(1e-6, 10.0),
+        tune=Tune(0.003, 0.3, ()),
     )
 
 
@@ -79,17 +94,31 @@ class OdometryConfig:
 
     enabled: bool = option(True, "Let the steps count; they give one camera its scale, and hold what images do not.")
     sigma_m: float = option(
-        0.001, "Standard deviation of a step's translation along each axis at rest.", unit="m", within=(0.0, 1e6)
+        0.001,
+        "Standard deviation of a step's translation along each axis at rest.",
+        unit="m",
+        within=(0.0, 1e6),
+        tune=Tune(1e-4, 0.1, ()),
     )
-    sigma_m_per_m: float = option(0.01, "The same, added for each metre of the step.", unit="m/m", within=(0.0, 1e6))
+    sigma_m_per_m: float = option(
+        0.01, "The same, added for each metre of the step.", unit="m/m", within=(0.0, 1e6), tune=Tune(1e-3, 0.3)
+    )
     sigma_rad: float = option(
-        0.001, "Standard deviation of a step's rotation about each axis at rest.", unit="rad", within=(0.0, 1e3)
+        0.001,
+        "Standard deviation of a step's rotation about each axis at rest.",
+        unit="rad",
+        within=(0.0, 1e3),
+        tune=Tune(1e-4, 0.1, ()),
     )
     sigma_rad_per_m: float = option(
-        0.003, "The same, added for each metre of the step.", unit="rad/m", within=(0.0, 1e3)
+        0.003, "The same, added for each metre of the step.", unit="rad/m", within=(0.0, 1e3), tune=Tune(3e-4, 0.1)
     )
     sigma_rad_per_rad: float = option(
-        0.01, "The same, added for each radian of the step.", unit="rad/rad", within=(0.0, 1e3)
+        0.01,
+        "The same, added for each radian of the step.",
+        unit="rad/rad",
+        within=(0.0, 1e3),
+        tune=Tune(1e-3, 0.3, ()),
     )
     max_inflation: float = option(
         10.0,
@@ -100,6 +129,38 @@ class OdometryConfig:
         1.0,
         "Where Cauchy's loss leaves the square, in standard deviations: steps that are off by far more count little.",
         within=(1e-3, 1e6),
+        tune=Tune(0.3, 10.0, ()),
+    )
+
+
+@dataclass(frozen=True)
+class FactorsConfig:
+    """What is known beside pixels and steps: relative poses, priors, gravity, loops. See docs/factors.md."""
+
+    enabled: bool = option(True, "Let what comes on their topics count.")
+    loss_scale: float = option(
+        3.0,
+        "Where Cauchy's loss leaves the square, in standard deviations: what contradicts the rest by far pulls little.",
+        within=(1e-3, 1e6),
+    )
+    gnss_sigma_m: float = option(
+        5.0, "Standard deviation of a fix of GNSS that tells no covariance.", unit="m", within=(1e-4, 1e6)
+    )
+    antenna_x_m: float = option(0.0, "Where the antenna is on the body.", unit="m", within=(-1e3, 1e3))
+    antenna_y_m: float = option(0.0, "The same, y.", unit="m", within=(-1e3, 1e3))
+    antenna_z_m: float = option(0.0, "The same, z.", unit="m", within=(-1e3, 1e3))
+    align_m: float = option(
+        10.0,
+        "How far the path has to spread (standard deviation) before map and world are aligned by positions alone; at"
+        " least five times the noise of these. With measured orientations at once.",
+        unit="m",
+        within=(0.0, 1e6),
+    )
+    adjust_m: float = option(
+        0.3,
+        "A loop or priors that move a keyframe further begin a solve of everything; 0: never.",
+        unit="m",
+        within=(0.0, 1e6),
     )
 
 

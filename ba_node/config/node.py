@@ -96,6 +96,12 @@ class NodeConfig:
         " services refuse.",
         live=False,
     )
+    load_map: str = option(
+        "", "File below node.map_folder with the map to begin with, if it is there; empty: an empty map.", live=False
+    )
+    save_map: str = option(
+        "", "File below node.map_folder that the map is saved to at cleanup and shutdown; empty: none.", live=False
+    )
     queue_depth: int = option(100, "QoS depth of the input subscriptions.", within=(1, 100_000), live=False)
     silence_s: float = option(
         10.0,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ba_node.config.declaration import Choice, ConfigError, declared, option
+from ba_node.config.declaration import Choice, ConfigError, Tune, declared, option
 
 _INC = "D = 1/step, the steps of the search for the best forward differences"
 
@@ -89,12 +89,14 @@ class SolverConfig:
         within=(1e-6, 1e6),
         aliases=("loss_scale", "gamma"),
         node={"default": 2.0},
+        tune=Tune(0.5, 10.0),
     )
     max_iterations: int = option(
         50,
         "Cap on outer iterations of a solve, rejected ones included.",
         within=(1, 100_000),
         node={"default": 12},
+        tune=Tune(2, 50, ("accuracy", "latency")),
     )
     max_linear_iterations: int = option(
         500, "Cap on PCG steps in one outer iteration.", within=(1, 1_000_000), aliases=("cap",), node={}
@@ -104,6 +106,7 @@ class SolverConfig:
         "Stop when an accepted step lowers the objective by less than this share.",
         within=(0.0, 1.0),
         node={"default": 1e-3},
+        tune=Tune(1e-6, 1e-1, ("accuracy", "latency")),
     )
     gradient_tolerance: float = option(
         1e-9, "Stop when the norm of the gradient falls below this.", within=(0.0, 1e12), node={}

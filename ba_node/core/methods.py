@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 from ba_node.config import SolverConfig, SolverOptions
 
@@ -66,6 +67,7 @@ def options(name: str) -> SolverOptions:
     return METHODS[name]
 
 
+@functools.lru_cache(maxsize=16)
 def from_config(config: SolverConfig) -> SolverOptions:
     """Return what the parameters ``solver.*`` ask for, and what their method chooses where they leave it open."""
     method = options(config.method)

@@ -102,6 +102,15 @@ class KeyframeFactors(Protocol):
 
 
 @dataclass(frozen=True)
+class PointPriors:
+    """Points whose places were measured."""
+
+    point: IntArray  # (n,) index into the points, all different
+    position: FloatArray  # (n, 3) m
+    covariance: FloatArray  # (n, 3, 3) m^2, positive definite
+
+
+@dataclass(frozen=True)
 class Problem:
     """A problem: start values, what is fixed, cameras and observations."""
 
@@ -110,6 +119,7 @@ class Problem:
     cameras: Cameras  # the rig
     observations: Observations  # sorted by point
     factors: tuple[KeyframeFactors, ...] = ()  # all terms of the objective that are not reprojections, see factors.py
+    point_priors: PointPriors | None = None  # of points, see point_priors.py; None for none
 
     @property
     def n_keyframes(self) -> int:

@@ -31,7 +31,7 @@ from dataclasses import replace
 import numpy as np
 
 from ba_node.config import ConfigError, SolverOptions
-from ba_node.core import covariance, linear, native_kernels
+from ba_node.core import covariance, linear, native_kernels, point_priors
 from ba_node.core.annealing import Annealing
 from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
@@ -69,6 +69,10 @@ def solve(
     """
     options.check()
     problem.check()
+    if problem.point_priors is not None:
+        whole = point_priors.as_observations(problem)
+        result = solve(whole, options, clock=clock, on_iteration=on_iteration, kernels=kernels, weakest=weakest)
+        return replace(result, state=point_priors.without(result.state, problem))
     if problem.factors and options.schur == "cameras":
         raise ConfigError(
             f"schur = cameras with {problem.n_factors} factors, which couple keyframes with each other: take"

@@ -61,6 +61,14 @@ def _of_one_metadata(files: list[Path]) -> bool:
     return {file.name.removesuffix(PACKED) for file in files} <= names
 
 
+def same_recording(first: Path, second: Path) -> bool:
+    """Return True if two files are parts of one recording, by a metadata.yaml beside them or by their names."""
+    one, other = first.resolve(), second.resolve()
+    if one.parent != other.parent:
+        return False
+    return _of_one_metadata([one, other]) or _base_name(one) == _base_name(other)
+
+
 def _require_common_name(files: list[Path]) -> None:
     """Raise BagError unless files are called as parts of one recording are: alike but for a number at the end."""
     for file in files[1:]:

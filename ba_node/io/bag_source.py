@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from mcap.records import Channel
-from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinitionFormat, QosDurability
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from ba_node.io import ros_types
@@ -23,6 +24,8 @@ from ba_node.io.files import FileKindError, open_regular
 # Any recording; devices and pipes are refused.
 MAX_BYTES = 2**62
 _SQLITE_MAGIC = b"SQLite format 3\x00"
+# By name, or by number as recorders before Iron write it.
+_LATCHED = re.compile(r"durability: (transient_local|1)\b")
 _ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 
@@ -36,6 +39,7 @@ class BagChannel:
     encoding: tuple[str, str]  # of messages and of definitions, as the file names them
     definition: str  # of the type
     count: int | None  # messages in it, None if that is not known
+    is_latched: bool = False  # the last message was kept for those who come later (transient_local)
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,7 @@ def _mcap_channel(index: BagIndex, channel: Channel) -> BagChannel:
         (channel.message_encoding, "" if schema is None else schema.encoding),
         "" if schema is None else schema.data.decode("utf-8", errors="replace"),
         index.counts[channel.id] if index.counts else None,
+        _LATCHED.search(channel.metadata.get("offered_qos_profiles", "")) is not None,
     )
 
 
@@ -131,4 +136,5 @@ def _sqlite_channel(connection: Any) -> BagChannel:
     if not definition and ros_types.is_known(type_name):
         definition = ros_types.schema_text(type_name)
     encoding = (connection.ext.serialization_format, kind)
-    return BagChannel(connection.id, connection.topic, type_name, encoding, definition, connection.msgcount)
+    latched = any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in connection.ext.offered_qos_profiles)
+    return BagChannel(connection.id, connection.topic, type_name, encoding, definition, connection.msgcount, latched)

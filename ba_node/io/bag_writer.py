@@ -12,6 +12,7 @@ from typing import Any
 from mcap.writer import CompressionType, Writer
 
 from ba_node.io import ros_types
+from ba_node.io.bag_source import BagChannel
 from ba_node.io.bag_topics import BagError
 from ba_node.io.files import whole_file
 
@@ -40,18 +41,20 @@ class BagWriter:
 
     Args:
         path: the file, ``*.mcap``; an older one is replaced.
+        streaming: the file has its name from the beginning, and must not be there yet; so it outlives its process.
     """
 
-    def __init__(self, path: Path | str) -> None:
-        self._path = path
+    def __init__(self, path: Path | str, *, streaming: bool = False) -> None:
+        self._path, self._streaming = Path(path), streaming
         self._stack = contextlib.ExitStack()
         self._types: dict[str, tuple[str, bool]] = {}
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._sequences: dict[str, int] = {}
+        self._sequences: dict[int, int] = {}
 
     def __enter__(self) -> BagWriter:
-        stream = self._stack.enter_context(whole_file(self._path))
+        new = self._path.open("xb") if self._streaming else whole_file(self._path)
+        stream = self._stack.enter_context(new)
         # The name of the library must not bring a version, and with it other bytes, into the file.
         self._writer = Writer(stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="ba_node")
@@ -89,9 +92,24 @@ class BagWriter:
             data = ros_types.encode(type_name, message)
         except Exception as error:  # generated encoders raise whatever a wrong value leads them to
             raise BagError(f"{self._path}: topic {topic}: message does not fit {type_name}: {error}") from error
-        channel = self._channel(topic, type_name, latched)
-        sequence = self._sequences.get(topic, 0)
-        self._sequences[topic] = sequence + 1
+        self._add(self._channel(topic, type_name, latched), log_time_ns, data)
+
+    def copy(self, channel: BagChannel, log_time_ns: int, data: bytes) -> None:
+        """Add a message of another recording as it is, with the definition that it had there."""
+        key = f"{channel.topic} {channel.type_name}"
+        if key not in self._channels:
+            kind, encoding = channel.encoding
+            schema = f"{channel.type_name} {channel.definition}"
+            if schema not in self._schemas:
+                text = channel.definition.encode()
+                self._schemas[schema] = self._writer.register_schema(channel.type_name, encoding, text)
+            about = {"offered_qos_profiles": _qos(channel.is_latched)}
+            self._channels[key] = self._writer.register_channel(channel.topic, kind, self._schemas[schema], about)
+        self._add(self._channels[key], log_time_ns, data)
+
+    def _add(self, channel: int, log_time_ns: int, data: bytes) -> None:
+        sequence = self._sequences.get(channel, 0)
+        self._sequences[channel] = sequence + 1
         self._writer.add_message(channel, log_time_ns, data, publish_time=log_time_ns, sequence=sequence)
 
     def _channel(self, topic: str, type_name: str, latched: bool) -> int:
@@ -99,11 +117,14 @@ class BagWriter:
             if type_name not in self._schemas:
                 text = ros_types.schema_text(type_name).encode()
                 self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text)
-            qos = _QOS.format(depth=1 if latched else 10, durability="transient_local" if latched else "volatile")
             self._channels[topic] = self._writer.register_channel(
                 topic,
                 "cdr",
                 self._schemas[type_name],
-                {"offered_qos_profiles": qos, "topic_type_hash": ros_types.type_hash(type_name)},
+                {"offered_qos_profiles": _qos(latched), "topic_type_hash": ros_types.type_hash(type_name)},
             )
         return self._channels[topic]
+
+
+def _qos(latched: bool) -> str:
+    return _QOS.format(depth=1 if latched else 10, durability="transient_local" if latched else "volatile")

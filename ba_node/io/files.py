@@ -135,9 +135,13 @@ def open_regular(path: Path | str, max_bytes: int) -> IO[bytes]:
 
 def write_json(path: Path | str, content: Mapping[str, Any]) -> None:
     """Write JSON that every reader takes: null for infinity and NaN, which JSON does not have."""
-    text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
     with whole_file(path) as stream:
-        stream.write(f"{text}\n".encode())
+        stream.write(json_text(content).encode())
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Return what :func:`write_json` writes."""
+    return json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def _plain(value: Any) -> Any:

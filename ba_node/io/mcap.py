@@ -98,9 +98,13 @@ class BagReader:
         Raises:
             BagError: nothing of the recording can be read after all.
         """
-        for number, log_time, data in self._raw(self._numbers(topics)):
-            channel = self._channels[number]
+        for channel, log_time, data in self.raw(topics):
             yield channel.topic, channel.type_name, log_time, data
+
+    def raw(self, topics: Collection[str] | None = None) -> Iterator[tuple[BagChannel, int, bytes]]:
+        """Yield channel, log time in ns and bytes, otherwise as :meth:`messages`."""
+        for number, log_time, data in self._raw(self._numbers(topics)):
+            yield self._channels[number], log_time, data
 
     def late_cameras(self) -> list[tuple[str, bytes]]:
         """Return topic and bytes of the first message of each camera topic that comes after others of the inputs."""

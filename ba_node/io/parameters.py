@@ -77,6 +77,20 @@ def parameters_yaml(config: Config, *, comments: bool = True) -> str:
     return "\n".join(lines) + "\n"
 
 
+def changes_yaml(config: Config) -> str:
+    """Return the parameters that differ from their defaults as such a file, the default behind each."""
+    lines = ["/**:", f"  {_ROS_KEY}:"]
+    values = config.values()
+    changed = [one for one in declarations() if values[one.name] != one.default]
+    for group, parameters in groupby(changed, key=lambda p: p.name.split(".")[0]):
+        lines.append(f"    {group}:")
+        lines += [
+            f"      {one.name.split('.')[1]}: {_scalar(values[one.name])}  # default {_scalar(one.default)}"
+            for one in parameters
+        ]
+    return "\n".join(lines if changed else ["{}  # all parameters have their defaults"]) + "\n"
+
+
 def parameters_markdown() -> str:
     """Return a table of all parameters."""
     lines = ["| parameter | default | unit | allowed | change | meaning |", "|---|---|---|---|---|---|"]

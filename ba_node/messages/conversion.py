@@ -171,7 +171,7 @@ def _fix(msg: Any) -> GlobalFix:
     )
 
 
-def _rig(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
+def rig_from_parts(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
     """Return the rig; without poses the cameras sit at the origin of the body."""
     n = len(cameras)
     names = tuple(str(info.header.frame_id) for info in cameras)
@@ -345,6 +345,6 @@ _READERS: dict[str, Callable[[Any], Measurement]] = {
     INPUT_TYPES["gravity"]: _gravity,
     INPUT_TYPES["pose_prior"]: _pose_prior,
     INPUT_TYPES["gnss"]: _fix,
-    INPUT_TYPES["camera_rig"]: lambda msg: _rig(str(msg.header.frame_id), msg.cameras, msg.body_from_camera),
-    INPUT_TYPES["camera_info"]: lambda msg: _rig(str(msg.header.frame_id), [msg], None),
+    INPUT_TYPES["camera_rig"]: lambda msg: rig_from_parts(str(msg.header.frame_id), msg.cameras, msg.body_from_camera),
+    INPUT_TYPES["camera_info"]: lambda msg: rig_from_parts(str(msg.header.frame_id), [msg], None),
 }

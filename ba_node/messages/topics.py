@@ -99,7 +99,13 @@ _ALL = (
         Delivery.LATCHED_OR_NOT,
     ),
     Topic("refined_keyframes", "ba_msgs/msg/RefinedKeyframes", "Poses of the window after each solve, by id.", _OUT),
-    Topic("pose", "geometry_msgs/msg/PoseStamped", "The same, one message a keyframe with the keyframe's stamp.", _OUT),
+    Topic(
+        "pose",
+        "geometry_msgs/msg/PoseStamped",
+        "The same, one message a keyframe with the keyframe's stamp: stamps go back with each solve. For the newest"
+        " alone take `~/odometry`.",
+        _OUT,
+    ),
     Topic("path", "nav_msgs/msg/Path", "Poses of all keyframes kept, newest `output.path_max_poses`.", _OUT, _LATCHED),
     Topic(
         "points",
@@ -113,6 +119,15 @@ _ALL = (
         "ba_msgs/msg/SolverReport",
         "How each solve went, failed and skipped ones too; without a solve, what was turned away.",
         _OUT,
+        _LATCHED,
+    ),
+    Topic(
+        "odometry",
+        "nav_msgs/msg/Odometry",
+        "Pose of the newest keyframe after each solve, held ones too, for those who steer by it: stamps only rise"
+        " within a map. Mean velocity since the keyframe before. Covariances as of `~/pose_with_covariance`, 1e6 where"
+        " unknown. Only while subscribed.",
+        _SIDE,
     ),
     Topic(
         "pose_with_covariance",
@@ -155,6 +170,8 @@ CAMERAS = ("camera_rig", "camera_info")
 # Every one comes from a front-end; what else is known beside pixels may come from elsewhere, and more seldom.
 CAMERA_TYPES = tuple(INPUT_TYPES[name] for name in CAMERAS)
 LATCHED_OUTPUTS = tuple(name for name in OUTPUT_TYPES if TOPICS[name].delivery is _LATCHED)
+# Those of them that show the whole map.
+WHOLE_MAP = tuple(name for name in LATCHED_OUTPUTS if name != "report")
 ON_DEMAND = tuple(one.name for one in _ALL if one.direction is _SIDE)
 
 SERVICES = {

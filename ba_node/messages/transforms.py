@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make messages of the correction map -> odom and of poses with their covariance, and read /tf_static."""
+"""Make messages of the correction map -> odom, of poses with their covariance and odometry, and read /tf_static."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Estimate, Transform
 from ba_node.measurements import CameraRig
 from ba_node.messages.factory import MessageFactory, header_message, pose_message
 from ba_node.messages.topics import TF, TOPICS
+
+# Variance of what is not known, m^2 and rad^2.
+_UNKNOWN = 1e6
 
 
 def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:
@@ -49,6 +53,50 @@ def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any
         )
         for k in range(len(poses))
     ]
+
+
+def odometry_message(factory: MessageFactory, estimate: Estimate, base_frame: str) -> Any:
+    """Return a ``nav_msgs/Odometry`` of the newest refined keyframe, with the mean velocity since the one before.
+
+    The velocity is seen from the body. Its covariance is that of the difference of two poses that err by themselves,
+    which is more than it is, as their errors are alike.
+    """
+    poses = estimate.refined[-2:]
+    known = np.full((len(poses), 6, 6), np.nan) if estimate.covariance is None else estimate.covariance[-2:]
+    rotation, position = geometry.matrix_from_quaternion(poses.orientation), poses.position
+    twist, sigma = np.zeros(6), np.full((6, 6), np.nan)
+    lapse_s = 1e-9 * float(poses.stamp_ns[-1] - poses.stamp_ns[0])
+    if lapse_s > 0.0:
+        step = rotation[1].T @ (position[1] - position[0])
+        twist = np.concatenate([step, geometry.so3_log(rotation[0].T @ rotation[1])]) / lapse_s
+        seen = np.kron(np.eye(2), rotation[1].T)
+        sigma = seen @ known.sum(axis=0) @ seen.T / lapse_s**2
+    x, y, z, turn_x, turn_y, turn_z = twist.tolist()
+    return factory.make(
+        TOPICS["odometry"].type_name,
+        header=header_message(factory, int(poses.stamp_ns[-1]), estimate.frame_id),
+        child_frame_id=base_frame,
+        pose=factory.make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=pose_message(factory, position[-1], poses.orientation[-1]),
+            covariance=factory.fixed(_or_unknown(known[-1])),
+        ),
+        twist=factory.make(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=factory.make(
+                "geometry_msgs/msg/Twist",
+                linear=factory.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                angular=factory.make("geometry_msgs/msg/Vector3", x=turn_x, y=turn_y, z=turn_z),
+            ),
+            covariance=factory.fixed(_or_unknown(sigma)),
+        ),
+    )
+
+
+def _or_unknown(covariance: FloatArray) -> FloatArray:
+    """Return the 36 numbers of a covariance; where it is not known, and 0 for what was held, those of no knowledge."""
+    known = bool(np.isfinite(covariance).all() and covariance.any())
+    return np.asarray(covariance if known else _UNKNOWN * np.eye(6)).ravel()
 
 
 class StaticTree:

@@ -32,7 +32,7 @@ from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
-from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES
+from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, WHOLE_MAP
 from ba_node.offline.attention import attention
 from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.run_folder import recording_facts, versions, write_details
@@ -133,10 +133,18 @@ def replay(
     return report
 
 
-class _Run:
-    """One pass over the measurements."""
+def rehearse(measurements: Sequence[Measurement], config: Config, watch: Watch = Watch()) -> list[SessionRecord]:
+    """Replay measurements and write nothing; return what each session gave."""
+    run = _Run(config, None, watch)
+    run.read(measurements, len(measurements))
+    run.end(optimize=False)
+    return run.sessions
 
-    def __init__(self, config: Config, writer: BagWriter, watch: Watch) -> None:
+
+class _Run:
+    """One pass over the measurements; what comes out is written if there is a writer."""
+
+    def __init__(self, config: Config, writer: BagWriter | None, watch: Watch) -> None:
         self.backend = Backend(config, clock=watch.clock)
         self.sessions: list[SessionRecord] = []
         self._config = config
@@ -194,12 +202,12 @@ class _Run:
     def _record(self, estimate: Estimate) -> None:
         if not self.sessions or self.sessions[-1].map_index != estimate.map_index:
             self._begin(estimate)
-        self.sessions[-1].add(estimate, self.backend.map.refined_keyframes())
+        self.sessions[-1].add(estimate, self.backend.map)
         if len(estimate.trajectory) >= (1.0 + _GROWTH) * self._written:
             self._written = len(estimate.trajectory)
             self._write(estimate, OUTPUT_TYPES)
         else:
-            self._write(estimate, OUTPUT_TYPES.keys() - set(LATCHED_OUTPUTS))
+            self._write(estimate, OUTPUT_TYPES.keys() - set(WHOLE_MAP))
 
     def _begin(self, estimate: Estimate) -> None:
         session_id = self.backend.map.session_id
@@ -212,10 +220,12 @@ class _Run:
         if record is not None and not record.closed:
             record.close(summary)
             if len(record.last.trajectory) > self._written:
-                self._write(record.last, LATCHED_OUTPUTS)
+                self._write(record.last, WHOLE_MAP)
         self._inputs = {}
 
     def _write(self, estimate: Estimate, wanted: Container[str]) -> None:
+        if self._writer is None:
+            return
         timeless = dataclasses.replace(estimate, report=dataclasses.replace(estimate.report, solve_time_s=0.0))
         for topic, kind, message in output_messages(ROSBAGS_FACTORY, timeless, self._config.output, wanted):
             time_ns = max(0, estimate.stamp_ns)

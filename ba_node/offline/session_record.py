@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ba_node.arrays import BoolArray
-from ba_node.backend import MapSummary
+from ba_node.backend import CurrentMap, MapSummary
 from ba_node.estimate import Estimate, Poses, SolveReport
 from ba_node.measurements import Keyframe
 
@@ -44,21 +44,24 @@ class SessionRecord:
         assert self.closed is not None, "close() comes first"
         return self.closed
 
-    def add(self, estimate: Estimate, refined: set[int]) -> None:
-        """Take in the next estimate, and which keyframes of the map are refined now."""
-        before = self.last.trajectory
-        gone = ~np.isin(before.keyframe_id, estimate.trajectory.keyframe_id)
-        if gone.any():
-            self.forgotten.append(before[gone])
+    def add(self, estimate: Estimate, current: CurrentMap) -> None:
+        """Take in the next estimate; ``current`` is its map, as it is now."""
+        before, now = self.last.trajectory, estimate.trajectory
+        # The oldest are forgotten first.
+        if len(before) and not np.array_equal(before[:1].keyframe_id, now[:1].keyframe_id):
+            gone = ~np.isin(before.keyframe_id, now.keyframe_id)
+            self.forgotten += [before[gone]] if gone.any() else []
         self.last = estimate
         report = estimate.report
         self.statuses[report.status.name] += 1
         self.solves.append((estimate.stamp_ns, report))
         if not report.status.usable:
             self.reasons[report.newest_keyframe_id] = report.reason
-        self.refined.update(refined.intersection(estimate.refined.keyframe_id.tolist()))
-        # What a check of the set-up has taken back.
-        self.refined.difference_update(set(estimate.trajectory.keyframe_id.tolist()) - refined)
+        took_part = set(estimate.refined.keyframe_id.tolist())
+        refined = current.refined_among(took_part)
+        # What is taken back is that of a window, or, by a check of the set-up, all.
+        self.refined -= took_part if current.refined_count else set(now.keyframe_id.tolist())
+        self.refined |= refined
 
     def close(self, summary: MapSummary) -> None:
         """Take what there is to tell of the map at its end."""

@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import InvalidNamespaceException, InvalidNodeNameException
@@ -39,7 +40,7 @@ def main(args: Sequence[str] | None = None) -> int:
         args: the program and its arguments; None for those of the process.
     """
     given = list(sys.argv if args is None else args)
-    with _signals() as ended:
+    with signals() as ended:
         try:
             # rclpy's own handlers end the context at once: nobody who waits for an answer could be told any more.
             rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
@@ -71,7 +72,7 @@ def _run(given: list[str], ended: Callable[[], bool]) -> int:
     gc.collect()
     gc.freeze()
     try:
-        _spin(executor, node, ended)
+        spin(executor, node, ended)
     finally:
         node.stop()
         executor.shutdown()
@@ -80,7 +81,7 @@ def _run(given: list[str], ended: Callable[[], bool]) -> int:
     return 0
 
 
-def _spin(executor: NodeExecutor, node: BaNode, ended: Callable[[], bool]) -> None:
+def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
     """Run callbacks until a signal. One that raises, as rclpy's own do on a senseless request, is survived."""
     faults = 0
     while rclpy.ok() and not ended():
@@ -92,7 +93,7 @@ def _spin(executor: NodeExecutor, node: BaNode, ended: Callable[[], bool]) -> No
             raise RuntimeError(f"{faults} internal errors one after the other: giving up")
 
 
-def _spin_once(executor: NodeExecutor, node: BaNode) -> bool:
+def _spin_once(executor: NodeExecutor, node: Any) -> bool:
     """Run one callback, after a wait that a signal may last out; return False if it raised."""
     try:
         executor.spin_once()
@@ -111,7 +112,7 @@ def _refuse(reason: str) -> int:
 
 
 @contextmanager
-def _signals() -> Iterator[Callable[[], bool]]:
+def signals() -> Iterator[Callable[[], bool]]:
     """Note the first SIGINT or SIGTERM, for the executor to find; a second one interrupts whatever hangs.
 
     Python's own handler would raise KeyboardInterrupt in the middle of any callback.

@@ -8,13 +8,14 @@ Everything in this file runs on the executor's thread.
 configure     a new back-end with an empty map, its worker, and all components with their topics
 activate      data is taken and results are published
 deactivate    the map stays, data is ignored and counted; a solve that runs is finished, not published
-cleanup       components are destroyed, the map is dropped; a solve that runs ends after its iteration
+cleanup       components are destroyed, the map is saved if asked for, and dropped; a solve ends after its iteration
 shutdown      as cleanup, for good
 ============  ==========================================================================================
 """
 
 from __future__ import annotations
 
+import threading
 import time
 import traceback
 from contextlib import ExitStack
@@ -39,8 +40,9 @@ from ba_node.ros.components.static_frames import StaticFrames
 from ba_node.ros.log import Severity, Throttle, fault, log
 from ba_node.ros.parameters import Parameters
 from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
-from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
+from ba_node.ros.rclpy_compat.lifecycle import ManagedNode, RefusedError
 from ba_node.ros.worker.inbox import Inbox
+from ba_node.ros.worker.kept_map import KeptMap, KeptMapError
 from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 NODE_NAME = "ba_node"
@@ -82,6 +84,8 @@ class BaNode(ManagedNode):
         self._host: Host | None = None
         self._components: list[Component] = []
         self._leaving: list[Worker] = []
+        self._kept: tuple[KeptMap, Backend] | None = None
+        self._saving: threading.Thread | None = None
         self._lingering = ExitStack()
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._linger_timer = self.create_timer(_LINGER_S, self._end_lingering, clock=clock, autostart=False)
@@ -105,20 +109,28 @@ class BaNode(ManagedNode):
             time.sleep(_LINGER_S)
         if not all(worker.stop() for worker in self._leaving):
             log(self, Severity.ERROR, "the solver did not stop in time, leaving it")
+        self._end_saving()
 
     def configure(self) -> None:
         """Make an empty map and everything that works on it."""
         self.cleanup()
         self._end_lingering()
+        self._end_saving()
         config = self._settings.config
         inbox = Inbox(config.node.inbox_size)
         backend = Backend(config, clock=time.perf_counter)
+        try:
+            kept = KeptMap(config, self._log)
+            kept.load(backend)
+        except KeptMapError as error:
+            raise RefusedError(str(error)) from error
         worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
         backend.setup.elsewhere = worker.check_elsewhere
         deferred = DeferredAnswers(self, lambda: worker.alive)
         self._host = host = Host(self, config, inbox, worker, deferred, self._log)
         host.at_cleanup.callback(deferred.close)
         worker.start()
+        self._kept = kept, backend
         for kind in COMPONENTS:
             self._components.append(kind(host))
         self._settings.check_overrides()
@@ -151,6 +163,9 @@ class BaNode(ManagedNode):
         try:
             self._leaving = [worker for worker in [*self._leaving, host.worker] if not worker.stop(_STOP_S)]
             self._refined_before += host.worker.refined
+            if self._kept is not None:
+                (kept, backend), self._kept = self._kept, None
+                self._saving = kept.save(backend, host.worker)
         finally:
             host.at_cleanup.close()
 
@@ -158,6 +173,12 @@ class BaNode(ManagedNode):
         """Destroy what was left for a moment after the last cleanup."""
         self._linger_timer.cancel()
         self._lingering.close()
+
+    def _end_saving(self) -> None:
+        """Wait until the map of the last configuration is on the disk."""
+        if self._saving is not None:
+            self._saving.join()
+            self._saving = None
 
     def _configured(self) -> Host:
         assert self._host is not None, "rclpy's state machine lets only a configured node do this"

@@ -4,14 +4,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter as RclpyParameter
 
-from ba_node.config import Config, ConfigError, Parameter, declarations, unknown
+from ba_node.config import Config, ConfigError, Parameter, Value, declarations, unknown
 from ba_node.ros import qos
 from ba_node.ros.rclpy_compat.private import part
 
@@ -45,6 +46,27 @@ def describe(parameter: Parameter) -> Any:
         ends = (-limit if low is None else float(low), limit if high is None else float(high))
         descriptor.floating_point_range = [FloatingPointRange(from_value=ends[0], to_value=ends[1])]
     return descriptor
+
+
+def declare(node: Any, parameters: Sequence[Parameter]) -> dict[str, Value]:
+    """Declare parameters that are set at start; return their values by name.
+
+    Raises:
+        ConfigError: a parameter file or the command line names a parameter that does not exist or a wrong value.
+    """
+    found = part(node, "_parameter_overrides", dict, "parameters with names that do not exist go unnoticed") or {}
+    names = [parameter.name for parameter in parameters]
+    for name in found:
+        if name not in names and not node.has_parameter(name) and not name.startswith(qos.OVERRIDES):
+            raise ConfigError(unknown(name, names))
+    values = {}
+    for parameter in parameters:
+        given = found[parameter.name].value if parameter.name in found else parameter.default
+        number = _as_float(given) if parameter.kind is float else None
+        values[parameter.name] = parameter.check(given if number is None else number)
+        description = describe(dataclasses.replace(parameter, live=False))
+        node.declare_parameter(parameter.name, values[parameter.name], description, ignore_override=True)
+    return values
 
 
 class Parameters:

@@ -204,7 +204,7 @@ def never_began(item: OfSession) -> Refusal:
 
 def newest_ns(scene: Scene) -> int:
     """Return the stamp of the newest keyframe, ns."""
-    return int(scene.keyframes.stamp_ns.max())
+    return scene.newest_ns
 
 
 def unusual_s(scene: Scene) -> float:

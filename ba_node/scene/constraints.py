@@ -11,6 +11,7 @@ receiver are in east, north, up about the first of them (or ``priors.origin_*``)
 from __future__ import annotations
 
 import bisect
+import copy
 import importlib
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from ba_node.arrays import FloatArray, IdArray
 from ba_node.core import geometry
-from ba_node.measurements import GlobalFix, GravityDirection, LandmarkPriors, PosePrior, RelativePose
+from ba_node.measurements import GlobalFix, GravityDirection, LandmarkPriors, PosePrior, RelativePose, TrackMerge
 from ba_node.scene import ingest
 from ba_node.scene.rejections import RejectionLog
 
@@ -47,7 +48,9 @@ class Absolute:
     stamp_ns: int
     position: FloatArray  # (3,) m
     rotation: FloatArray | None  # (3, 3) world from body; None: unknown
-    covariance: FloatArray  # (6, 6), rotation about the axes of the body, or (3, 3) of the position alone
+    covariance: (
+        FloatArray  # (6, 6), rotation about the axes of the body, or (3, 3) of the position alone; zero: not told
+    )
     of_antenna: bool  # of the antenna, not the body
 
 
@@ -56,20 +59,41 @@ class Constraints:
 
     Attributes:
         relative: by the ids of both keyframes.
+        relative_of: the keys of these by the id of each keyframe.
         gravity: by id of the keyframe: down (3,) in the body, unit; standard deviation, rad.
         landmarks: by track id: position (3,) in the world, m; covariance (3, 3), m^2.
         absolute: by stamp, oldest first.
+        merges: pairs of tracks that are the same point, still to be joined; the first goes on under the second's id.
+        renamed: tracks that were joined, by the id that they had: the one that they go on under.
+        steps: covariance (6, 6) of the step from the keyframe before, by id of the keyframe.
+        unchecked: relative poses that the map was not compared with yet; refused: those that it cannot meet.
+        adjusted_at: how many keyframes there were when the map was last bent.
+        map_from_world: rotation (3, 3) and translation (3,) m; None until enough is known.
         world_frame: name of the frame that all that is absolute is in; empty before the first.
         origin: (3,) latitude, longitude (deg), altitude (m) of the origin of east, north, up; None before a fix.
     """
 
     def __init__(self) -> None:
         self.relative: dict[tuple[int, int], RelativeMeasure] = {}
+        self.relative_of: dict[int, list[tuple[int, int]]] = {}
         self.gravity: dict[int, tuple[FloatArray, float]] = {}
         self.landmarks: dict[int, tuple[FloatArray, FloatArray]] = {}
         self.absolute: list[Absolute] = []
+        self.merges: list[tuple[int, int]] = []
+        self.renamed: dict[int, int] = {}
+        self.steps: dict[int, FloatArray] = {}
+        self.unchecked: list[tuple[int, int]] = []
+        self.refused: set[tuple[int, int]] = set()
+        self.adjusted_at = 0
+        self.map_from_world: tuple[FloatArray, FloatArray] | None = None
         self.world_frame = ""
         self.origin: FloatArray | None = None
+
+    def clone(self) -> Constraints:
+        """Return the same, to which later ones are not added."""
+        other = Constraints()
+        vars(other).update({name: copy.copy(value) for name, value in vars(self).items()})
+        return other
 
     def add_relative(self, measured: RelativePose, log: RejectionLog) -> None:
         """Take in a relative pose; the first between two keyframes stays."""
@@ -90,6 +114,43 @@ class Constraints:
         turn[:3, :3] = pose.rotation.T
         covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
         self.relative[key] = RelativeMeasure(pose.rotation, pose.position, covariance, measured.is_loop)
+        self.unchecked.append(key)
+        for one in key:
+            self.relative_of.setdefault(one, []).append(key)
+
+    def add_step(self, keyframe_id: int, covariance: FloatArray, log: RejectionLog) -> None:
+        """Take in the covariance of the step to a keyframe; one that cannot be is counted, and its step has none."""
+        if len(covariance):
+            known = _covariance(f"step to keyframe {keyframe_id}", covariance, 6, log)
+            if known is not None:
+                self.steps[keyframe_id] = known[np.ix_(_TANGENT, _TANGENT)]
+
+    def add_merge(self, merge: TrackMerge, log: RejectionLog) -> None:
+        """Take in pairs of tracks that are the same point."""
+        if merge.malformed:
+            log.reject("malformed", f"merge of tracks: {merge.malformed}")
+            return
+        for pair in zip(merge.track_id.tolist(), merge.same_as.tolist(), strict=True):
+            one, other = (self.name_of(track) for track in pair)
+            if one == other or (one, other) in self.merges:
+                log.notice("repeated_factor")
+                continue
+            self.merges.append((one, other))
+
+    def name_of(self, track: int) -> int:
+        """Return the id that a track goes on under."""
+        while track in self.renamed:
+            track = self.renamed[track]
+        return track
+
+    def names_of(self, tracks: IdArray) -> IdArray:
+        """Return the ids that tracks go on under."""
+        if not self.renamed:
+            return tracks
+        known = np.isin(tracks, np.fromiter(self.renamed, np.uint64, len(self.renamed)))
+        out = tracks.copy()
+        out[known] = [self.name_of(track) for track in tracks[known].tolist()]
+        return out
 
     def add_gravity(self, measured: GravityDirection, log: RejectionLog) -> None:
         """Take in a direction of gravity; the first at a keyframe stays."""
@@ -121,7 +182,7 @@ class Constraints:
             if not _finite(position):
                 log.reject("bad_factor", f"{name}: position {position} m, expected finite")
                 continue
-            self.landmarks[track] = np.array(position), known
+            self.landmarks[self.name_of(track)] = np.array(position), known
 
     def add_pose(self, prior: PosePrior, log: RejectionLog) -> None:
         """Take in a pose of the body in the world."""
@@ -135,8 +196,8 @@ class Constraints:
         covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
         self._insert(Absolute(prior.stamp_ns, pose.position, pose.rotation, covariance, of_antenna=False))
 
-    def add_fix(self, fix: GlobalFix, sigma_m: float, log: RejectionLog) -> None:
-        """Take in a fix of a receiver; ``sigma_m`` is its standard deviation where it tells none."""
+    def add_fix(self, fix: GlobalFix, log: RejectionLog) -> None:
+        """Take in a fix of a receiver."""
         name, place = f"fix at {fix.stamp_ns * 1e-9:.3f} s", np.asarray(fix.geodetic, float)
         if not fix.is_fix:
             log.notice("no_fix")
@@ -145,7 +206,7 @@ class Constraints:
             log.reject("bad_factor", f"{name}: latitude, longitude, altitude {place}, expected within 90, 180 deg")
             return
         told = np.asarray(fix.covariance, float)
-        covariance = _covariance(name, told if told.any() else sigma_m**2 * np.eye(3), 3, log)
+        covariance = _covariance(name, told, 3, log) if told.any() else np.zeros((3, 3))
         if covariance is None or not self._same_world(name, ENU, log):
             return
         try:

@@ -9,16 +9,21 @@ however large the map is.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import SceneConfig
 from ba_node.core import geometry
 from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
-from ba_node.scene.tables import IdIndex
+from ba_node.scene.tables import Growing, IdIndex
 
 # 2^64 over the golden ratio: its multiples, modulo 2^64, are all different and spread evenly.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+# Keyframes that are looked at first for one that was refined.
+_NEAR = 64
 
 
 class MapTables:
@@ -32,19 +37,20 @@ class MapTables:
         self.blocks: list[list[Block]] = []  # per keyframe row, its rows in ``observations``
         self._keyframe_rows: dict[int, int] = {}
         self._landmark_rows = IdIndex()
-        self._order: IntArray | None = None
+        self._order, self._places = Growing(np.intp), Growing(np.intp)
+        # The place in the order of time from which on keyframes that took part in no solve have to be moved.
+        self._unsettled = 0
+        self._scratch: IntArray = np.empty(0, np.intp)
 
     @property
     def order(self) -> IntArray:
-        """Return the keyframe rows by (stamp, arrival), oldest first."""
-        if self._order is None:
-            self._order = np.argsort(self.keyframes.stamp_ns, kind="stable")
-        return self._order
+        """Return the keyframe rows by (stamp, arrival), oldest first; it stays as it is when others come."""
+        return self._order.values
 
     @property
-    def landmark_order(self) -> IntArray:
-        """Return the landmark rows by track id."""
-        return self._landmark_rows.rows
+    def newest_ns(self) -> int:
+        """Return the stamp of the newest keyframe, the least there is without any."""
+        return int(self.keyframes.stamp_ns[self.order[-1]]) if len(self.keyframes) else np.iinfo(np.int64).min
 
     def find_keyframe(self, keyframe_id: int) -> int | None:
         """Return the row of a keyframe, None if it is not known."""
@@ -60,9 +66,37 @@ class MapTables:
 
     def places(self) -> IntArray:
         """Return the place of each row of keyframes in the order of time."""
-        place = np.empty(len(self.order), np.intp)
-        place[self.order] = np.arange(len(place))
-        return place
+        return self._places.values
+
+    def by_time(self, keyframes: IntArray) -> IntArray:
+        """Return rows of keyframes, oldest first."""
+        return self.order[np.sort(self.places()[keyframes])]
+
+    def numbers(self, rows: NDArray[np.integer[Any]], listed: IntArray) -> IntArray:
+        """Return the place of each of some rows of keyframes or landmarks in a list of different ones, -1 if in none.
+
+        Its cost does not depend on the size of the table.
+        """
+        scratch = self._cleared()
+        scratch[listed] = np.arange(len(listed))
+        found = scratch.take(rows)
+        scratch[listed] = -1
+        return found
+
+    def distinct(self, rows: NDArray[np.integer[Any]]) -> IntArray:
+        """Return the different ones among rows of keyframes or landmarks, ascending; its cost is likewise."""
+        scratch, at = self._cleared(), np.arange(len(rows))
+        scratch[rows] = at
+        found: IntArray = np.sort(rows[scratch.take(rows) == at]).astype(np.intp)
+        scratch[found] = -1
+        return found
+
+    def _cleared(self) -> IntArray:
+        """Return numbers for each row of keyframes or landmarks, all -1; whoever writes to some puts them back."""
+        size = max(len(self.keyframes), len(self.landmarks))
+        if size > len(self._scratch):
+            self._scratch = np.full(2 * size, -1)
+        return self._scratch
 
     def cameras_of(self, keyframe_row: int) -> set[int]:
         """Return the indices of the cameras that delivered for a keyframe."""
@@ -92,10 +126,8 @@ class MapTables:
             (n,) rows of the landmarks of the older views.
         """
         table, observations = self.landmarks, self.observations
-        number = np.full(len(table), -1)
-        number[landmarks] = np.arange(len(landmarks))
         rows = np.sort(self.views_of(landmarks))
-        of = number[observations.landmark[rows]]
+        of = self.numbers(observations.landmark[rows], landmarks)
         old = self.places()[observations.keyframe[rows]] < since[of]
         known = {name: getattr(table, name)[landmarks] for name in ("position", "guess", "has_position", "has_guess")}
         ids = self._unknown_ids(len(landmarks))
@@ -107,30 +139,94 @@ class MapTables:
         self._link_rows(rows, np.concatenate([landmarks, added]))
         return added
 
+    def join(self, landmark: int, into: int) -> bool:
+        """Give the views of one landmark to another; False, and nothing changes, if one image sees both."""
+        observations = self.observations
+        rows = [self.views_of(np.array([one])) for one in (landmark, into)]
+        seen = [set(zip(observations.keyframe[r].tolist(), observations.camera[r].tolist(), strict=True)) for r in rows]
+        if landmark == into or seen[0] & seen[1]:
+            return False
+        table = self.landmarks
+        if not table.has_position[into]:
+            table.position[into], table.has_position[into] = table.position[landmark], table.has_position[landmark]
+        table.has_position[landmark] = table.has_guess[landmark] = False
+        both = np.sort(np.concatenate(rows))
+        observations.landmark[rows[0]] = into
+        # What was an outlier of the one may fit the other.
+        observations.outlier[both] = False
+        self._link_rows(both, np.array([landmark, into]))
+        table.changed(np.array([landmark, into]))
+        self._see(np.array([into]), int(table.last_seen[landmark]))
+        return True
+
+    def moved(self, keyframes: IntArray | None = None) -> None:
+        """Note that keyframes have other poses, or are refined or no longer; all by default."""
+        if keyframes is None:
+            self.keyframes.changed()
+            self._unsettled = 0
+        elif len(keyframes):
+            self.keyframes.changed(keyframes)
+            self._unsettled = min(self._unsettled, int(self.places()[keyframes].min()))
+
     def propagate_corrections(self) -> None:
         """Move keyframes that took part in no solve by the correction of their predecessor.
 
         So the relative motion comes from the front-end and the anchor from the refined map (before the first refined
-        keyframe, from that one). Done anew before each use: corrections change with every solve.
+        keyframe, from that one). Done anew before each use, from the oldest on that was :meth:`moved` since.
         """
-        order, table = self.order, self.keyframes
-        refined = table.refined[order]
-        if refined.all() or not refined.any():
+        table = self.keyframes
+        begin, self._unsettled = self._unsettled, len(table)
+        if begin >= len(table) or table.refined[self.order[begin:]].all():
             return
-        at = np.arange(len(order))
-        anchor = np.maximum.accumulate(np.where(refined, at, -1))
-        anchor = np.where(anchor < 0, int(np.argmax(refined)), anchor)
-        rows, anchors = order[~refined], order[anchor[~refined]]
+        before = self._refined_before(begin)
+        if before < 0:
+            begin = 0
+        rows = self.order[begin:]
+        refined = table.refined[rows]
+        if before < 0 and not refined.any():
+            return
+        at = np.maximum.accumulate(np.where(refined, np.arange(begin, len(table)), before))
+        anchor = np.where(at < 0, begin + int(np.argmax(refined)), at)
+        rows, anchors = rows[~refined], self.order[anchor[~refined]]
         rotation, translation = self.corrections(anchors)
         moved = geometry.compose(rotation, translation, table.input_rotation[rows], table.input_position[rows])
         table.rotation[rows], table.position[rows] = moved
+        table.changed(rows)
+
+    def _refined_before(self, place: int) -> int:
+        """Return the place of the last refined keyframe before a place in the order of time, -1 if there is none."""
+        size = _NEAR
+        while place > 0:
+            begin = max(0, place - size)
+            found = np.flatnonzero(self.keyframes.refined[self.order[begin:place]])
+            if len(found):
+                return begin + int(found[-1])
+            place, size = begin, 2 * size
+        return -1
+
+    def poses_and_points(self) -> tuple[FloatArray | BoolArray, ...]:
+        """Return a copy of where keyframes and points are, to be restored as long as none comes or goes."""
+        table, points = self.keyframes, self.landmarks
+        return tuple(a.copy() for a in (table.rotation, table.position, points.position, points.has_position))
+
+    def restore(self, known: tuple[FloatArray | BoolArray, ...]) -> None:
+        """Put keyframes and points back to where :meth:`poses_and_points` had them."""
+        table, points = self.keyframes, self.landmarks
+        for column, was in zip(
+            (table.rotation, table.position, points.position, points.has_position), known, strict=True
+        ):
+            column[:] = was
+        self.moved()
+        points.changed()
 
     def forget_solutions(self) -> None:
         """Put keyframes back to where the front-end has them; forget where points are and which views are outliers."""
         table = self.keyframes
         table.rotation[:], table.position[:] = table.input_rotation, table.input_position
         table.refined[:] = False
+        self.moved()
         self.landmarks.has_position[:] = False
+        self.landmarks.changed()
         self.observations.outlier[:] = False
 
     def corrections(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -192,8 +288,26 @@ class MapTables:
         self._link()
 
     def _index_keyframes(self) -> None:
-        self._keyframe_rows = {int(k): row for row, k in enumerate(self.keyframes.keyframe_id)}
-        self._order = None
+        table = self.keyframes
+        self._keyframe_rows = {key: row for row, key in enumerate(table.keyframe_id.tolist())}
+        self._order = Growing(np.intp, np.argsort(table.stamp_ns, kind="stable"))
+        self._places = Growing(np.intp, np.argsort(self.order))
+        self.moved()
+
+    def _index_newest(self) -> None:
+        """Find the place of the keyframe of the last row, which is new."""
+        table, row = self.keyframes, len(self.keyframes) - 1
+        place, stamp_ns = row, table.stamp_ns[row]
+        if row and stamp_ns < table.stamp_ns[self.order[-1]]:
+            place = int(np.searchsorted(table.stamp_ns[self.order], stamp_ns, side="right"))
+        self._keyframe_rows[int(table.keyframe_id[row])] = row
+        if place == row:
+            self._order.extend(np.array([row]))
+            self._places.extend(np.array([row]))
+        else:
+            self._order = Growing(np.intp, np.insert(self.order, place, row))
+            self._places = Growing(np.intp, np.argsort(self.order))
+        self.moved(np.array([row]))
 
     def _unknown_ids(self, n: int) -> IdArray:
         """Return n ids that no track has, spread over all there are."""
@@ -219,4 +333,6 @@ class MapTables:
         self.landmarks.last[landmarks] = -1
         # Rows ascend within a landmark, so the last write is its newest row.
         self.landmarks.last[landmark] = order
-        self.landmarks.views[landmarks] = np.bincount(landmark, minlength=len(self.landmarks))[landmarks]
+        count = np.bincount(self.numbers(landmark, landmarks), minlength=len(landmarks))
+        self.landmarks.views[landmarks] = count
+        self.landmarks.changed(landmarks)

@@ -25,6 +25,8 @@ class Keyframes(Table):
     was made for it with all that matters (see ``Backend``).
     """
 
+    COPIED = ("keyframe_id", "stamp_ns", "rotation", "position")
+
     keyframe_id: IdArray = column(np.uint64)
     stamp_ns: NDArray[np.int64] = column(np.int64)
     input_rotation: FloatArray = column(np.float64, (3, 3))
@@ -37,6 +39,8 @@ class Keyframes(Table):
 
 class Landmarks(Table):
     """One row a track. ``guess`` is as given, in the front-end's fixed frame; ``last`` the newest observation row."""
+
+    COPIED = ("track_id", "position", "has_position", "views", "rms_px")
 
     track_id: IdArray = column(np.uint64)
     position: FloatArray = column(np.float64, (3,), np.nan)

@@ -71,6 +71,7 @@ WARNINGS: dict[str, str] = {
     "equal_stamps": "Two keyframes have one stamp.",
     "reused_id": "An id was used for a second keyframe of the session.",
     "no_geo": "Fixes of GNSS are left out, as pymap3d is missing.",
+    "not_adjusted": "A loop or priors that the map would have to be bent too far for, or that images contradict.",
     "setup": "A set-up that the tracks contradict: the likely mistake, and what to change. All solves are held.",
 }
 

@@ -8,6 +8,8 @@ What contradicts or cannot be used is counted in ``log`` and leaves the scene as
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ba_node.arrays import BoolArray, IntArray
@@ -34,9 +36,6 @@ from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
 
-# Standard deviation of a fix that tells none, m.
-_FIX_SIGMA_M = 5.0
-
 
 class Scene(MapTables):
     """What is known in one session. All methods leave it consistent; none raises on bad data."""
@@ -53,6 +52,17 @@ class Scene(MapTables):
         self.pending: list[FeatureTracks] = []
         self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()
+
+    def clone(self) -> Scene:
+        """Return a scene of its own with the same content but for what waits and what was turned away."""
+        other = Scene(self.config, self.session_id)
+        other.frame_id, other.cameras = self.frame_id, self.cameras
+        other.refused_rig = self.refused_rig
+        other.keyframes, other.landmarks = self.keyframes.clone(), self.landmarks.clone()
+        other.observations, other.blocks = self.observations.clone(), [list(blocks) for blocks in self.blocks]
+        other._index_keyframes()
+        other.constraints = self.constraints.clone()
+        return other
 
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement of this session (or a rig); what cannot be used is counted."""
@@ -86,7 +96,7 @@ class Scene(MapTables):
         if isinstance(measured, PosePrior):
             self.constraints.add_pose(measured, self.log)
         else:
-            self.constraints.add_fix(measured, _FIX_SIGMA_M, self.log)
+            self.constraints.add_fix(measured, self.log)
 
     def _add_constraint(self, measured: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> None:
         if isinstance(measured, RelativePose):
@@ -95,6 +105,8 @@ class Scene(MapTables):
             self.constraints.add_gravity(measured, self.log)
         elif isinstance(measured, LandmarkPriors):
             self.constraints.add_landmarks(measured, self.log)
+        else:
+            self.constraints.add_merge(measured, self.log)
 
     def usable(self, measurement: Keyframe | OfSession) -> bool:
         """Return True if anything of a measurement passes the checks it can be given by itself; count nothing."""
@@ -160,11 +172,11 @@ class Scene(MapTables):
             self._reject_known(keyframe, known)
         if pose is None:
             return
-        if len(self.keyframes) and keyframe.stamp_ns < self.keyframes.stamp_ns.max():
-            self.log.notice("reordered")
-        ingest.check_stamp(keyframe, self.keyframes, self.log)
+        if keyframe.stamp_ns <= self.newest_ns:
+            self.log.notice("reordered", keyframe.stamp_ns < self.newest_ns)
+            ingest.check_stamp(keyframe, self.keyframes, self.log)
         self.frame_id = self.frame_id or ingest.plain_name(keyframe.frame_id)
-        row = self.keyframes.append(
+        self.keyframes.append(
             1,
             keyframe_id=keyframe.keyframe_id,
             stamp_ns=keyframe.stamp_ns,
@@ -173,9 +185,9 @@ class Scene(MapTables):
             rotation=pose.rotation,
             position=pose.position,
         )
-        self._keyframe_rows[keyframe.keyframe_id] = int(row[0])
+        self._index_newest()
+        self.constraints.add_step(keyframe.keyframe_id, keyframe.covariance, self.log)
         self.blocks.append([])
-        self._order = None
         if len(self.keyframes) > self.config.max_keyframes:
             self._forget_keyframes()
         self.propagate_corrections()
@@ -206,7 +218,7 @@ class Scene(MapTables):
         self.landmarks.has_guess[rows[new]] = True
         if len(self.keyframes):
             # Counts as seen now, or a full map would forget it before its first observation comes.
-            self._see(rows[new], int(self.keyframes.stamp_ns.max()))
+            self._see(rows[new], self.newest_ns)
         self._limit_landmarks()
 
     def _place(self, tracks: FeatureTracks) -> None:
@@ -225,6 +237,7 @@ class Scene(MapTables):
             what = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}, an id that came twice"
             self.log.reject("duplicate_observation", what, len(tracks.track_id))
             return
+        tracks = self._renamed(tracks)
         landmarks = self._rows_of(tracks.track_id)
         new = self._unseen(row, tracks, landmarks)
         landmarks = landmarks[new]
@@ -246,8 +259,30 @@ class Scene(MapTables):
             self.keyframes.solved[row] = False
         self.landmarks.last[landmarks] = added
         self.landmarks.views[landmarks] += 1
+        self.landmarks.changed(landmarks)
         self._see(landmarks, int(self.keyframes.stamp_ns[row]))
         self._limit_landmarks()
+
+    def _renamed(self, tracks: FeatureTracks) -> FeatureTracks:
+        """Return tracks under the ids that they go on under; one that so comes twice in the image is turned away."""
+        names = self.constraints.names_of(tracks.track_id)
+        if names is tracks.track_id:
+            return tracks
+        kept = np.sort(np.unique(names, return_index=True)[1])
+        if len(kept) < len(names):
+            what = f"merged tracks in keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
+            self.log.reject("duplicate_observation", f"{what}: one image sees both", len(names) - len(kept))
+        rows = {name: getattr(tracks, name)[kept] for name in ("uv", "sigma_px", "depth_m")}
+        return dataclasses.replace(tracks, track_id=names[kept], **rows)
+
+    def join_tracks(self, track: int, other: int) -> bool:
+        """Let a track go on under the id of another; False (counted) if one image sees both."""
+        rows = self.find_landmarks(np.array([track, other], np.uint64))
+        if not self.join(int(rows[0]), int(rows[1])):
+            self.log.reject("bad_merge", f"tracks {track} and {other}: one image sees both, they are no one point")
+            return False
+        self.constraints.renamed[track] = other
+        return True
 
     def _place_pending(self) -> None:
         waiting, self.pending = self.pending, []
@@ -265,16 +300,18 @@ class Scene(MapTables):
 
     def _unseen(self, row: int, tracks: FeatureTracks, landmarks: IntArray) -> BoolArray:
         """Return which landmarks this camera has not seen in this keyframe yet; count the others."""
-        seen = np.zeros(len(self.landmarks), bool)
-        for block in self.blocks[row]:
-            if block.camera == tracks.camera_index:
-                seen[self.observations.landmark[block.begin : block.end]] = True
-        repeated = np.flatnonzero(seen[landmarks])
+        known = [
+            self.observations.landmark[b.begin : b.end] for b in self.blocks[row] if b.camera == tracks.camera_index
+        ]
+        if not known:
+            return np.ones(len(landmarks), bool)
+        seen = np.isin(landmarks, np.concatenate(known))
+        repeated = np.flatnonzero(seen)
         if len(repeated):
             where = f"keyframe {tracks.keyframe_id}, camera {tracks.camera_index}"
             what = f"track {tracks.track_id[repeated[0]]} is known in {where}"
             self.log.reject("duplicate_observation", what, len(repeated))
-        return ~seen[landmarks]
+        return ~seen
 
 
 def _same(a: Cameras, b: Cameras) -> bool:

@@ -9,7 +9,8 @@ tells 2^64 - 1 from 2^64 - 2 no longer; so ids are only ever sorted, compared an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -30,14 +31,39 @@ def column(dtype: DTypeLike, shape: tuple[int, ...] = (), fill: float = 0) -> An
     return Column(dtype, shape, fill)
 
 
+# Rows are copied by pieces of so many.
+_PIECE = 512
+
+
+class Piece(dict[str, NDArray[Any]]):
+    """Columns of some rows in a row as they were at a moment; nobody changes them."""
+
+    made: Any = None  # what a reader has made of them, for the next
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of some columns as they were at a moment, in pieces that later moments share where nothing changed."""
+
+    pieces: tuple[Piece, ...]
+
+    def take(self, name: str, rows: IntArray) -> NDArray[Any]:
+        """Return a column at some rows."""
+        first, last = int(rows.min(initial=0)) // _PIECE, int(rows.max(initial=0)) // _PIECE
+        column = np.concatenate([piece[name] for piece in self.pieces[first : last + 1]])
+        return column[rows - first * _PIECE]
+
+
 class Table:
     """Columns of equal length. A subclass declares each as an attribute with :func:`column`.
 
     The attributes are views of the rows in use; writing to them changes the table. They are replaced when the table
-    grows or shrinks, so nobody may hold on to one.
+    grows or shrinks, so nobody may hold on to one. Who changes a column that is in :attr:`COPIED` calls
+    :meth:`changed`.
     """
 
     COLUMNS: ClassVar[Mapping[str, Column]] = {}
+    COPIED: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
         """Find the columns."""
@@ -48,6 +74,8 @@ class Table:
         self._buffers: dict[str, NDArray[Any]] = {
             name: np.empty((0, *column.shape), column.dtype) for name, column in self.COLUMNS.items()
         }
+        self._pieces: list[Piece] = []
+        self._stale = np.ones(1, bool)
         self._expose()
 
     def __len__(self) -> int:
@@ -65,7 +93,9 @@ class Table:
             self._buffers[name][begin:end] = values.get(name, column.fill)
         self._size = end
         self._expose()
-        return np.arange(begin, end)
+        added = np.arange(begin, end)
+        self.changed(added)
+        return added
 
     def keep(self, rows: BoolArray) -> IntArray:
         """Forget all rows but those marked, and return the new number of every old row, -1 for the forgotten."""
@@ -74,42 +104,121 @@ class Table:
             self._buffers[name] = self._buffers[name][: self._size][rows]
         self._size = int(np.count_nonzero(rows))
         self._expose()
+        self.changed()
         return renumbered
+
+    def changed(self, rows: IntArray | slice = slice(None)) -> None:
+        """Note that rows are to be copied anew, by default all."""
+        if isinstance(rows, slice):
+            self._pieces, self._stale = [], np.ones(self._n_pieces, bool)
+        elif len(rows):
+            missing = self._n_pieces - len(self._stale)
+            if missing > 0:
+                self._stale = np.append(self._stale, np.ones(missing, bool))
+            self._stale[np.asarray(rows) // _PIECE] = True
+
+    def clone(self: _Table) -> _Table:
+        """Return a table of its own with the same rows."""
+        other = type(self)()
+        other.append(self._size, **{name: getattr(self, name) for name in self.COLUMNS})
+        return other
+
+    def copy(self) -> Rows:
+        """Return a copy of the columns in ``COPIED``; it costs as much as has changed since the last."""
+        for k in np.flatnonzero(self._stale).tolist():
+            rows = slice(k * _PIECE, min((k + 1) * _PIECE, self._size))
+            piece = Piece((name, np.array(self._buffers[name][rows])) for name in self.COPIED)
+            self._pieces[k : k + 1] = [piece]
+        self._stale[:] = False
+        return Rows(tuple(self._pieces))
+
+    @property
+    def _n_pieces(self) -> int:
+        return max(1, -(-self._size // _PIECE))
 
     def _expose(self) -> None:
         for name, buffer in self._buffers.items():
             setattr(self, name, buffer[: self._size])
 
 
+_Table = TypeVar("_Table", bound=Table)
+
+
+class Growing:
+    """An array that grows at its end; what was taken of it before stays as it is."""
+
+    def __init__(self, dtype: DTypeLike, values: Any = ()) -> None:
+        self._buffer: NDArray[Any] = np.array(values, dtype)
+        self.values = self._buffer
+
+    def extend(self, values: NDArray[Any]) -> None:
+        """Add some at the end."""
+        begin, end = len(self.values), len(self.values) + len(values)
+        if end > len(self._buffer):
+            self._buffer = np.concatenate([self.values, np.empty(end, self._buffer.dtype)])
+        self._buffer[begin:end] = values
+        self.values = self._buffer[:end]
+
+
+# So many ids, or such a share of all, are kept apart before they are merged.
+_FEW, _FEW_SHARE = 1024, 8
+
+
 class IdIndex:
-    """Row numbers by id: sorted ids, searched by bisection."""
+    """Row numbers by id: sorted ids, searched by bisection.
+
+    New ids that come before others are few: they are kept apart, sorted too, and merged once they are many.
+    """
 
     def __init__(self) -> None:
-        self._ids: IdArray = np.empty(0, np.uint64)
-        self.rows: IntArray = np.empty(0, np.intp)
+        self._ids, self._of = Growing(np.uint64), Growing(np.intp)
+        self._few: IdArray = np.empty(0, np.uint64)
+        self._few_rows: IntArray = np.empty(0, np.intp)
 
     def __len__(self) -> int:
-        return len(self._ids)
+        return len(self._ids.values) + len(self._few)
 
     def find(self, ids: IdArray) -> IntArray:
         """Return the row of each id, -1 where it is not known."""
-        if not len(self._ids):
-            return np.full(len(ids), -1)
-        at = np.minimum(np.searchsorted(self._ids, ids), len(self._ids) - 1)
-        return np.where(self._ids[at] == ids, self.rows[at], -1)
+        found = _found(self._ids.values, self._of.values, ids)
+        return np.maximum(found, _found(self._few, self._few_rows, ids)) if len(self._few) else found
 
     def insert(self, ids: IdArray, rows: IntArray) -> None:
         """Add ids that are not known yet and differ from each other."""
         order = np.argsort(ids)
         ids, rows = ids[order], rows[order]
-        if len(self._ids) and len(ids) and ids[0] < self._ids[-1]:
-            at = np.searchsorted(self._ids, ids)
-            self._ids, self.rows = np.insert(self._ids, at, ids), np.insert(self.rows, at, rows)
-        else:
-            # Most front-ends count: new ids come last.
-            self._ids, self.rows = np.concatenate([self._ids, ids]), np.concatenate([self.rows, rows])
+        known = self._ids.values
+        # Most front-ends count: new ids come last.
+        begin = int(np.searchsorted(ids, known[-1])) if len(known) else 0
+        self._ids.extend(ids[begin:])
+        self._of.extend(rows[begin:])
+        if begin:
+            at = np.searchsorted(self._few, ids[:begin])
+            self._few, self._few_rows = (
+                np.insert(self._few, at, ids[:begin]),
+                np.insert(self._few_rows, at, rows[:begin]),
+            )
+            if len(self._few) > max(_FEW, len(known) // _FEW_SHARE):
+                self._merge()
 
     def renumber(self, renumbered: IntArray) -> None:
         """Follow :meth:`Table.keep`: take over the new row numbers and drop ids whose row is gone."""
-        rows = renumbered[self.rows]
-        self._ids, self.rows = self._ids[rows >= 0], rows[rows >= 0]
+        self._merge()
+        rows = renumbered[self._of.values]
+        self._set(self._ids.values[rows >= 0], rows[rows >= 0])
+
+    def _merge(self) -> None:
+        if len(self._few):
+            at = np.searchsorted(self._ids.values, self._few)
+            self._set(np.insert(self._ids.values, at, self._few), np.insert(self._of.values, at, self._few_rows))
+            self._few, self._few_rows = self._few[:0], self._few_rows[:0]
+
+    def _set(self, ids: IdArray, rows: IntArray) -> None:
+        self._ids, self._of = Growing(np.uint64, ids), Growing(np.intp, rows)
+
+
+def _found(known: IdArray, rows: IntArray, ids: IdArray) -> IntArray:
+    if not len(known):
+        return np.full(len(ids), -1)
+    at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+    return np.where(known[at] == ids, rows[at], -1)

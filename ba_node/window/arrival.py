@@ -50,17 +50,14 @@ def strays(
     The problem is of these keyframes and landmarks, rows in the scene; ``norms`` (n_obs,) are its residuals at the
     start, sigmas.
     """
-    new = np.flatnonzero(~scene.keyframes.refined[keyframes])
-    if config.tracks.outlier_px <= 0 or len(new) == len(keyframes):
-        return new[:0]
-    known = scene.landmarks.has_position[landmarks]
-    obs, found = problem.observations, []
-    for k in new:
-        own = np.flatnonzero(obs.keyframe == k)
-        own = own[known[obs.point[own]]]
-        if len(own) >= _MIN_POINTS and np.count_nonzero(norms[own] <= _limit(problem)) < _AGREEING * len(own):
-            found.append(keyframes[k])
-    return np.array(found, np.intp)
+    obs, new = problem.observations, ~scene.keyframes.refined[keyframes]
+    rows = np.flatnonzero(new.take(obs.keyframe))
+    if config.tracks.outlier_px <= 0 or new.all() or not len(rows):
+        return keyframes[:0]
+    rows = rows[scene.landmarks.has_position[landmarks].take(obs.point[rows])]
+    count = np.bincount(obs.keyframe[rows], minlength=len(new))
+    near = np.bincount(obs.keyframe[rows[norms[rows] <= _limit(problem)]], minlength=len(new))
+    return keyframes[(count >= _MIN_POINTS) & (near < _AGREEING * count)]
 
 
 class Stray(NamedTuple):
@@ -107,7 +104,7 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
     ]
     near = [_near(problem, start, config) for start in starts]
     for i in sorted(range(len(starts)), key=lambda i: -near[i])[:_TRIED]:
-        state = _lowered(problem, starts[i])
+        state = lowered(problem, starts[i])
         norms = native_kernels.residual_norms(problem, state, config.solver.kernels)
         agreeing = int(np.count_nonzero(norms <= _WIDE * config.tracks.outlier_px))
         if agreeing > most:
@@ -117,6 +114,7 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
     table = scene.keyframes
     rotation, position = geometry.inverse(best.rotation[0], best.translation[0])
     rotation, position = geometry.nearest_rotation(rotation), position + table.position[scene.order[0]]
+    scene.moved(np.array([row]))
     if max(near[-_ASKED:]) >= _AGREEING * len(problem.observations):
         # Its step from one of the keyframes before is right: it is another one that has jumped.
         table.rotation[row], table.position[row] = rotation, position
@@ -165,7 +163,7 @@ def _starts(scene: Scene, row: int) -> list[tuple[FloatArray, FloatArray]]:
     return [geometry.inverse(rotation, position - origin) for rotation, position in poses]
 
 
-def _lowered(problem: Problem, state: State) -> State:
+def lowered(problem: Problem, state: State) -> State:
     """Return the pose after steps of a robust loss that narrows; points are held."""
     with np.errstate(all="ignore"):
         for width in _WIDTHS:

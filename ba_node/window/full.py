@@ -143,7 +143,7 @@ class Optimization:
 
 
 @dataclass(frozen=True)
-class _Similarity:
+class Similarity:
     """x -> scale * rotation x + translation: (n,), (n, 3, 3), (n, 3)."""
 
     scale: FloatArray
@@ -156,8 +156,13 @@ class _Similarity:
         return np.asarray(self.scale[which, None] * turned + self.translation[which])
 
 
-def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Optimization | str:
-    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it."""
+def take_snapshot(
+    scene: Scene, config: Config, wanted: Extras = NOTHING, origin: Scene | None = None
+) -> Optimization | str:
+    """Return the problem of all keyframes and points, or why there is none; later changes do not reach it.
+
+    ``origin`` is the scene that the result is for where this one is a clone of it.
+    """
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
     if isinstance(selection, str):
@@ -166,7 +171,7 @@ def take_snapshot(scene: Scene, config: Config, wanted: Extras = NOTHING) -> Opt
     fixed = _fixed(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
     return Optimization(
-        scene,
+        origin or scene,
         selection,
         scene.keyframes.keyframe_id[selection.keyframes],
         scene.landmarks.track_id[selection.landmarks],
@@ -218,7 +223,7 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     anchor_of_row = np.empty(len(table), np.intp)
     anchor_of_row[scene.order] = anchor
 
-    _follow_points(scene, landmarks[kept], anchor_of_row, similarity)
+    follow_points(scene, landmarks[kept], anchor_of_row, similarity)
     others = np.flatnonzero((member < 0) & table.refined)
     which = anchor_of_row[others]
     table.position[others] = similarity.move(which, table.position[others])
@@ -228,6 +233,8 @@ def merge_snapshot(scene: Scene, config: Config, taken: Optimization, state: Sta
     table.refined[keyframes[here]] = True
     points.position[landmarks[kept]] = found[kept]
     points.has_position[landmarks[kept]] = True
+    points.changed()
+    scene.moved()
     scene.propagate_corrections()
     _classify(scene, config, taken.selection, keyframes[here], landmarks[kept])
     _join(scene, config, len(table) - 1 - int(scene.places()[keyframes[here]].max()))
@@ -252,7 +259,7 @@ def _corrections(
     result: tuple[FloatArray, FloatArray, FloatArray],
     keyframes: IntArray,
     landmarks: IntArray,
-) -> _Similarity:
+) -> Similarity:
     """Return the correction at each keyframe of the snapshot; senseless at those that are forgotten."""
     rotation, position, found = result
     before = (scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes])
@@ -265,7 +272,7 @@ def _corrections(
     was = np.linalg.norm(scene.landmarks.position[landmarks[point]] - before[1][at], axis=1)
     sound = (far > 0) & (was > 0)
     scale = _medians(far[sound] / was[sound], at[sound], len(keyframes))
-    return _Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
+    return Similarity(scale, turn, position - scale[:, None] * (turn @ before[1][:, :, None])[..., 0])
 
 
 def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
@@ -285,7 +292,7 @@ def _anchors(member: IntArray) -> IntArray:
     return np.asarray(member[np.where(at < 0, int(np.argmax(member >= 0)), at)])
 
 
-def _follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: _Similarity) -> None:
+def follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, similarity: Similarity) -> None:
     """Move the points that the result does not place with the keyframe that saw them first."""
     follows = scene.landmarks.has_position.copy()
     follows[updated] = False

@@ -135,6 +135,7 @@ def apply(
     rows = selection.keyframes[free]
     scene.keyframes.rotation[rows] = geometry.nearest_rotation(rotation)
     scene.keyframes.position[rows] = position + selection.origin
+    scene.moved(selection.keyframes[free | ~scene.keyframes.refined[selection.keyframes]])
     scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
@@ -201,6 +202,7 @@ def classify(
         _displace(scene, selection.landmarks[good < 2])
     error = norm * obs.sigma_px
     scene.landmarks.rms_px[selection.landmarks] = _rms_by_point(error * error, obs.point, ~outlier, n_points)
+    scene.landmarks.changed(selection.landmarks)
     if outlier_px > 0:
         note_reuse(scene, part_reused(scene, selection, whole, norm, gate, kernels))
 
@@ -236,6 +238,7 @@ def _place_anew(
 def _displace(scene: Scene, landmarks: IntArray) -> None:
     """Take the position of landmarks away; all their views are heard again when they are next placed."""
     scene.landmarks.has_position[landmarks] = False
+    scene.landmarks.changed(landmarks)
     scene.observations.outlier[scene.views_of(landmarks)] = False
 
 

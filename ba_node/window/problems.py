@@ -34,8 +34,8 @@ def problem_of(
     """
     table, cameras = scene.observations, scene.cameras
     assert cameras is not None
-    keyframe = _number(keyframes, len(scene.keyframes)).take(table.keyframe.take(rows))
-    point = _number(landmarks, len(scene.landmarks)).take(table.landmark.take(rows))
+    keyframe = scene.numbers(table.keyframe.take(rows), keyframes)
+    point = scene.numbers(table.landmark.take(rows), landmarks)
     camera = table.camera.take(rows).astype(np.intp)
     # No camera sees a point twice in a keyframe, so no two keys are equal and any sort gives the same.
     order = _sorted((point * len(keyframes) + keyframe) * len(cameras.model) + camera)
@@ -100,13 +100,6 @@ def _sorted(keys: IntArray) -> IntArray:
     packed = (keys << bits) | np.arange(len(keys))
     packed.sort()
     return packed & ((1 << bits) - 1)
-
-
-def _number(rows: IntArray, n: int) -> IntArray:
-    """Return the place of each of n rows in a list of rows, -1 where it is not in it."""
-    place = np.full(n, -1)
-    place[rows] = np.arange(len(rows))
-    return place
 
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.

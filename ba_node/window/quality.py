@@ -57,7 +57,7 @@ def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[
         "fixed_keyframes": int(np.count_nonzero(problem.fixed)),
         "landmarks": problem.n_points,
         "observations": len(problem.observations),
-        "held_keyframes": len(selection.window) - int(np.count_nonzero(np.isin(selection.window, selection.keyframes))),
+        "held_keyframes": len(set(selection.window.tolist()) - set(selection.keyframes.tolist())),
         "outliers": int(np.count_nonzero(~selection.inlier & ~selection.held_out[selection.observations.point])),
     }
 

@@ -67,6 +67,7 @@ def part_reused(
     scene.landmarks.position[landmarks[newer]] = kept[0][newer]
     scene.landmarks.has_position[landmarks[newer]] = kept[1][newer]
     scene.landmarks.has_position[added[newer]] = False
+    scene.landmarks.changed(np.concatenate([landmarks, added]))
     scene.observations.outlier[selection.rows[other]] = False
     return len(landmarks)
 

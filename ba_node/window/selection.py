@@ -26,12 +26,12 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, gauge, moving, odometry, trial, turns
+from ba_node.window import arrival, constraints, gauge, moving, odometry, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
-# Views of a point beyond those of the window that are looked at, newest first, for keyframes to be held fixed.
-_VIEWS = 400
+# Views of a point are looked at, newest first, so many times as a solve may have: some keyframes are not refined.
+_SPARE = 2
 # An observation that begins this many times beyond the outlier gate sits out the solve. A point that comes to stand in
 # the plane of a camera has a residual of 1e6 px or more; even weighted it would outweigh all the others.
 _ABSURD = 25.0
@@ -122,9 +122,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]
     usable &= ~moves.take(part.problem.observations.point)
-    is_new = np.zeros(len(scene.keyframes), bool)
-    is_new[window] = True
-    is_old = ~is_new[part.keyframes]
+    is_old = scene.numbers(part.keyframes, window) < 0
     if is_old.all():
         return "no keyframe of the window sees enough points that others see from another place, by rays that meet"
     obs, table = part.problem.observations, scene.keyframes
@@ -136,9 +134,11 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     active = some_observations(part.problem, np.flatnonzero(inlier))
     held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
     active = dataclasses.replace(active, fixed=held.fixed)
-    factors = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    factors = constraints.in_place(steps, constraints.factors(scene, config, active, part.keyframes, part.origin))
+    priors = constraints.point_priors(scene, config, part.landmarks, part.origin)
     return Selection(
-        problem=dataclasses.replace(active, factors=factors),
+        problem=dataclasses.replace(active, factors=factors, point_priors=priors),
         observations=obs,
         norms=norms,
         rows=part.rows,
@@ -181,11 +181,44 @@ def _measured(scene: Scene, part: _Part) -> tuple[FloatArray, FloatArray]:
 
 
 def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) -> tuple[_Part, FloatArray]:
-    """Return what may take part, and its residuals at the start, sigmas."""
+    """Return what may take part, with a first position for points that have none, and its residuals there, sigmas.
+
+    Positions are NaN where none can be had yet.
+    """
     part = _turned(scene, _reach(scene, window, config, without), window, config)
-    part = dataclasses.replace(part, problem=_placed(scene, part, config))
-    start = dataclasses.replace(part.problem.start, points=np.nan_to_num(part.problem.start.points))
-    return part, native_kernels.residual_norms(part.problem, start, config.solver.kernels)
+    problem, kernels, new = part.problem, config.solver.kernels, ~scene.landmarks.has_position[part.landmarks]
+    points = np.where(new[:, None], 0.0, problem.start.points)
+    norms = native_kernels.residual_norms(problem, _at(problem, points).start, kernels)
+    of_new = new.take(problem.observations.point)
+    heard = ~scene.observations.outlier.take(part.rows)
+    points[new] = np.nan
+    rows = np.flatnonzero(of_new & heard)
+    if len(rows):
+        points[new] = _first_positions(scene, part, rows, (new, norms[heard & ~of_new]), config)
+        found = part_of(problem, np.flatnonzero(of_new), np.ones(len(part.keyframes), bool), new)
+        norms[of_new] = native_kernels.residual_norms(found, _at(found, np.nan_to_num(points[new])).start, kernels)
+    return dataclasses.replace(part, problem=_at(problem, points)), norms
+
+
+def _first_positions(
+    scene: Scene, part: _Part, rows: IntArray, among: tuple[BoolArray, FloatArray], config: Config
+) -> FloatArray:
+    """Return first positions (n_new, 3) of the points that have none, of which ``rows`` are the inlier observations.
+
+    ``among`` tells which they are, (n_pt,), and how far off the views of the others are, sigmas.
+    """
+    new, norms = among
+    of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
+    guess = moved_guesses(scene, part.landmarks[new]) - part.origin
+    if len(norms) < _BULK:
+        gate = poses_gate(of_new, config.tracks, config.solver.kernels)
+    else:
+        gate = widened(config.tracks.max_triangulation_px, norms)
+    return initial_points(of_new, guess, config.tracks, gate, config.solver.kernels)
+
+
+def _at(problem: Problem, points: FloatArray) -> Problem:
+    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:
@@ -209,22 +242,12 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     taking_part = window[~np.isin(window, without)] if len(without) else window
     ranges = [np.arange(b.begin, b.end) for row in taking_part for b in scene.blocks[row]]
     own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
-    landmarks = _distinct(table.landmark[own], len(scene.landmarks))
-    rows = scene.views_of(landmarks, _views_needed(scene, window))
-    n = len(scene.keyframes)
-    in_window = np.zeros(n, bool)
-    in_window[window] = True
+    landmarks = scene.distinct(table.landmark[own])
+    rows = scene.views_of(landmarks, _views_needed(scene, window, config.window.max_fixed_keyframes))
     keyframe = table.keyframe.take(rows)
-    shared = np.bincount(keyframe[~table.outlier.take(rows)], minlength=n)
-    # Newest first, so that of those that share equally many the newest are taken. A keyframe that was never refined
-    # would only hold the others to the front-end's drift.
-    older = scene.order[: int(np.argmax(in_window[scene.order]))][::-1]
-    older = older[(shared[older] > 0) & scene.keyframes.refined[older]]
-    in_part = np.zeros(n, bool)
-    in_part[taking_part] = True
-    in_part[older[np.argsort(-shared[older], kind="stable")[: config.window.max_fixed_keyframes]]] = True
-    rows = rows[in_part.take(keyframe)]
-    keyframes = scene.order[in_part[scene.order]]
+    older = _older(scene, window, keyframe[~table.outlier.take(rows)])[: config.window.max_fixed_keyframes]
+    keyframes = scene.by_time(np.concatenate([taking_part, older]))
+    rows = rows[scene.numbers(keyframe, keyframes) >= 0]
     landmarks = landmarks[np.argsort(scene.landmarks.track_id[landmarks])]
     origin = scene.keyframes.position[keyframes[0]] if len(keyframes) else np.zeros(3)
     positions = scene.landmarks.position[landmarks] - origin
@@ -232,63 +255,43 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     return _Part(problem, rows, keyframes, landmarks, origin)
 
 
-def _views_needed(scene: Scene, window: IntArray) -> int | None:
+def _views_needed(scene: Scene, window: IntArray, n_fixed: int) -> int | None:
     """Return how many of the newest views of a point may matter, None for all of them.
 
     Who stands still sees the same points in thousands of keyframes, and to gather all of these takes longer and longer.
-    Those before the newest few hundred keyframes share no more points with the window than these do.
+    Those before the newest few share no more points with the window than these do.
     """
     if not len(window) or window[-1] != scene.order[-1]:
         return None  # newer keyframes wait behind the window
-    return _VIEWS + sum(len(scene.blocks[row]) for row in window)
+    images = max(len(scene.blocks[row]) for row in window)
+    return _SPARE * images * (len(window) + n_fixed)
 
 
-def _distinct(rows: NDArray[np.int32], n: int) -> IntArray:
-    """Return the different ones among rows of a table of n, ascending."""
-    marked = np.zeros(n, bool)
-    marked[rows] = True
-    return np.flatnonzero(marked)
+def _older(scene: Scene, window: IntArray, keyframe: NDArray[np.int32]) -> IntArray:
+    """Return the refined keyframes before a window that see its points, those first that share most with it.
+
+    ``keyframe`` is that of each inlier observation of its points. A keyframe that was never refined would only hold the
+    others to the front-end's drift.
+    """
+    seeing = scene.by_time(scene.distinct(keyframe))
+    shared = np.bincount(scene.numbers(keyframe, seeing), minlength=len(seeing))
+    first = int(scene.places()[window[0]]) if len(window) else 0
+    # Newest first, so that of those that share equally many the newest are taken.
+    older = np.flatnonzero((scene.places()[seeing] < first) & scene.keyframes.refined[seeing])[::-1]
+    return seeing[older[np.argsort(-shared[older], kind="stable")]]
 
 
 def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Part:
     """Return a part that begins with the orientations that images alone tell."""
     if not config.odometry.enabled or len(part.keyframes) > _MOST_TURNS:
         return part
-    of_window = np.isin(part.keyframes, window).take(part.problem.observations.keyframe)
+    of_window = (scene.numbers(part.keyframes, window) >= 0).take(part.problem.observations.keyframe)
     used = of_window & ~scene.observations.outlier.take(part.rows)
     found = turns.find(part.problem, part.keyframes, used, scene.landmarks.has_position[part.landmarks])
     if found is None:
         return part
     free = ~scene.keyframes.refined[part.keyframes]
     return dataclasses.replace(part, problem=found.applied(part.problem, part.keyframes, free), turned=found)
-
-
-def _placed(scene: Scene, part: _Part, config: Config) -> Problem:
-    """Return the problem of a part with first positions of points that have none, NaN where none can be had yet."""
-    new = ~scene.landmarks.has_position[part.landmarks]
-    points = part.problem.start.points.copy()
-    points[new] = np.nan
-    rows = np.flatnonzero(new.take(part.problem.observations.point) & ~scene.observations.outlier.take(part.rows))
-    if len(rows):
-        of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
-        guess = moved_guesses(scene, part.landmarks[new]) - part.origin
-        gate = _gate(scene, part, new, config) or poses_gate(of_new, config.tracks, config.solver.kernels)
-        points[new] = initial_points(of_new, guess, config.tracks, gate, config.solver.kernels)
-    return _with_points(part.problem, points)
-
-
-def _gate(scene: Scene, part: _Part, new: BoolArray, config: Config) -> float | None:
-    """Return how far off a view of a new point may be: as those of the known points are; None without these."""
-    rows = np.flatnonzero(~new.take(part.problem.observations.point) & ~scene.observations.outlier.take(part.rows))
-    if len(rows) < _BULK:
-        return None
-    known = some_observations(part.problem, rows)
-    norms = native_kernels.residual_norms(known, known.start, config.solver.kernels)
-    return widened(config.tracks.max_triangulation_px, norms)
-
-
-def _with_points(problem: Problem, points: FloatArray) -> Problem:
-    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
 def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
@@ -301,10 +304,11 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     guess = np.where(has_guess, scene.landmarks.guess[landmarks], np.nan)
     if not has_guess.any():
         return guess
-    rows = scene.views_of(landmarks)
-    first = np.full(len(scene.landmarks), len(scene.order) - 1)
-    np.minimum.at(first, scene.observations.landmark[rows], scene.places()[scene.observations.keyframe[rows]])
-    rotation, translation = scene.corrections(scene.order[first[landmarks]])
+    rows = scene.views_of(landmarks[has_guess[:, 0]])
+    first = np.full(len(landmarks), len(scene.order) - 1)
+    number = scene.numbers(scene.observations.landmark[rows], landmarks)
+    np.minimum.at(first, number, scene.places()[scene.observations.keyframe[rows]])
+    rotation, translation = scene.corrections(scene.order[first])
     return np.asarray((rotation @ guess[:, :, None])[..., 0] + translation)
 
 

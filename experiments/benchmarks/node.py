@@ -28,7 +28,7 @@ from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
 from ba_node.measurements import FeatureTracks
 from ba_node.messages import conversion
 from ba_node.messages.outputs import output_messages
-from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.tools.domain import free_domain, isolation
@@ -75,7 +75,8 @@ class Peer:
         self.received_s: dict[int, float] = {}
         self.calls_ms: list[float] = []
         for topic in topics:
-            cls, profile = message_class(OUTPUT_TYPES[topic]), qos.profile(TOPICS[topic])
+            cls = message_class(OUTPUT_TYPES[topic])
+            profile = qos.profile(TOPICS[topic]) if topic in WHOLE_MAP else qos.reliable(qos.OUTPUT_DEPTH)
             if topic == "report":
                 self.node.create_subscription(cls, "ba_node/report", self._note, profile)
             else:

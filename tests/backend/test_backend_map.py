@@ -18,7 +18,7 @@ from ba_node.backend import Backend
 from ba_node.backend.archive import unpack
 from ba_node.config import Config
 from ba_node.estimate import Estimate
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement, OfTime
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.synthetic import SyntheticOptions, generate
 
@@ -38,7 +38,7 @@ def stream(seed: int) -> tuple[Measurement, ...]:
             seed=seed, outlier_share=0.05, depth_share=0.3 * (seed % 2),
         )  # fmt: skip
         for _, _, m in generate(options).timeline():
-            out.append(m if isinstance(m, CameraRig) else dataclasses.replace(m, session_id=session))
+            out.append(m if isinstance(m, CameraRig | OfTime) else dataclasses.replace(m, session_id=session))
     return tuple(out)
 
 
@@ -150,7 +150,7 @@ def test_reset_forgets_all_but_the_cameras(known: Backend) -> None:
     assert known.scene.cameras is cameras
     assert known.solve_count == count
     # A session that is not higher than the last is taken, too: the front-end need not know of the reset.
-    estimates = feed(known, [m for m in stream(1) if isinstance(m, CameraRig) or m.session_id == 0])
+    estimates = feed(known, [m for m in stream(1) if isinstance(m, CameraRig | OfTime) or m.session_id == 0])
     assert estimates[-1] is not None
     assert estimates[-1].report.status.usable
 
@@ -238,7 +238,7 @@ def test_what_another_version_adds_or_lacks_is_passed_over(known: Backend) -> No
 def test_a_map_that_is_larger_than_allowed_is_cut_when_more_comes(known: Backend) -> None:
     target = Backend(Config().with_values({**SETTINGS, "scene.max_landmarks": 100}))
     target.take_over(unpack(known.snapshot(), target.config.scene))
-    feed(target, [m for m in stream(1) if isinstance(m, CameraRig) or m.session_id == 1])
+    feed(target, [m for m in stream(1) if isinstance(m, CameraRig | OfTime) or m.session_id == 1])
     assert len(target.scene.landmarks) <= 100
 
 

@@ -65,7 +65,7 @@ def test_a_keyframe_is_solved_waits_or_is_not_known() -> None:
         backend.solve()
     assert [backend.map.is_solved(0, key) for key in (first, last)] == [True, True]
     assert backend.map.solved_count == 3
-    assert backend.map.refined_keyframes() <= set(all_ids()[:3])
+    assert backend.map.refined_among(all_ids()) <= set(all_ids()[:3])
     given = backend.map.input_keyframes()
     assert [keyframe.keyframe_id for keyframe in given] == all_ids()[:3]
     for ours, theirs in zip(given, data().keyframes[:3], strict=True):

@@ -19,7 +19,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, solver
 from ba_node.core.result import Iteration, Status
 from ba_node.evaluation.alignment import align
-from ba_node.measurements import CameraRig, Measurement
+from ba_node.measurements import CameraRig, Measurement, OfTime
 from ba_node.synthetic import SyntheticData, SyntheticOptions
 from ba_node.window import full
 from ba_node.window.merging import scaled
@@ -184,7 +184,7 @@ def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: 
     # The scale is given to the map by its steps, so they are stretched with it.
     snapshot = dataclasses.replace(snapshot, position=moved(position))
     state = scaled(snapshot.selection, snapshot.position, state)
-    late_ids = set(data.truth.keyframe_id[12:].tolist()) & backend.map.refined_keyframes()
+    late_ids = backend.map.refined_among(data.truth.keyframe_id[12:].tolist())
     assert len(late_ids) >= 6, f"{len(late_ids)} of the 8 later keyframes were refined"
     assert full.merge_snapshot(scene, backend.config, snapshot, state) == len(late_ids)
     after = backend.estimate()
@@ -212,7 +212,9 @@ def test_the_result_of_a_map_that_is_gone_changes_nothing(lost: str) -> None:
     elif lost == "map":
         backend.take_over(unpack(backend.snapshot(), CONFIG.scene))
     else:
-        feed(backend, [m if isinstance(m, CameraRig) else dataclasses.replace(m, session_id=1) for m in stream])
+        feed(
+            backend, [m if isinstance(m, CameraRig | OfTime) else dataclasses.replace(m, session_id=1) for m in stream]
+        )
     before = backend.estimate().trajectory.position
     assert backend.merge(taken) is None
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before)
@@ -282,6 +284,28 @@ def test_a_solve_is_stopped_after_an_iteration() -> None:
     assert taken.result.method == "lma_cd"
 
 
+def test_what_is_chosen_of_a_copy_is_the_map_at_that_moment() -> None:
+    """Windows go on before the problem of the copy is put together, and the result is merged as that of the map."""
+    first, rest = cut(recording(), 20)
+    backend = Backend(CONFIG)
+    feed(backend, first)
+    direct, begin = everything(backend), backend.copied()
+    feed(backend, rest)
+    taken = begin()
+    assert isinstance(taken, Optimization)
+    assert taken.scene is direct.scene is backend.scene
+    assert np.array_equal(taken.keyframe_id, direct.keyframe_id)
+    assert np.array_equal(taken.track_id, direct.track_id)
+    ours, theirs = taken.selection.problem, direct.selection.problem
+    assert np.array_equal(ours.start.points, theirs.start.points)
+    assert np.array_equal(ours.start.rotation, theirs.start.rotation)
+    assert np.array_equal(ours.observations.uv, theirs.observations.uv)
+    taken.solve(backend.config.solver)
+    merged = backend.merge(taken)
+    assert merged is not None
+    assert merged[1] == 10, f"{merged[1]} of the 10 later keyframes followed"
+
+
 @settings(max_examples=25)
 @given(st.data())
 def test_whatever_happens_meanwhile_merging_does_not_raise(data: st.DataObject) -> None:
@@ -299,6 +323,7 @@ def test_whatever_happens_meanwhile_merging_does_not_raise(data: st.DataObject) 
     feed(backend, [m for i, m in enumerate(stream[at:end]) if not lost or i % (lost + 1)], flush=False)
     rows = data.draw(st.lists(st.integers(0, len(backend.scene.landmarks) - 1), max_size=50))
     backend.scene.landmarks.has_position[rows] = False
+    backend.scene.landmarks.changed()
     backend.merge(taken)
     backend.merge(taken)
     assert np.isfinite(backend.scene.keyframes.position).all()

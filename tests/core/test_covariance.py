@@ -55,27 +55,27 @@ def by_dense_jacobian(problem: Problem, state: State, chosen: SolverOptions) -> 
             size = np.abs(lin.residual[:, 2])
             weight[:, 2] = np.minimum(1.0, chosen.loss_scale_px / np.maximum(size, 1e-300))
             slope[:, 2] = weight[:, 2] * np.sum(size <= chosen.loss_scale_px) / np.sum(weight[:, 2])
-    jacobian, score = jacobian.reshape(n_obs * d, -1), (weight * lin.residual).ravel()
-    slope = slope.ravel()
-    inverse = np.linalg.inv(jacobian.T @ (slope[:, None] * jacobian))
-    leverage = np.einsum("mi,ij,mj->m", jacobian, inverse, jacobian) * slope
-    counts = np.any(jacobian != 0.0, axis=1)
+    flat, score = jacobian.reshape(n_obs * d, -1), (weight * lin.residual).ravel()
+    steep = slope.ravel()
+    inverse = np.linalg.inv(flat.T @ (steep[:, None] * flat))
+    leverage = np.einsum("mi,ij,mj->m", flat, inverse, flat) * steep
+    counts = np.any(flat != 0.0, axis=1)
     variance = np.zeros(n_obs * d)
     for rows in (np.arange(n_obs * d) % d < 2, np.arange(n_obs * d) % d == 2):
         of = rows & counts
         if of.any() and (chosen.loss == "squared" or not rows[0]):
-            variance[of] = slope[of] / slope[of].mean() * np.sum(score[of] ** 2) / np.sum(1.0 - leverage[of])
+            variance[of] = steep[of] / steep[of].mean() * np.sum(score[of] ** 2) / np.sum(1.0 - leverage[of])
         elif of.any():
             left = 1.0 - np.minimum(leverage[of], 0.9)
-            kappa = np.sum((score[of] / left) ** 2) / np.sum(slope[of] / left)
-            variance[of] = np.maximum((score[of] / left) ** 2 - kappa * slope[of] * (1.0 - left), 0.0)
-    whole = inverse @ (jacobian.T @ (variance[:, None] * jacobian)) @ inverse
+            kappa = np.sum((score[of] / left) ** 2) / np.sum(steep[of] / left)
+            variance[of] = np.maximum((score[of] / left) ** 2 - kappa * steep[of] * (1.0 - left), 0.0)
+    whole = inverse @ (flat.T @ (variance[:, None] * flat)) @ inverse
     blocks = [whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]
     # Points take the mean variance of a group.
     for rows in (np.arange(n_obs * d) % d < 2, np.arange(n_obs * d) % d == 2):
         of = rows & counts
-        variance[of] = slope[of] * variance[of].sum() / max(slope[of].sum(), 1e-300)
-    whole = inverse @ (jacobian.T @ (variance[:, None] * jacobian)) @ inverse
+        variance[of] = steep[of] * variance[of].sum() / max(steep[of].sum(), 1e-300)
+    whole = inverse @ (flat.T @ (variance[:, None] * flat)) @ inverse
     at = 6 * n + 3 * np.arange(problem.n_points)
     return np.array(blocks), np.array([whole[i : i + 3, i : i + 3] for i in at])
 

@@ -41,6 +41,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_nothing_is_written_when_there_is_no_common_time(tmp_path: Path) -> None:
     c = comparison()
+    assert c.truth is not None
     late = Poses(c.truth.keyframe_id, c.truth.stamp_ns + 10**12, c.truth.position, c.truth.orientation)
     with pytest.raises(EvaluationError, match="0 of 12 poses"):
         draw(tmp_path / "a.png", Comparison(c.before, c.after, late, np.empty((0, 3))))

@@ -15,7 +15,7 @@ from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.io.bag_topics import NO_CHOICE, Chooser, TopicChoice, parse_topic
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
-from ba_node.measurements import CameraRig, Keyframe, LandmarkGuesses
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.offline.replay import MapOptions, replay
@@ -143,6 +143,7 @@ def write_robots(path: Path, spaces: dict[str, int]) -> None:
             elif isinstance(m, LandmarkGuesses):
                 message = guesses_message(F, m, stamp, "odom")
             else:
+                assert isinstance(m, FeatureTracks)
                 message = tracks_message(F, m, stamp, f"camera{m.camera_index}")
             entries.append((stamp, f"{space}/{topic}", INPUT_TYPES[topic], message))
     entries.sort(key=lambda entry: entry[0])

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ba_node.arrays import FloatArray
 from ba_node.core import geometry
-from ba_node.estimate import Correction, Estimate, Transform
+from ba_node.estimate import Cloud, Correction, Estimate, Poses, SolveReport, Transform
 from ba_node.io.ros_types import ROSBAGS_FACTORY as FACTORY
-from ba_node.messages.transforms import StaticTree, covariance_messages, tf_message
+from ba_node.messages.transforms import StaticTree, covariance_messages, odometry_message, tf_message
 
 
 def test_tf_says_where_odom_stands_in_the_map() -> None:
@@ -35,6 +36,46 @@ def test_covariances_are_row_major_and_zero_where_unknown(estimate: Estimate) ->
         assert list(message.pose.covariance) == expected.tolist()
         assert message.pose.pose.position.x == estimate.refined.position[k, 0]
         assert message.header.frame_id == "map"
+
+
+def test_odometry_is_the_newest_keyframe_with_the_mean_velocity_in_the_body() -> None:
+    """A body that looks along y goes 2 m along it in half a second and turns left by 0.1 rad."""
+    turns = np.array([[0.0, 0.0, 0.5 * np.pi], [0.0, 0.0, 0.5 * np.pi + 0.1]])
+    orientation = geometry.quaternion_from_matrix(geometry.so3_exp(turns))
+    poses = Poses(
+        np.arange(2, dtype=np.uint64), np.array([0, 5 * 10**8]), np.array([[1.0, 1, 0], [1, 3, 0]]), orientation
+    )
+    variance = np.array([[1e-4, 4e-4, 9e-4, 1e-6, 1e-6, 1e-6], [1e-4, 4e-4, 9e-4, 4e-6, 4e-6, 4e-6]])
+    estimate = estimate_of(poses, np.array([np.diag(row) for row in variance]))
+    message = odometry_message(FACTORY, estimate, "base_link")
+    assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (0, 5 * 10**8)
+    assert message.pose.pose.position.y == 3.0
+    assert np.array_equal(message.pose.covariance, np.diag(variance[1]).ravel())
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    found = [linear.x, linear.y, linear.z, angular.x, angular.y, angular.z]
+    # Seen from where it looks now, 0.1 rad left of the way.
+    np.testing.assert_allclose(found, [4.0 * np.cos(0.1), -4.0 * np.sin(0.1), 0.0, 0.0, 0.0, 0.2], atol=1e-12)
+    cov = np.reshape(message.twist.covariance, (6, 6))
+    # Along the way it errs as y of the map does: twice 4e-4 m^2, over a quarter of a square second.
+    c, s = np.cos(0.1), np.sin(0.1)
+    along = np.array([c, -s])
+    np.testing.assert_allclose(along @ cov[:2, :2] @ along, 32e-4, rtol=1e-12)
+    np.testing.assert_allclose(np.diagonal(cov)[2:], [72e-4, 2e-5, 2e-5, 2e-5], rtol=1e-12)
+
+
+def test_odometry_says_where_nothing_is_known() -> None:
+    poses = Poses(np.array([3], np.uint64), np.array([7]), np.zeros((1, 3)), np.array([[0.0, 0, 0, 1]]))
+    for covariance in (None, np.full((1, 6, 6), np.nan), np.zeros((1, 6, 6))):
+        message = odometry_message(FACTORY, estimate_of(poses, covariance), "base")
+        for found in (message.pose.covariance, message.twist.covariance):
+            assert np.array_equal(found, 1e6 * np.eye(6).ravel())
+        assert message.twist.twist.linear.x == 0.0
+
+
+def estimate_of(poses: Poses, covariance: FloatArray | None) -> Estimate:
+    empty = Cloud(np.empty(0, np.uint64), np.empty((0, 3)), np.empty(0, np.float32), np.empty(0, np.int32))
+    return Estimate(int(poses.stamp_ns[-1]), "map", poses, poses, empty, SolveReport(), covariance=covariance)
 
 
 def said(parent: str, child: str, transform: Transform) -> Any:

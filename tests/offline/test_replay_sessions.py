@@ -16,7 +16,7 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.io.trajectory import read_tum
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement, OfTime
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
@@ -166,7 +166,9 @@ def test_what_is_worth_nothing_is_refused_by_name(
 def test_the_lower_session_of_a_front_end_that_restarted_is_written(tmp_path: Path) -> None:
     rows = timeline()
     length = rows[-1][1] - rows[0][1] + S
-    first = [(t, s, m if isinstance(m, CameraRig) else dataclasses.replace(m, session_id=6)) for t, s, m in rows]
+    first = [
+        (t, s, m if isinstance(m, CameraRig | OfTime) else dataclasses.replace(m, session_id=6)) for t, s, m in rows
+    ]
     record(tmp_path / "restart.mcap", [*first, *((t, s + length, m) for t, s, m in rows[1:])])
     report = replay(tmp_path / "restart.mcap", tmp_path / "out", Config())
     assert (report["session_id"], report["keyframes"]) == (0, 8)

@@ -32,9 +32,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RclpyParameter
 
-from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages import conversion
-from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS
+from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.synthetic import SyntheticData
@@ -175,7 +175,8 @@ class Peer:
         for topic in topics or OUTPUT_TYPES:
             take = self.received[topic].append
             cls = message_class(OUTPUT_TYPES[topic])
-            self.node.create_subscription(cls, f"ba_node/{topic}", take, qos.profile(TOPICS[topic]))
+            profile = qos.profile(TOPICS[topic]) if topic in WHOLE_MAP else qos.reliable(qos.OUTPUT_DEPTH)
+            self.node.create_subscription(cls, f"ba_node/{topic}", take, profile)
 
     def connect(self) -> None:
         """Wait until the node hears every publisher and is heard by every subscription."""
@@ -217,6 +218,7 @@ class Peer:
             message = conversion.guesses_message(FACTORY, measurement, stamp_ns, "odom")
             self.publishers["landmark_guesses"].publish(message)
         else:
+            assert isinstance(measurement, CameraRig)
             self.publishers["camera_rig"].publish(conversion.rig_message(FACTORY, measurement, stamp_ns))
 
     def play(self, data: SyntheticData, session_id: int = 0) -> None:

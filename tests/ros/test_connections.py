@@ -74,8 +74,8 @@ def test_publisher_and_subscriber_that_do_not_match_are_named(start_node: StartN
     assert "between this node and publisher /peer: incompatible RELIABILITY" in warning
     assert "qos_overrides./keyframes.*" in warning
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    peer.node.create_subscription(message_class(OUTPUT_TYPES["report"]), "ba_node/report", print, latched)
-    peer.until(lambda: "/ba_node/report: no messages pass" in node.err, "a warning about the subscriber")
+    peer.node.create_subscription(message_class(OUTPUT_TYPES["pose"]), "ba_node/pose", print, latched)
+    peer.until(lambda: "/ba_node/pose: no messages pass" in node.err, "a warning about the subscriber")
     assert "subscriber /peer: incompatible DURABILITY" in node.err
 
 

@@ -77,7 +77,7 @@ def content(scene: Scene) -> tuple[Any, ...]:
             strict=True,
         )
     )
-    rows = scene.landmark_order
+    rows = np.argsort(scene.landmarks.track_id)
     table = scene.landmarks
     marks = [
         (int(table.track_id[r]), int(table.views[r]), bool(table.has_guess[r]), repr(table.guess[r].tolist()))
@@ -105,7 +105,7 @@ def test_any_uint64_is_an_id() -> None:
     ends = [0, 2**53 + 1, 2**64 - 1]
     scene = scene_of(rig(), *(m for i, k in enumerate(ends) for m in (keyframe(k, stamp=i), tracks(k))))
     assert [int(k) for k in scene.keyframes.keyframe_id] == ends
-    assert [int(t) for t in scene.landmarks.track_id[scene.landmark_order]] == IDS.tolist()
+    assert [int(t) for t in scene.landmarks.track_id[np.argsort(scene.landmarks.track_id)]] == IDS.tolist()
     assert (scene.landmarks.views == 3).all()
     assert not scene.log.rejected
     check_links(scene)
@@ -239,6 +239,7 @@ def test_new_keyframes_follow_the_correction_of_their_predecessor() -> None:
     turn = geometry.so3_exp(np.array([0.0, 0.0, 0.3]))
     scene.keyframes.rotation[1], scene.keyframes.position[1] = turn, [10.0, 0, 0]
     scene.keyframes.refined[1] = True
+    scene.moved(np.array([1]))
     scene.add(keyframe(3, position=np.array([1.5, 0.25, 0])))
     scene.propagate_corrections()
     # Keyframe 2 came in at x = 1: keyframe 3 is (0.5, 0.25, 0) further on, seen from it.
@@ -368,3 +369,34 @@ def test_order_within_a_keyframe_does_not_matter(order: list[int], split: int) -
     shuffled = [messages[i] for i in order]
     scene = scene_of(*shuffled[:split], *shuffled)
     assert content(scene) == content(scene_of(*messages))
+
+
+def test_corrections_are_propagated_as_if_all_were_done_anew() -> None:
+    """Poses and refinements change at random, keyframes come late: each follows the last refined one before it."""
+    rng = np.random.default_rng(5)
+    scene = scene_of()
+    for count in range(120):
+        stamp = count - 4 if count % 9 == 8 else count
+        scene.add(keyframe(count, stamp=stamp, position=rng.normal(size=3)))
+        for row in rng.integers(0, len(scene.keyframes), rng.integers(0, 3)):
+            scene.keyframes.position[row] = rng.normal(size=3)
+            scene.keyframes.refined[row] = rng.random() < 0.7
+            scene.moved(np.array([row]))
+        scene.propagate_corrections()
+        table, order = scene.keyframes, scene.order.tolist()
+        assert order == sorted(range(len(table)), key=lambda row: (int(table.stamp_ns[row]), row))
+        assert scene.places()[order].tolist() == list(range(len(order)))
+        refined = [row for row in order if table.refined[row]]
+        for place, row in enumerate(order if refined else []):
+            before = [other for other in order[: place + 1] if table.refined[other]]
+            anchor = before[-1] if before else refined[0]
+            step = table.input_position[row] - table.input_position[anchor]
+            np.testing.assert_allclose(table.position[row], table.position[anchor] + step, atol=1e-12)
+
+
+def test_rows_are_numbered_and_told_apart_without_regard_to_the_rest() -> None:
+    scene = scene_of(rig(), keyframe(1), tracks(1, ids=np.arange(50, dtype=np.uint64)))
+    rows = np.array([7, 3, 7, 40, 3, 9], np.int32)
+    for _ in range(2):
+        assert scene.distinct(rows).tolist() == [3, 7, 9, 40]
+        assert scene.numbers(rows, np.array([40, 7])).tolist() == [1, -1, 1, 0, -1, -1]

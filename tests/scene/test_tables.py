@@ -43,7 +43,6 @@ def test_ids_are_found_exactly_as_a_dict_would(known: list[int], asked: list[int
         expected.update(zip(part, rows.tolist(), strict=True))
     found = index.find(np.array(asked, np.uint64))
     assert found.tolist() == [expected.get(i, -1) for i in asked]
-    assert index.rows.tolist() == [expected[i] for i in sorted(expected)]
 
 
 def test_forgotten_rows_lose_their_ids() -> None:

@@ -76,7 +76,6 @@ def test_newest_are_free_older_that_share_most_are_fixed() -> None:
 def test_who_stands_still_gathers_no_more_views_than_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same images again and again: what is gathered stays bounded, and the newest keyframes are held fixed."""
     settings = config(window__max_keyframes=4, window__max_fixed_keyframes=3)
-    monkeypatch.setattr("ba_node.window.selection._VIEWS", 20)
     scene = scene_of(settings, guesses=True)
     data = generate(SyntheticOptions(**QUIET))
     keyframe, (left, right) = data.keyframes[-1], data.tracks[-1]

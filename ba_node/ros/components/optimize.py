@@ -13,6 +13,7 @@ import math
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -115,16 +116,17 @@ class Optimize(Component):
     def _copy(self, backend: Backend, goal: _Goal) -> None:
         """Copy the map, on the solver's thread."""
         with goal.answer.guarded():
-            taken = backend.begin_optimization()
+            arguments = backend, goal, backend.copied()
+            # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
+            threading.Thread(target=self._solve, args=arguments, name=_NAME, daemon=False).start()
+
+    def _solve(self, backend: Backend, goal: _Goal, begin: Callable[[], Optimization | str]) -> None:
+        """Solve the copy, on a thread of its own."""
+        with goal.answer.guarded():
+            taken = begin()
             if isinstance(taken, str):
                 goal.end(Status.SKIPPED, taken)
                 return
-            # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
-            threading.Thread(target=self._solve, args=(backend, goal, taken), name=_NAME, daemon=False).start()
-
-    def _solve(self, backend: Backend, goal: _Goal, taken: Optimization) -> None:
-        """Solve the copy, on a thread of its own."""
-        with goal.answer.guarded():
             taken = self._solved(backend, goal, taken)
             goal.result = taken.statistics()
             if goal.stop:

@@ -11,7 +11,7 @@ from typing import Any
 from ba_node.estimate import Estimate, Status
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.report import LatencyReport, Report, report_message
-from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS
+from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, Throttle, log
@@ -55,8 +55,8 @@ class Activity:
 class Publishing(Component):
     """The outputs of the node; nothing is built for a topic that nobody listens to.
 
-    Path and points replace each other: only the newest are sent. Who comes later gets those of the last estimate, which
-    are built then.
+    Path and points replace each other: only the newest are sent. Who comes later gets those of the last estimate, and
+    the last report, which are built then.
     """
 
     def __init__(self, host: Host) -> None:
@@ -66,6 +66,7 @@ class Publishing(Component):
         self._ages, self._latency = (Sliding(), Sliding()), LatencyReport()
         # The estimate that latched topics are to show, and those of them that do not show it yet.
         self._latest: Estimate | None = None
+        self._told: Outcome | None = None
         self._behind: set[str] = set()
         self._outputs: dict[str, Any] = {}
         for topic in OUTPUT_TYPES:
@@ -78,11 +79,9 @@ class Publishing(Component):
             self._publish(outcome.estimate, self._heard() & _POSES)
             self._measure(outcome)
         report = Report(outcome.report, outcome.queue, self._latency).counting(self.host.counted)
-        self.host.report = report
-        if "report" in self._heard():
-            frame_id = self.host.config.frames.map_frame if outcome.estimate is None else outcome.estimate.frame_id
-            message = report_message(self._factory, report, outcome.stamp_ns, frame_id)
-            self._outputs["report"].publish(message)
+        self.host.report, self._told = report, outcome
+        self._behind.add("report")
+        self._publish_report()
         if outcome.estimate is not None:
             self._log_report(report)
 
@@ -90,18 +89,32 @@ class Publishing(Component):
         """Publish the map."""
         if newest:
             self._latest = estimate
-            self._behind = set(LATCHED_OUTPUTS) - self._heard()
-            self._publish(estimate, self._heard().intersection(LATCHED_OUTPUTS))
+            heard = self._heard()
+            self._behind |= set(WHOLE_MAP) - heard
+            self._behind -= heard.intersection(WHOLE_MAP)
+            self._publish(estimate, heard.intersection(WHOLE_MAP))
 
     def _heard(self) -> set[str]:
         return {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
 
     def _catch_up(self, _status: object) -> None:
         """Give those who come late what they missed."""
-        wanted = self._behind & self._heard()
-        if self._latest is not None and wanted and self.host.active:
-            self._behind -= wanted
+        if not self.host.active or len(self._outputs) < len(OUTPUT_TYPES):
+            return
+        wanted = (self._behind & self._heard()).intersection(WHOLE_MAP)
+        self._behind -= wanted
+        if self._latest is not None:
             self._publish(self._latest, wanted)
+        self._publish_report()
+
+    def _publish_report(self) -> None:
+        """Publish the last report if somebody listens who has not got it."""
+        report, outcome = self.host.report, self._told
+        if report is None or outcome is None or "report" not in self._behind & self._heard():
+            return
+        self._behind.discard("report")
+        frame_id = self.host.config.frames.map_frame if outcome.estimate is None else outcome.estimate.frame_id
+        self._outputs["report"].publish(report_message(self._factory, report, outcome.stamp_ns, frame_id))
 
     def _publish(self, estimate: Estimate, wanted: set[str]) -> None:
         if not wanted:

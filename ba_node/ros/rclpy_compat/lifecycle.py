@@ -23,12 +23,19 @@ from ba_node.ros.rclpy_compat.private import RCLError, part
 _SET = "rcl_interfaces/SetParametersResult"
 
 
+class RefusedError(ValueError):
+    """A transition that cannot be made as things are; the text is one line that says what to do."""
+
+
 def _guarded(method: str, name: str = "") -> Callable[[ManagedNode, Any], Any]:
     """Return what rclpy calls for a transition: runs a method of the node, and says how it went."""
 
     def run(node: ManagedNode, _state: Any) -> Any:
         try:
             getattr(node, method)()
+        except RefusedError as error:
+            log(node, Severity.ERROR, f"{name or method} refused: {error}")
+            return TransitionCallbackReturn.FAILURE
         except Exception as error:
             text = f"{name or method} failed: {type(error).__name__}: {error}"
             log(node, Severity.ERROR, f"{text}\n{traceback.format_exc()}")

@@ -1,173 +1,174 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn feature clouds and keyframe odometry, as VINS-Fusion publishes them, into keyframes and tracks: `ba_adapter`.
+"""Feed the node from another front-end: `ros2 run ba_node ba_adapter --from openvins`.
 
-Takes ``features`` (sensor_msgs/PointCloud, one of all cameras for each image), ``odometry`` (nav_msgs/Odometry, the
-pose of the body at keyframes) and ``restart`` (std_msgs/Bool); gives ``keyframes`` and ``feature_tracks``. Features and
-odometry are paired by equal stamps; features of images that are no keyframes find no partner and are dropped.
-
-Channels are found by their names id, camera, u, v (px), or without names in that order, which is VINS-Fusion's. An id
-is a float32 there, exact below 2^24; larger ones are dropped and counted. The stamp in ns is the keyframe's id.
+It subscribes to what the front-end publishes as soon as it is there, in whatever namespace, and publishes
+``keyframes``, ``feature_tracks``, ``landmark_guesses`` and ``camera_rig``. A true ``std_msgs/Bool`` on ``restart``
+begins a new session. Every few seconds the log says what was sent on and what was left out, by reason.
 """
 
 from __future__ import annotations
 
+import argparse
+import functools
 import sys
-import time
-from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
 
-from ba_node.measurements import FeatureTracks, Keyframe
+from ba_node.io.rig_file import RigError, read_rig
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages import conversion
-from ba_node.messages.factory import stamp_ns_from_message
-from ba_node.messages.topics import INPUT_TYPES
+from ba_node.messages.adapters import SOURCES, Adapter, AdapterOptions, Input
+from ba_node.messages.topics import INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
-from ba_node.ros.log import Throttle
+from ba_node.ros.log import Severity, log
 
 NODE_NAME = "ba_adapter"
-CHANNELS = ("id", "camera", "u", "v")
-MAX_ID = 2**24
-MAX_CAMERA = 2**16
-_DEPTH = 100
-# Images that wait for their pose, and poses that wait for their image.
-MAX_WAITING = 200
-_LOG_PERIOD_S = 5.0
+USAGE_ERROR = 2
+PUBLISHED = ("camera_rig", "keyframes", "landmark_guesses", "feature_tracks")
+_DEPTH = 1000
+_LOOK_S = 0.5
+_LOG_S = 5.0
+_HINT = "; its package comes with the front-end (for rtabmap: ros-jazzy-rtabmap-msgs)"
 
 
-class FeatureError(ValueError):
-    """A feature cloud that cannot be read."""
-
-
-def tracks_from_cloud(cloud: Any, session_id: int, counted: Counter[str]) -> list[FeatureTracks]:
-    """Return what each camera saw, from a ``sensor_msgs/PointCloud``; unusable rows are left out and counted.
+class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
+    """The converter node.
 
     Raises:
-        FeatureError: channels are missing or differ in length.
+        LookupError: the messages of the front-end are not installed.
     """
-    named = {channel.name: channel.values for channel in cloud.channels}
-    values = [named[name] for name in CHANNELS] if named.keys() >= set(CHANNELS) else []
-    values = values or [channel.values for channel in cloud.channels[: len(CHANNELS)]]
-    lengths = [len(column) for column in values]
-    if len(values) < len(CHANNELS) or len(set(lengths)) != 1:
-        raise FeatureError(f"{len(cloud.channels)} channels of lengths {lengths}: expected id, camera, u, v")
-    ids, cameras, u, v = (np.asarray(column, np.float64) for column in values)
-    good = (ids >= 0) & (ids < MAX_ID) & (ids % 1 == 0) & (cameras >= 0) & (cameras < MAX_CAMERA) & (cameras % 1 == 0)
-    counted["inexact_id"] += int(np.count_nonzero(~good))
-    return [
-        FeatureTracks(
-            session_id,
-            stamp_ns_from_message(cloud.header.stamp),
-            int(camera),
-            ids[rows].astype(np.uint64),
-            np.column_stack([u[rows], v[rows]]),
-        )
-        for camera in np.unique(cameras[good])
-        for rows in [good & (cameras == camera)]
-    ]
 
-
-def keyframe_from_odometry(odometry: Any, session_id: int) -> Keyframe:
-    """Return the pose of a ``nav_msgs/Odometry`` as a keyframe whose id is its stamp, ns."""
-    stamp_ns = stamp_ns_from_message(odometry.header.stamp)
-    p, q = odometry.pose.pose.position, odometry.pose.pose.orientation
-    position, orientation = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
-    return Keyframe(session_id, stamp_ns, stamp_ns, odometry.header.frame_id, position, orientation)
-
-
-class Adapter(Node):  # type: ignore[misc]  # rclpy is not typed
-    """The converter node."""
-
-    def __init__(self, **node_options: Any) -> None:
+    def __init__(self, source: str, adapter: Adapter, **node_options: Any) -> None:
         super().__init__(NODE_NAME, **node_options)
-        self.sent = 0  # keyframes that were sent on
-        self.counted: Counter[str] = Counter()  # what was dropped, by reason
-        self._session_id = 0
-        # By stamp, ns; the newest of them.
-        self._features: dict[int, Any] = {}
-        self._odometry: dict[int, Any] = {}
+        self.adapter = adapter
+        self._source = source
+        self._inputs = [one for one in SOURCES[source].inputs if one.type_name]
+        for one in self._inputs:
+            message_class(one.type_name)
+        self._subscribed: dict[str, Input] = {}
         self._factory = RclpyFactory()
-        self._throttle = Throttle(_LOG_PERIOD_S)
+        self._frames: tuple[str, ...] = ()
+        self._fixed_frame = ""
+        self._said = self._ambiguous = ""
         self._out = {
-            topic: self.create_publisher(message_class(INPUT_TYPES[topic]), topic, qos.reliable(_DEPTH))
-            for topic in ("keyframes", "feature_tracks")
+            name: self.create_publisher(message_class(kind), name, qos.profile(TOPICS[name], _DEPTH))
+            for name, kind in INPUT_TYPES.items()
+            if name in PUBLISHED
         }
-        for topic, kind, receive in (
-            ("features", "sensor_msgs/msg/PointCloud", self._on_features),
-            ("odometry", "nav_msgs/msg/Odometry", self._on_odometry),
-            ("restart", "std_msgs/msg/Bool", self._on_restart),
-        ):
-            self.create_subscription(message_class(kind), topic, receive, qos.reliable(_DEPTH))
+        self.create_subscription(message_class("std_msgs/msg/Bool"), "restart", self._on_restart, qos.reliable(10))
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_LOOK_S, self._look, clock=clock)
+        self.create_timer(_LOG_S, self._report, clock=clock)
 
-    def _on_features(self, cloud: Any) -> None:
-        stamp_ns = stamp_ns_from_message(cloud.header.stamp)
-        odometry = self._odometry.pop(stamp_ns, None)
-        if odometry is None:
-            self.counted["no_keyframe"] += keep(self._features, stamp_ns, cloud)
-        else:
-            self._send(odometry, cloud)
+    def _look(self) -> None:
+        """Subscribe to what is there now: an input under its own name, else under the same one in any namespace."""
+        taken = {one.role for one in self._subscribed.values() if one.role}
+        there = [(name, kinds) for name, kinds in self.get_topic_names_and_types() if self.count_publishers(name)]
+        for one in self._inputs:
+            if one.role in taken or one in self._subscribed.values():
+                continue
+            own = self.resolve_topic_name(one.name)
+            same = [name for name, kinds in there if one.type_name in kinds]
+            found = [name for name in same if name == own] or [
+                name for name in same if name.rpartition("/")[2] == one.name
+            ]
+            if len(found) == 1:
+                self._subscribe(one, found[0])
+                taken.add(one.role)
+            elif found and one.role:
+                words = f"{one.name} is there more than once: {', '.join(found)}: say -r {one.name}:=TOPIC"
+                self._ambiguous = self._ambiguous or self._tell(Severity.WARNING, words)
 
-    def _on_odometry(self, odometry: Any) -> None:
-        stamp_ns = stamp_ns_from_message(odometry.header.stamp)
-        cloud = self._features.pop(stamp_ns, None)
-        if cloud is not None:
-            self._send(odometry, cloud)
-        elif keep(self._odometry, stamp_ns, odometry):
-            self._drop("no_features", f"{MAX_WAITING} poses wait for features of the same stamp")
+    def _subscribe(self, one: Input, topic: str) -> None:
+        infos = self.get_publishers_info_by_topic(topic)
+        reliable = all(info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in infos)
+        profile = qos.reliable(_DEPTH) if reliable else qos.SENSOR_DATA
+        receive = functools.partial(self._receive, one.name)
+        self._subscribed[topic] = one
+        # The name is that of the graph: remapping has been done, and must not be done again.
+        self.create_subscription(message_class(one.type_name), topic, receive, profile)
+        self._tell(Severity.INFO, f"{topic} ({one.type_name}) is taken as {one.name}")
+
+    def _receive(self, name: str, message: Any) -> None:
+        for topic, stamp_ns, measurement in self.adapter.take(name, message):
+            if topic == "keyframes" and not self._out[topic].get_subscription_count():
+                self.adapter.leave("nobody_listens", f"{self.resolve_topic_name(topic)} has no subscriber")
+            self._out[topic].publish(self._message(stamp_ns, measurement))
+
+    def _message(self, stamp_ns: int, measurement: Measurement) -> Any:
+        if isinstance(measurement, CameraRig):
+            self._frames = measurement.names
+            return conversion.rig_message(self._factory, measurement, stamp_ns)
+        if isinstance(measurement, Keyframe):
+            self._fixed_frame = measurement.frame_id
+            return conversion.keyframe_message(self._factory, measurement)
+        if isinstance(measurement, LandmarkGuesses):
+            return conversion.guesses_message(self._factory, measurement, stamp_ns, self._fixed_frame)
+        assert isinstance(measurement, FeatureTracks)
+        return conversion.tracks_message(self._factory, measurement, stamp_ns, self._frames[measurement.camera_index])
 
     def _on_restart(self, restart: Any) -> None:
-        """Begin a new session: ids of features begin anew."""
         if restart.data:
-            self._session_id += 1
-            self._features.clear()
-            self._odometry.clear()
-            self.get_logger().info(f"restart: session {self._session_id}")
+            self.adapter.restart()
+            self._tell(Severity.INFO, f"restart: {self.adapter.summary()}")
 
-    def _send(self, odometry: Any, cloud: Any) -> None:
-        try:
-            tracks = tracks_from_cloud(cloud, self._session_id, self.counted)
-        except FeatureError as error:
-            self._drop("malformed", f"features: {error}")
-            return
-        keyframe = keyframe_from_odometry(odometry, self._session_id)
-        self._out["keyframes"].publish(conversion.keyframe_message(self._factory, keyframe))
-        for image in tracks:
-            message = conversion.tracks_message(self._factory, image, keyframe.stamp_ns, f"camera{image.camera_index}")
-            self._out["feature_tracks"].publish(message)
-        self.sent += 1
+    def _report(self) -> None:
+        """Log what has become of the images, when that has changed; and what is missing."""
+        missing = [one for one in self._inputs if one.role and one.role not in self._roles()]
+        words = "; ".join([self.adapter.summary(), *self.adapter.told()])
+        if missing:
+            listed = ", ".join(f"{self.resolve_topic_name(one.name)} ({one.type_name})" for one in missing)
+            words += f"; nobody publishes {listed}: is {self._source} running?"
+        if self.adapter.waits_for_rig:
+            words += "; images wait for the cameras, of which nothing is known: give them with --rig FILE"
+        if words != self._said:
+            self._said = self._tell(Severity.WARNING if missing or self.adapter.waits_for_rig else Severity.INFO, words)
 
-    def _drop(self, reason: str, what: str) -> None:
-        self.counted[reason] += 1
-        if self._throttle.passes(reason, time.monotonic()):
-            self.get_logger().warning(f"{what}; dropped ({reason} = {self.counted[reason]})")
+    def _roles(self) -> set[str]:
+        roles = {one.role for one in self._subscribed.values()}
+        return roles | {"extrinsic"} if self.adapter.rig is not None else roles
 
-
-def keep(waiting: dict[int, Any], stamp_ns: int, message: Any) -> int:
-    """Have a message wait for the other one of its pair; return how many were dropped for it."""
-    waiting[stamp_ns] = message
-    if len(waiting) <= MAX_WAITING:
-        return 0
-    del waiting[next(iter(waiting))]
-    return 1
+    def _tell(self, severity: Severity, words: str) -> str:
+        log(self, severity, words)
+        return words
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the converter until SIGINT or SIGTERM."""
-    rclpy.init(args=None if args is None else list(args))
-    node = Adapter()
+    """Run the converter until SIGINT or SIGTERM; return 2 if it cannot."""
+    given = list(sys.argv if args is None else args)
+    parser = argparse.ArgumentParser(prog=NODE_NAME, description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--from", dest="source", required=True, choices=SOURCES, help="the front-end that runs")
+    parser.add_argument("--rig", type=Path, nargs="+", metavar="FILE", help="cameras as YAML, in any form of ba rig")
+    parser.add_argument("--tolerance", type=float, default=1e-3, metavar="S", help="stamps pair within (%(default)s)")
+    parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")
+    parser.add_argument("--cameras", type=int, default=1, metavar="N", help="NUM_OF_CAM of vins_mono (%(default)s)")
+    said = parser.parse_args(remove_ros_args(given)[1:])
+    rclpy.init(args=given)
+    try:
+        rig = read_rig(*said.rig) if said.rig else None
+        options = AdapterOptions(said.tolerance, said.parallax, rig=rig)
+        node = AdapterNode(said.source, Adapter(SOURCES[said.source](said.cameras), options))
+    except (RigError, LookupError) as error:
+        print(f"{NODE_NAME}: {error}{_HINT if isinstance(error, LookupError) else ''}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return USAGE_ERROR
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        dropped = ", ".join(f"{reason} = {n}" for reason, n in sorted(node.counted.items()) if n) or "nothing"
-        print(f"stopped: {node.sent} keyframes sent on, dropped: {dropped}", flush=True)
+        node.adapter.finish()
+        print("; ".join([f"stopped: {node.adapter.summary()}", *node.adapter.told()]), flush=True)
         node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from ba_node.estimate import Poses
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.outputs import POINT_DTYPE
-from ba_node.messages.topics import TOPICS
+from ba_node.messages.topics import TOPICS, WHOLE_MAP
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
 
@@ -47,7 +47,8 @@ class NodeListener:
         for name, receive in receivers.items():
             topic = TOPICS[name]
             kind, full_name = message_class(topic.type_name), f"{self._node_name}/{name}"
-            self._subscriptions.append(self._node.create_subscription(kind, full_name, receive, qos.profile(topic)))
+            profile = qos.profile(topic) if name in WHOLE_MAP else qos.reliable(qos.OUTPUT_DEPTH)
+            self._subscriptions.append(self._node.create_subscription(kind, full_name, receive, profile))
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.duration import Duration
@@ -28,9 +28,11 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from ba_node.io.mcap import BagReader
+from ba_node.measurements import CameraRig
+from ba_node.messages.conversion import rig_message
 from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
 
 _WRONG_OPTIONS = (*ARGUMENT_ERRORS, InvalidNamespaceException)
@@ -127,6 +129,21 @@ def _node(options: PlayOptions) -> Iterator[Any]:
             node.destroy_node()
     finally:
         rclpy.try_shutdown(context=context)
+
+
+def publish_rig(rig: CameraRig, namespace: str, said: Callable[[str], None]) -> NoReturn:
+    """Publish a latched rig on ``camera_rig`` until the process ends; ``said`` is told the name of the topic.
+
+    Raises:
+        PlayError: the namespace is none.
+    """
+    with _node(PlayOptions(namespace=namespace)) as node:
+        topic = TOPICS["camera_rig"]
+        publisher = node.create_publisher(message_class(topic.type_name), topic.name, qos.latched())
+        publisher.publish(rig_message(RclpyFactory(), rig, node.get_clock().now().nanoseconds))
+        said(publisher.topic_name)
+        while True:
+            time.sleep(_ACK_TIMEOUT_S)
 
 
 def take_leave() -> None:

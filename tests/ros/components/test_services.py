@@ -285,3 +285,48 @@ def test_a_file_is_written_to_the_end(
     assert node.wait() == 0, node.err
     assert gates.passed("map file")
     assert len(read_map(tmp_path / "a.npz").arrays["keyframes/position"]) == 3
+
+
+def test_a_map_is_saved_at_the_end_and_loaded_at_the_start(
+    start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, tmp_path: Path
+) -> None:
+    """The second run goes on where the first has ended, in the same session."""
+    kept = ("-p", "node.load_map:=site", "-p", "node.save_map:=site")
+    for first, last in ((0, 4), (4, KEYFRAMES)):
+        node, peer = start_node(*kept), make_peer()
+        peer.advertise()
+        peer.listen("report")
+        peer.connect()
+        peer.play_keyframes(scene, *range(first, last))
+        peer.close()
+        assert node.stop() == 0
+        assert ("no file" in node.err) == (first == 0), node.err
+        saved = read_map(tmp_path / "site.npz").arrays
+        assert saved["keyframes/keyframe_id"].tolist() == [one.keyframe_id for one in scene.keyframes[:last]]
+        assert saved["keyframes/refined"].all()
+    node, peer = start_node(*kept), make_peer()
+    peer.until(lambda: "activate: done" in node.err, "the third run")
+    assert node.stop() == 0
+    assert len(read_map(tmp_path / "site.npz").arrays["keyframes/keyframe_id"]) == KEYFRAMES
+
+
+def test_an_empty_map_is_not_saved(start_node: StartNode, peer: Any, tmp_path: Path) -> None:
+    node = start_node("-p", "node.save_map:=site")
+    peer.until(lambda: "activate: done" in node.err, "the node")
+    assert node.stop() == 0
+    assert not list(tmp_path.glob("*.npz"))
+    assert "node.save_map: the map is empty" in node.err
+
+
+def test_a_node_does_not_begin_with_a_damaged_map(start_node: StartNode, peer: Any, tmp_path: Path) -> None:
+    """Said in one line; the node stays unconfigured."""
+    (tmp_path / "site.npz").write_bytes(b"PK\x03\x04 and no more")
+    kept = ("-p", "node.load_map:=site", "-p", "node.save_map:=other")
+    node = start_node(*kept)
+    peer.until(lambda: "from where it can" in node.err, "the refusal")
+    refused = [line for line in node.err.splitlines() if "configure refused" in line]
+    assert len(refused) == 1
+    assert "node.load_map: " in refused[0] and "give another file, or none" in refused[0]
+    assert "Traceback" not in node.err
+    node.stop()
+    assert [path.name for path in tmp_path.iterdir()] == ["site.npz"]

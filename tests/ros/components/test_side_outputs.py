@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
@@ -54,8 +55,8 @@ def data() -> SyntheticData:
     return generate(options)
 
 
-def watch(peer: Any, topic: str) -> Any:
-    profile = qos.latched(100) if topic == "markers" else qos.reliable(1000)
+def watch(peer: Any, topic: str, latched: bool = False) -> Any:
+    profile = qos.latched(100) if latched or topic == "markers" else qos.reliable(1000)
     cls = message_class(TOPICS[topic].type_name)
     return peer.node.create_subscription(cls, f"ba_node/{topic}", peer.received[topic].append, profile)
 
@@ -132,3 +133,39 @@ def test_markers_show_the_window_and_begin_anew_with_a_session(
     late = make_peer()
     watch(late, "markers")
     late.until(lambda: late.received["markers"], "the markers that are kept")
+
+
+def test_odometry_goes_on_in_time(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
+    """It is the newest keyframe of each solve, once; in a new session stamps may begin anew."""
+    node, peer = start_node("--ros-args", "-p", "frames.base_frame:=robot"), make_peer()
+    peer.advertise()
+    peer.listen("report", "refined_keyframes")
+    subscription = watch(peer, "odometry")
+    peer.connect()
+    peer.until(subscription.get_publisher_count, "the publisher")
+    found, session = peer.received["odometry"], 0
+    while not found or np.diagonal(np.reshape(found[-1].pose.covariance, (6, 6))).max() > 1.0:
+        found.clear()
+        peer.play(data, session)
+        session += 1
+        assert session < 20
+    newest_ns = data.keyframes[-1].stamp_ns
+    peer.until(lambda: stamp_ns_from_message(found[-1].header.stamp) == newest_ns, "odometry of the newest keyframe")
+    stamps = [stamp_ns_from_message(message.header.stamp) for message in found]
+    assert stamps == sorted(set(stamps))
+    assert len(found) >= len(data.keyframes) - 2, "of all but the first keyframes"
+    assert {(message.header.frame_id, message.child_frame_id) for message in found} == {("map", "robot")}
+    newest, refined = found[-1].pose.pose.position, peer.received["refined_keyframes"][-1]
+    assert [newest.x, newest.y, newest.z] == list(refined.position[-3:])
+    deviation = np.sqrt(np.diagonal(np.reshape(found[-1].pose.covariance, (6, 6))))
+    assert np.all((deviation > 1e-6) & (deviation < 0.5)), deviation
+    speed = np.linalg.norm([found[-1].twist.twist.linear.x, found[-1].twist.twist.linear.y])
+    step = np.linalg.norm(data.keyframes[-1].position - data.keyframes[-2].position)
+    lapse_s = 1e-9 * (data.keyframes[-1].stamp_ns - data.keyframes[-2].stamp_ns)
+    assert abs(speed - step / lapse_s) < 0.05 * step / lapse_s
+    late = make_peer()
+    watch(late, "report", latched=True)
+    late.until(lambda: late.received["report"], "the last report, which is kept")
+    assert late.received["report"][0].newest_keyframe_id == data.keyframes[-1].keyframe_id
+    late.close()
+    assert node.stop() == 0

@@ -1,0 +1,71 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Try every combination of some values of parameters on recordings.
+
+The error is that of `ba tune`: of the trajectory where a recording has a truth, else of tracks that are held out of it.
+Writes into DIR: sweep.csv, sweep.json, and index.html.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ba_node.cli.console import (
+    add_fleet_options,
+    add_parameter_options,
+    add_topic_options,
+    parameters,
+    progress_bar,
+    table,
+    topic_choice,
+)
+
+SUMMARY = "try every combination of some values of parameters on recordings"
+EXAMPLE = "ba sweep bags/*.mcap --out out/sweep --values window.max_keyframes=5,10,20 --values tracks.outlier_px=3,6"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("bag", nargs="+", metavar="RECORDING", help="files, folders or URLs")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    parser.add_argument(
+        "--values", action="append", required=True, metavar="NAME=A,B,C", help="values of a parameter; repeatable"
+    )
+    parser.add_argument(
+        "--objective", choices=("auto", "truth", "held_out"), default="auto", help="what the error is, as in ba tune"
+    )
+    parser.add_argument("--each", action="store_true", help="every RECORDING is one by itself, whatever it is called")
+    add_fleet_options(parser)
+    add_topic_options(parser)
+    add_parameter_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Sweep."""
+    from ba_node.config import find, split_assignment  # noqa: PLC0415
+    from ba_node.offline import tuning, tuning_page  # noqa: PLC0415
+    from ba_node.offline.batch import recordings  # noqa: PLC0415
+    from ba_node.offline.fleet import Fleet  # noqa: PLC0415
+    from ba_node.offline.page import PageError  # noqa: PLC0415
+
+    base = parameters(args)
+    values = {}
+    for text in args.values:
+        name, listed = split_assignment(text, "window.max_keyframes=5,10,20")
+        parameter = find(name)
+        values[parameter.name] = [parameter.read(one.strip()) for one in listed.split(",")]
+    plan = tuning.Plan(
+        tuple(recordings(args.bag, each=args.each)), None, (), objective=args.objective, topics=topic_choice(args)
+    )
+    args.out.mkdir(parents=True, exist_ok=True)
+    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("sweep", "replays") as progress:
+        found = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
+    print(table(*tuning_page.sweep_rows(found)))
+    names = "sweep.csv, sweep.json, index.html"
+    try:
+        tuning_page.write_sweep(args.out, found)
+    except PageError as error:
+        names = f"sweep.csv, sweep.json; {error}"
+    print(f"written to {args.out}: {names}")
+    return 0

@@ -1,0 +1,83 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Put priors of points into a problem as observations, so that every kernel, method and covariance has them.
+
+With ``C = V diag(s1^2, s2^2, s3^2) V'`` the covariance of a point at p: a camera that is fixed far off, at the distance
+D, looks at p along the third axis of V, with focal lengths D / s1 and D / s2 px. A point x at ``y = V'(x - p)`` from p
+is seen by it at ``u = (D / s1) y1 / (D + y3)`` px, off by ``y1 / s1`` sigmas, likewise v, and at the depth ``D + y3``,
+which is measured as D with the standard deviation s3. So the squares of all three residuals add up to
+``(x - p)' C^-1 (x - p)``, but for a share of ``2 y3 / D``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ba_node.arrays import FloatArray
+from ba_node.core import cameras
+from ba_node.core.problem import Cameras, Observations, Problem, State
+
+# Metres; the digits that it costs are those beyond 1e-10 m.
+_FAR_M = 1e5
+
+
+def as_observations(problem: Problem) -> Problem:
+    """Return a problem with its priors as observations by fixed keyframes, which come after its own."""
+    priors, start, obs = problem.point_priors, problem.start, problem.observations
+    assert priors is not None
+    n, n_kf, n_cam = len(priors.point), problem.n_keyframes, len(problem.cameras.model)
+    variance, axes = np.linalg.eigh(priors.covariance)
+    sigma = np.sqrt(variance)
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    rotation = np.swapaxes(axes, 1, 2)
+    translation = np.array([0.0, 0.0, _FAR_M]) - (rotation @ priors.position[:, :, None])[..., 0]
+    lens = np.zeros((n, cameras.N_PARAMS))
+    lens[:, :2] = _FAR_M / sigma[:, :2]
+    rig = problem.cameras
+    model = np.full(n, int(cameras.Model.RATIONAL), rig.model.dtype)
+    whole_rig = Cameras(
+        np.concatenate([rig.rotation, np.tile(np.eye(3), (n, 1, 1))]),
+        np.concatenate([rig.translation, np.zeros((n, 3))]),
+        np.concatenate([rig.model, model]),
+        np.concatenate([rig.params, lens]),
+    )
+    depth = _filled(obs.depth_m, len(obs)), _filled(obs.depth_sigma_m, len(obs))
+    columns = Observations(
+        np.concatenate([obs.keyframe, n_kf + np.arange(n)]),
+        np.concatenate([obs.camera, n_cam + np.arange(n)]),
+        np.concatenate([obs.point, priors.point]),
+        np.concatenate([obs.uv, np.zeros((n, 2))]),
+        np.concatenate([obs.sigma_px, np.ones(n)]),
+        np.concatenate([depth[0], np.full(n, _FAR_M)]),
+        np.concatenate([depth[1], sigma[:, 2]]),
+    )
+    order = np.argsort(columns.point, kind="stable")
+    intrinsics = start.intrinsics
+    if problem.free_intrinsics:
+        intrinsics = np.concatenate([intrinsics, np.tile([1.0, 0.0, 0.0], (n, 1))])
+    state = State(
+        np.concatenate([start.rotation, rotation]),
+        np.concatenate([start.translation, translation]),
+        start.points,
+        intrinsics,
+    )
+    return replace(
+        problem,
+        start=state,
+        fixed=np.concatenate([problem.fixed, np.ones(n, bool)]),
+        cameras=whole_rig,
+        observations=Observations(*(values[order] for values in vars(columns).values())),
+        point_priors=None,
+    )
+
+
+def without(state: State, problem: Problem) -> State:
+    """Return a state of :func:`as_observations` without the keyframes that this added."""
+    n = problem.n_keyframes
+    return State(state.rotation[:n], state.translation[:n], state.points, state.intrinsics[:n])
+
+
+def _filled(depth: FloatArray, n: int) -> FloatArray:
+    return depth if len(depth) else np.full(n, np.nan)

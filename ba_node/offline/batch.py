@@ -1,0 +1,244 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Replay or check many recordings: each by itself, so that a bad one fails alone; one table and page of all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ba_node.config import Config
+from ba_node.io.bag_files import same_recording
+from ba_node.io.files import whole_file, write_json
+from ba_node.io.mcap import TopicChoice
+from ba_node.io.parameters import parameters_yaml
+from ba_node.offline.check import check_recording
+from ba_node.offline.figures import COLOURS, Figure, array
+from ba_node.offline.fleet import Fleet, delivered, expand, fetched, is_url, name_of
+from ba_node.offline.page import PageError, write_page
+from ba_node.offline.replay import MapOptions, Watch, replay
+from ba_node.offline.report import REPORT, draw_trajectory, html_table, write_report
+
+# Columns of the table of all recordings: name in results.json and .csv, heading.
+COLUMNS = {
+    "recording": "recording",
+    "state": "state",
+    "keyframes": "keyframes",
+    "refined": "refined",
+    "error_before_m": "error before [m]",
+    "error_after_m": "after [m]",
+    "median_before_px": "median before [px]",
+    "median_after_px": "after [px]",
+    "held": "held",
+    "solve_p95_ms": "solve p95 [ms]",
+    "time_s": "time [s]",
+    "note": "note",
+}
+OK, LOOK, FAILED = "ok", "look", "failed"
+
+
+@dataclass(frozen=True)
+class ReplayTask:
+    """One recording of many."""
+
+    recording: tuple[str, ...]  # a path or URL, or the files of one recording
+    out: str  # folder or URL for its results
+    config: Config
+    topics: TopicChoice
+    report: bool = True  # write page and picture too
+    resume: bool = False  # leave it alone if its results are there, with the same parameters
+    clock: Callable[[], float] = lambda: 0.0  # s
+
+
+def recordings(places: Sequence[str], *, each: bool = False) -> list[tuple[str, ...]]:
+    """Return which recordings are meant: files that are called as parts of one are one, unless ``each`` is by itself.
+
+    Raises:
+        FleetError: a URL with a wildcard matches nothing.
+    """
+    found: list[list[str]] = []
+    for place in expand(places):
+        lone = each or is_url(place) or Path(place).is_dir()
+        group = None if lone else next((one for one in found if _belongs(one, place)), None)
+        if group is None:
+            found.append([place])
+        else:
+            group.append(place)
+    return [tuple(group) for group in found]
+
+
+def _belongs(group: Sequence[str], place: str) -> bool:
+    first = group[0]
+    return not (is_url(first) or Path(first).is_dir()) and same_recording(Path(first), Path(place))
+
+
+def replay_all(fleet: Fleet, tasks: Sequence[ReplayTask], progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
+    """Replay recordings; return a row of the table for each, in their order."""
+    rows: list[dict[str, Any]] = [{}] * len(tasks)
+    for done, (number, row) in enumerate(fleet.each(replay_one, tasks, _lost), start=1):
+        rows[number] = row
+        progress(done, len(tasks))
+    return rows
+
+
+def folder_names(found: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return a folder name for each recording, with a number where a name comes again."""
+    names: list[str] = []
+    for group in found:
+        name, again = name_of(group[0]), 2
+        while name in names:
+            name, again = f"{name_of(group[0])}_{again}", again + 1
+        names.append(name)
+    return names
+
+
+def replay_one(task: ReplayTask) -> dict[str, Any]:
+    """Replay a recording and return its row; whatever is wrong with it stands there."""
+    begun = task.clock()
+    try:
+        report = (_known(task) if task.resume else None) or _replayed(task)
+    except (ValueError, OSError) as error:
+        return _failed(task, " ".join(str(error).split()))
+    return _row(task, report) | {"time_s": task.clock() - begun}
+
+
+def _replayed(task: ReplayTask) -> dict[str, Any]:
+    with fetched(task.recording[0]) as first, delivered(task.out) as out:
+        bag = [first, *map(Path, task.recording[1:])]
+        report = replay(bag, out, task.config, Watch(task.clock), MapOptions(topics=task.topics))
+        if task.report:
+            draw_trajectory(out)
+            write_report([out], out / REPORT)
+    return report
+
+
+def _known(task: ReplayTask) -> dict[str, Any] | None:
+    """Return the report of an earlier replay of the recording with these parameters, None if there is none."""
+    if is_url(task.out):
+        return None
+    try:
+        if (Path(task.out) / "effective.yaml").read_text() != parameters_yaml(task.config, comments=False):
+            return None
+        report: dict[str, Any] = json.loads((Path(task.out) / "report.json").read_text())
+    except (OSError, ValueError):
+        return None
+    return report if report["bag"] == Path(task.recording[0]).name else None
+
+
+def _row(task: ReplayTask, report: Mapping[str, Any]) -> dict[str, Any]:
+    error = report.get("trajectory_error_m") or {"input": None, "refined": None}
+    return {
+        "recording": task.recording[0],
+        "folder": task.out,
+        "state": LOOK if report["attention"] else OK,
+        "keyframes": report["keyframes"],
+        "refined": report["keyframes_refined"],
+        "error_before_m": error["input"],
+        "error_after_m": error["refined"],
+        "median_before_px": report["median_px"]["input"],
+        "median_after_px": report["median_px"]["refined"],
+        "held": sum(report["solves_by_status"].get(name, 0) for name in ("HELD", "FAILED")),
+        "solve_p95_ms": 1e3 * float(np.percentile(report["solve_times_s"] or [0.0], 95)),
+        "note": "; ".join(report["attention"]),
+    }
+
+
+def _failed(task: ReplayTask, words: str) -> dict[str, Any]:
+    return {"recording": task.recording[0], "folder": task.out, "state": FAILED, "note": words}
+
+
+_lost = _failed
+
+
+def check_one(task: ReplayTask) -> dict[str, Any]:
+    """Check a recording and return its sessions, or why it cannot be checked."""
+    try:
+        with fetched(task.recording[0]) as first:
+            sessions = check_recording(first, task.config)
+    except (ValueError, OSError) as error:
+        return _failed(task, " ".join(str(error).split()))
+    causes = [cause for one in sessions for finding in one.found.findings for cause in finding.causes]
+    warnings = [text for one in sessions for text in one.warnings]
+    notes = [*dict.fromkeys(causes), *warnings]
+    return {
+        "recording": task.recording[0],
+        "state": LOOK if notes else OK,
+        "note": "; ".join(notes) or "the set-up fits the tracks",
+        "sessions": [one.as_dict() for one in sessions],
+    }
+
+
+def check_all(fleet: Fleet, tasks: Sequence[ReplayTask], progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
+    """Check recordings; return state and note of each, in their order."""
+    rows: list[dict[str, Any]] = [{}] * len(tasks)
+    for done, (number, row) in enumerate(fleet.each(check_one, tasks, _lost), start=1):
+        rows[number] = row
+        progress(done, len(tasks))
+    return rows
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """Return a row of the table as text."""
+    values = (row.get(name) for name in COLUMNS)
+    return ["" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
+
+
+def write_results(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write results.json, results.csv and index.html; return what to say if the page is left out.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "results.json", {"recordings": rows})
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, [*COLUMNS, "folder"], lineterminator="\n", extrasaction="ignore")
+    table.writeheader()
+    table.writerows(rows)
+    with whole_file(out / "results.csv") as stream:
+        stream.write(text.getvalue().encode())
+    try:
+        _write_page(out, rows)
+    except PageError as error:
+        return str(error)
+    return ""
+
+
+def _write_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    states = {state: sum(row["state"] == state for row in rows) for state in (OK, LOOK, FAILED)}
+    names = [name_of(str(row["recording"])) for row in rows]
+    kind = "bad" if states[FAILED] else "look" if states[LOOK] else "good"
+    verdict = f"{len(rows)} recordings: {states[OK]} sound, {states[LOOK]} to look at, {states[FAILED]} failed"
+    marks = {OK: "", LOOK: "changed", FAILED: "changed"}
+    shown = html_table(list(COLUMNS.values()), [(marks[row["state"]], cells(row)) for row in rows])
+    links = "".join(
+        f'<li><a href="{name}/{REPORT}">{name}</a></li>'
+        for name in (Path(str(row.get("folder", ""))).name for row in rows if row["state"] != FAILED)
+        if (out / name / REPORT).is_file()
+    )
+    figures = [
+        _bars("error", "Error to the reference", names, rows, "error_before_m", "error_after_m", "m"),
+        _bars("median", "Median residual", names, rows, "median_before_px", "median_after_px", "px"),
+    ]
+    head = f"<div class='verdict {kind}'><b>{verdict}</b></div>{shown}<ul>{links}</ul>"
+    write_page(out / "index.html", "Replays", [figure for figure in figures if figure.data], head)
+
+
+def _bars(
+    key: str, title: str, names: Sequence[str], rows: Sequence[Mapping[str, Any]], before: str, after: str, unit: str
+) -> Figure:
+    data = []
+    for name, column, colour in (("before", before, "#D55E00"), ("after", after, COLOURS[0])):
+        values = [row.get(column) for row in rows]
+        if any(value is not None for value in values):
+            bar = {"type": "bar", "x": list(names), "y": array([np.nan if v is None else v for v in values])}
+            data.append(bar | {"name": name, "marker": {"color": colour}})
+    layout = {"yaxis": {"title": f"[{unit}]", "type": "log"}, "barmode": "group", "xaxis": {}}
+    return Figure(key, title, "Before and after adjustment, of each recording.", data, layout, wide=True)

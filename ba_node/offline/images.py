@@ -1,0 +1,301 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read images with their rig from a recording, or from a folder of pictures.
+
+A folder holds pictures of one camera, or in folders below it those of the left and the right one, or of colour and
+depth (names in :data:`FOLDERS`). Beside them is the rig: a YAML of any form (``rig.yaml``, or the only ones there), or
+KITTI's ``calib.txt`` of projection matrices. Stamps are the lines of ``times.txt`` (s), else the names of the pictures
+where these are seconds or nanoseconds, else the number of the picture by the rate.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ba_node.estimate import Transform
+from ba_node.front_end.records import FrontEndError, Images
+from ba_node.front_end.streams import MODES, Frame, OdometryBuffer, Streams, cameras_of, images_of, transform_of
+from ba_node.io.bag_topics import absolute
+from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.rig_file import read_rig
+from ba_node.measurements import CameraRig
+from ba_node.messages.factory import stamp_ns_from_message
+from ba_node.messages.rig import rig_from_infos
+from ba_node.offline.rig import rig_of_recording, static_tree
+
+FOLDERS = {
+    "stereo": (
+        ("left", "image_l", "image_0", "cam0/data", "cam0"),
+        ("right", "image_r", "image_1", "cam1/data", "cam1"),
+    ),
+    "rgbd": (("rgb", "color"), ("depth",)),
+}
+PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
+_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+_DEPTH_ENCODINGS = ("16UC1", "32FC1")
+_BEGIN_NS = 1_000_000_000
+# Digits of nanoseconds since 1970.
+_NS_DIGITS = 16
+_QUEUE = 100
+
+
+@dataclass(frozen=True)
+class ImageRequest:
+    """What a user says about images."""
+
+    rig: CameraRig | None = None  # in place of what the recording or folder says
+    topics: Mapping[str, str] = field(default_factory=dict)  # by left, right, rgb, depth, image, odometry
+    rectified: bool = False  # p of camera_info is the camera
+    base: str = ""  # body frame in /tf_static, empty for the first camera
+    rate_hz: float = 10.0  # of a folder whose pictures have no stamps
+
+
+@dataclass
+class ImageSource:
+    """Images of a rig by time. ``counted`` and ``notes`` fill while it is read."""
+
+    rig: CameraRig
+    mode: str  # stereo, rgbd or mono
+    total: int  # images of the first camera
+    read: Callable[[], Iterator[tuple[Images, Transform | None]]]  # images, and the odometry of their time if there is
+    counted: Counter[str] = field(default_factory=Counter)  # images left out, by reason
+    notes: dict[str, str] = field(default_factory=dict)  # the last words on each reason
+
+
+@contextlib.contextmanager
+def open_images(path: Path, request: ImageRequest) -> Iterator[ImageSource]:
+    """Open a recording or a folder of pictures.
+
+    Raises:
+        BagError: it has no images, it cannot be told which are meant, or nothing tells the rig.
+        RigError: a YAML of the folder holds no rig.
+    """
+    if path.is_dir() and not (path / "metadata.yaml").exists() and not any(path.glob("*.mcap")):
+        yield _of_folder(path, request)
+        return
+    with BagReader(path) as reader:
+        yield _of_recording(reader, request)
+
+
+def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
+    chosen = _image_topics(reader, request)
+    mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
+    infos = [_info_of(reader, chosen[name]) for name in cameras_of(mode)]
+    rig = request.rig or rig_of_recording(reader, infos, rectified=request.rectified, base=request.base)
+    odometry = request.topics.get("odometry")
+    topics = {topic: name for name, topic in chosen.items()}
+    source = ImageSource(rig, mode, 0, lambda: _frames(reader, source, topics, odometry and absolute(odometry)))
+    source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
+    return source
+
+
+def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:
+    """Return the topic of each image of a mode: by what the user says, by names, or the only ones there."""
+    there = sorted(topic for topic, kind in reader.topics.items() if kind in _TYPES)
+    listed = ", ".join(there) or "none"
+    given = {name: absolute(topic) for name, topic in request.topics.items() if name != "odometry"}
+    for name, topic in given.items():
+        if topic not in there:
+            raise BagError(f"{reader.path}: {name}={topic}: no such topic of images; there are: {listed}")
+    for mode, names in MODES.items():
+        short = [name.rpartition("/")[0] or "image" for name in names]
+        if given and set(given) == set(short):
+            return {name: given[key] for name, key in zip(names, short, strict=True)}
+        found = [
+            [topic for topic in there if re.search(rf"(^|/){name}(/compressed(Depth)?)?$", topic)] for name in names
+        ]
+        if not given and all(found) and (mode != "mono" or len(there) == 1):
+            return {name: topics[0] for name, topics in zip(names, found, strict=True)}
+    if not given and len(there) == 1:
+        return {MODES["mono"][0]: there[0]}
+    if not given and len(there) == 2:
+        return _two(reader, there)
+    raise BagError(
+        f"{reader.path}: cannot tell which images are meant of: {listed}: say --topic left=TOPIC --topic right=TOPIC,"
+        " rgb and depth, or image"
+    )
+
+
+def _two(reader: BagReader, topics: Sequence[str]) -> dict[str, str]:
+    """Return two topics as colour and depth, or as left and right: the right one has a baseline in its p."""
+    firsts = [next((reader.decode(topic, data) for *_, data in reader.messages([topic])), None) for topic in topics]
+    depths = [getattr(first, "encoding", "") in _DEPTH_ENCODINGS for first in firsts]
+    if sum(depths) == 1:
+        return dict(zip(MODES["rgbd"], sorted(topics, key=lambda topic: depths[topics.index(topic)]), strict=True))
+    shifts = []
+    for topic in topics:
+        info = next((reader.decode(t, data) for t, _, _, data in reader.messages([_info_of(reader, topic)])), None)
+        shifts.append(0.0 if info is None else abs(float(info.p[3])))
+    order = sorted(topics, key=lambda topic: shifts[topics.index(topic)])
+    return dict(zip(MODES["stereo"], order, strict=True))
+
+
+def _info_of(reader: BagReader, image: str) -> str:
+    """Return the topic of the camera_info of an image: beside it, else the only one there is."""
+    base = re.sub(r"/compressed(Depth)?$", "", image).rpartition("/")[0]
+    infos = [topic for topic, kind in reader.topics.items() if kind == _INFO]
+    return infos[0] if len(infos) == 1 else f"{base}/camera_info"
+
+
+def _frames(
+    reader: BagReader, source: ImageSource, topics: Mapping[str, str], odometry: str | None
+) -> Iterator[tuple[Images, Transform | None]]:
+    """Yield frames by time. Odometry comes from its topic, each frame waiting until it is known."""
+    streams, buffer = Streams(MODES[source.mode], frozenset(), _QUEUE), OdometryBuffer()
+    tree, waiting = static_tree(reader), []
+    for topic, _, _, data in reader.messages([*topics, *([odometry] if odometry else [])]):
+        try:
+            message = reader.decode(topic, data)
+        except BagError as error:
+            _leave(source, "undecodable", str(error))
+            continue
+        stamp_ns = stamp_ns_from_message(message.header.stamp)
+        if topic == odometry:
+            pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
+            child = str(message.child_frame_id)
+            place = tree.find(child, source.rig.frame_id) if child not in ("", source.rig.frame_id) else None
+            buffer.add(stamp_ns, pose if place is None else pose.after(place))
+        else:
+            waiting += streams.put(topics[topic], stamp_ns, message)
+        while waiting and (odometry is None or buffer.covers(waiting[0].stamp_ns)):
+            yield from _with_odometry(source, waiting.pop(0), buffer if odometry else None)
+    for frame in (*waiting, *streams.flush()):
+        yield from _with_odometry(source, frame, buffer if odometry else None)
+    source.counted.update(streams.counted)
+    for name, apart_ns in streams.apart_ns.items():
+        source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+
+
+def _with_odometry(source: ImageSource, frame: Frame, buffer: OdometryBuffer | None) -> Iterator[Any]:
+    """Yield a frame with the odometry of its time; nothing where that is not known, which is counted."""
+    pose = None if buffer is None else buffer.at(frame.stamp_ns)
+    if buffer is not None and pose is None:
+        _leave(source, "no odometry", f"none at stamp {frame.stamp_ns} ns")
+    else:
+        yield from _read(source, frame, pose)
+
+
+def _read(source: ImageSource, frame: Frame, odometry: Transform | None) -> Iterator[tuple[Images, Transform | None]]:
+    """Yield what a frame shows; nothing where it cannot be read, which is counted."""
+    try:
+        images = images_of(frame, source.mode)
+    except FrontEndError as error:
+        _leave(source, "unreadable", f"image of stamp {frame.stamp_ns} ns: {error}")
+        return
+    yield images, odometry
+
+
+def _leave(source: ImageSource, reason: str, words: str) -> None:
+    source.counted[reason] += 1
+    source.notes[reason] = words
+
+
+def _of_folder(path: Path, request: ImageRequest) -> ImageSource:
+    folders = [path]
+    mode = "mono"
+    for kind, names in FOLDERS.items():
+        found = [next((path / name for name in some if _pictures(path / name)), None) for some in names]
+        if found[0] is not None and (found[1] is not None or not _pictures(path)):
+            mode = kind if found[1] is not None else "mono"
+            folders = [folder for folder in found if folder is not None]
+            break
+    pictures = [_pictures(folder) for folder in folders]
+    if not pictures[0]:
+        raise BagError(
+            f"{path}: no pictures ({', '.join(PICTURES)}), neither here nor in left/ and right/, rgb/ and depth/"
+        )
+    rig = request.rig or _rig_of_folder(path, request, cameras=len(cameras_of(mode)))
+    stamps = [_stamps(path, files, request.rate_hz) for files in pictures]
+    source = ImageSource(rig, mode, len(pictures[0]), lambda: _read_folder(source, pictures, stamps))
+    return source
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES) if folder.is_dir() else []
+
+
+def _rig_of_folder(path: Path, request: ImageRequest, cameras: int) -> CameraRig:
+    own = [path / name for name in ("rig.yaml", "camchain.yaml") if (path / name).exists()][:1]
+    pair = [path / name for name in ("left.yaml", "right.yaml")[:cameras] if (path / name).exists()]
+    files = own or pair or sorted([*path.glob("*.yaml"), *path.glob("*.yml")])[:2]
+    if files:
+        rig = read_rig(*files, rectified=request.rectified)
+    elif (path / "calib.txt").exists():
+        rig = _kitti_rig(path / "calib.txt", cameras)
+    else:
+        raise BagError(
+            f"{path}: nothing tells the cameras: put a rig.yaml beside the pictures (ba rig --help), or give --rig"
+        )
+    if len(rig) < cameras:
+        raise BagError(f"{path}: {', '.join(str(file) for file in files)}: {len(rig)} camera, expected {cameras}")
+    return _first_cameras(rig, cameras)
+
+
+def _first_cameras(rig: CameraRig, count: int) -> CameraRig:
+    arrays = {name: getattr(rig, name)[:count] for name in
+              ("names", "models", "intrinsics", "distortion", "image_size", "position", "orientation")}  # fmt: skip
+    return CameraRig(frame_id=rig.frame_id, **arrays)
+
+
+def _kitti_rig(path: Path, cameras: int) -> CameraRig:
+    """Return the rectified cameras of rows of 12 numbers, each with or without a name before it."""
+    rows = [re.sub(r"^\w+:", "", line).split() for line in path.read_text().splitlines()]
+    infos = [
+        SimpleNamespace(
+            header=SimpleNamespace(frame_id=f"camera{i}"), width=0, height=0, k=[], d=[], r=np.eye(3).reshape(-1),
+            p=[float(value) for value in row], distortion_model="", binning_x=0, binning_y=0,
+        )
+        for i, row in enumerate(row for row in rows if len(row) == 12)
+    ][:cameras]  # fmt: skip
+    return rig_from_infos(infos, rectified=True)
+
+
+def _stamps(path: Path, files: Sequence[Path], rate_hz: float) -> list[int]:
+    """Return when each picture was taken, ns."""
+    times = path / "times.txt"
+    if times.exists():
+        seconds = [float(line.split()[0]) for line in times.read_text().splitlines() if line.strip()]
+        if len(seconds) < len(files):
+            raise BagError(f"{times}: {len(seconds)} lines for {len(files)} pictures")
+        return [_BEGIN_NS + round(one * 1e9) for one in seconds[: len(files)]]
+    if all(file.stem.isdigit() and len(file.stem) >= _NS_DIGITS for file in files):
+        return [int(file.stem) for file in files]
+    if all(re.fullmatch(r"\d{6,}\.\d+", file.stem) for file in files):
+        return [round(float(file.stem) * 1e9) for file in files]
+    return [_BEGIN_NS + round(i / rate_hz * 1e9) for i in range(len(files))]
+
+
+def _read_folder(
+    source: ImageSource, pictures: Sequence[Sequence[Path]], stamps: Sequence[Sequence[int]]
+) -> Iterator[tuple[Images, Transform | None]]:
+    names = MODES[source.mode]
+    streams = Streams(names, frozenset(), _QUEUE)
+    entries = [
+        (stamp_ns, place, file)
+        for place, files in enumerate(pictures)
+        for stamp_ns, file in zip(stamps[place], files, strict=True)
+    ]
+    for stamp_ns, place, file in sorted(entries):
+        message = SimpleNamespace(format=file.suffix[1:], data=file)
+        for frame in streams.put(names[place], stamp_ns, message):
+            yield from _read(source, _loaded(frame), None)
+    for frame in streams.flush():
+        yield from _read(source, _loaded(frame), None)
+    source.counted.update(streams.counted)
+
+
+def _loaded(frame: Frame) -> Frame:
+    """Return a frame with the content of its files."""
+    files = frame.messages.items()
+    data = {name: SimpleNamespace(format=one.format, data=one.data.read_bytes()) for name, one in files}
+    return frame._replace(messages=data)

@@ -1,0 +1,220 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tell what is in a recording, cut it, and put several together; messages are copied as they are."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ba_node.io.bag_source import BagChannel
+from ba_node.io.bag_topics import TopicChoice
+from ba_node.io.mcap import BagError, BagReader, BagWriter
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.messages.topics import CAMERA_TYPES, INPUT_TYPES, TF_STATIC
+
+_NS = 1e9
+# A pause between keyframes that is so many times as long as the median is told.
+_GAP = 4.0
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class TopicFacts:
+    """What there is of one topic."""
+
+    type_name: str
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    gap_s: float = 0.0  # the longest pause
+    gap_at_s: float = 0.0  # when it began, since the first message of the recording
+    bytes: int = 0
+
+
+@dataclass
+class RecordingFacts:
+    """What there is in a recording, and what a replay would use of it."""
+
+    path: Path
+    topics: dict[str, TopicFacts] = field(default_factory=dict)
+    start_ns: int = 0
+    end_ns: int = 0
+    taken: dict[str, str] = field(default_factory=dict)  # topic by input
+    left: dict[str, str] = field(default_factory=dict)  # reason by topic
+    inputs: dict[str, Any] = field(default_factory=dict)  # what the inputs hold
+    refusal: str = ""  # why a replay would refuse it; empty if it would not
+    attention: list[str] = field(default_factory=list)  # what has to be looked at, one sentence each
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it for JSON."""
+        return {**vars(self), "path": self.path.name, "topics": {name: vars(of) for name, of in self.topics.items()}}
+
+
+def examine(path: Path | Sequence[Path], choice: TopicChoice, progress: Progress) -> RecordingFacts:
+    """Read a recording once as it is, and once as a replay would.
+
+    Raises:
+        BagError: nothing of it can be read.
+    """
+    with BagReader(path, choice) as reader:
+        facts = RecordingFacts(reader.path)
+        for done, (channel, time_ns, data) in enumerate(reader.raw(), start=1):
+            progress(done, reader.message_count)
+            facts.start_ns = facts.start_ns or time_ns
+            facts.end_ns = max(facts.end_ns, time_ns)
+            of = facts.topics.setdefault(channel.topic, TopicFacts(channel.type_name, first_ns=time_ns))
+            pause_s = (time_ns - of.last_ns) / _NS
+            if of.count and pause_s > of.gap_s:
+                of.gap_s, of.gap_at_s = pause_s, (of.last_ns - facts.start_ns) / _NS
+            of.count, of.last_ns, of.bytes = of.count + 1, time_ns, of.bytes + len(data)
+        for topic, kind in reader.topics.items():
+            facts.topics.setdefault(topic, TopicFacts(kind))
+        _use(reader, facts)
+        facts.attention += [*reader.warnings.values(), *reader.rejection_notes]
+    return facts
+
+
+def _use(reader: BagReader, facts: RecordingFacts) -> None:
+    """Fill in what a replay would use."""
+    try:
+        measurements = list(reader.measurements())
+    except BagError as error:
+        facts.refusal = str(error).removeprefix(f"{reader.path}: ")
+        images = sorted(topic for topic, of in facts.topics.items() if of.type_name in _IMAGES)
+        if images:
+            facts.attention.append(f"images on {', '.join(images)}: a front-end makes keyframes and tracks of them")
+        return
+    facts.taken, facts.left = dict(reader.taken), dict(reader.left)
+    by_kind: dict[type, list[Any]] = {}
+    for _, _, measurement in measurements:
+        by_kind.setdefault(type(measurement), []).append(measurement)
+    keyframes, tracks = by_kind.get(Keyframe, []), by_kind.get(FeatureTracks, [])
+    seen = Counter(int(track) for image in tracks for track in np.unique(image.track_id))
+    tracked = {(image.session_id, image.keyframe_id) for image in tracks if len(image.track_id)}
+    bare = sum((keyframe.session_id, keyframe.keyframe_id) not in tracked for keyframe in keyframes)
+    sizes, lengths = [len(image.track_id) for image in tracks], list(seen.values())
+    rigs = by_kind.get(CameraRig, [])
+    facts.inputs = {
+        "sessions": len({keyframe.session_id for keyframe in keyframes}),
+        "keyframes": len(keyframes),
+        "keyframes_without_tracks": bare,
+        "cameras": len(rigs[0]) if rigs else 0,
+        "images": len(tracks),
+        "tracks": len(seen),
+        "observations": sum(sizes),
+        "tracks_per_image": _median(sizes),
+        "images_per_track": _median(lengths),
+        "tracks_seen_once": sum(length == 1 for length in lengths),
+        "guesses": sum(len(guess.track_id) for guess in by_kind.get(LandmarkGuesses, [])),
+        "pauses": _pauses(keyframes),
+        "depths": sum(int(np.isfinite(image.depth_m).sum()) for image in tracks),
+    }
+    if bare:
+        facts.attention.append(f"{bare} of {len(keyframes)} keyframes have no tracks")
+
+
+def _pauses(keyframes: Sequence[Keyframe]) -> str:
+    """Return in words where keyframes stay away for much longer than usual; empty if they never do."""
+    stamps = np.sort(np.array([keyframe.stamp_ns for keyframe in keyframes], dtype=np.int64))
+    steps = np.diff(stamps) / _NS
+    usual = _median(steps.tolist())
+    long = np.flatnonzero(steps > _GAP * usual) if usual > 0.0 else np.empty(0, np.intp)
+    if not len(long):
+        return ""
+    worst = int(long[np.argmax(steps[long])])
+    begin = (int(stamps[worst]) - int(stamps[0])) / _NS
+    return f"{len(long)}, the longest {steps[worst]:.2f} s, {begin:.2f} s after the first; usual are {usual:.2f} s"
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if len(values) else 0.0
+
+
+@dataclass(frozen=True)
+class Span:
+    """What is cut out."""
+
+    start_s: float = 0.0  # since the first message
+    end_s: float = math.inf
+    topics: Collection[str] | None = None  # all if None
+
+
+def cut(source: Path | Sequence[Path], target: Path, span: Span, progress: Progress) -> tuple[int, float]:
+    """Write the messages of a time; return how many, and how many seconds they take.
+
+    The last message from before of each topic with cameras or static transforms, and of what else is latched, is
+    written at the begin: without these the rest is of no use.
+
+    Raises:
+        BagError: the recording cannot be read, or nothing of it is of this time.
+    """
+    with BagReader(source) as reader:
+        names = None if span.topics is None else {name if name.startswith("/") else f"/{name}" for name in span.topics}
+        missing = sorted((names or set()) - set(reader.topics))
+        if missing:
+            raise BagError(f"{reader.path}: no topic {missing[0]}; there are: {', '.join(sorted(reader.topics))}")
+        first = next((time_ns for _, time_ns, _ in reader.raw()), 0)
+        start, end = first + span.start_s * _NS, first + span.end_s * _NS
+        held: dict[str, tuple[BagChannel, bytes]] = {}
+        count, last = 0, int(start)
+        with BagWriter(target) as writer:
+            for done, (channel, time_ns, data) in enumerate(reader.raw(names), start=1):
+                progress(done, reader.message_count)
+                if time_ns > end:
+                    break
+                if time_ns < start:
+                    if channel.is_latched or channel.type_name in CAMERA_TYPES or channel.topic == TF_STATIC:
+                        held[channel.topic] = (channel, data)
+                    continue
+                if not count:
+                    for kept, of in held.values():
+                        writer.copy(kept, time_ns, of)
+                writer.copy(channel, time_ns, data)
+                count, last = count + 1, time_ns
+            if not count:
+                length = (max((t for _, t, _ in reader.raw()), default=first) - first) / _NS
+                raise BagError(f"{reader.path}: no message from {span.start_s:g} to {span.end_s:g} s of {length:g} s")
+    return count + len(held), (last - start) / _NS
+
+
+def merge(sources: Sequence[Path], target: Path, progress: Progress) -> tuple[int, list[str]]:
+    """Write all messages of several recordings by time; return how many, and which topics come from several.
+
+    Raises:
+        BagError: one cannot be read, or a topic has another type in another.
+    """
+    with ExitStack() as stack:
+        readers = [stack.enter_context(BagReader(source)) for source in sources]
+        owners: dict[str, list[BagReader]] = {}
+        for reader in readers:
+            for topic, kind in reader.topics.items():
+                of = owners.setdefault(topic, [])
+                if of and of[0].topics[topic] != kind:
+                    raise BagError(f"{reader.path}: topic {topic} is {kind}, in {of[0].path} {of[0].topics[topic]}")
+                of.append(reader)
+        total, count = sum(reader.message_count for reader in readers), 0
+
+        def messages(place: int) -> Iterator[tuple[int, int, int, BagChannel, bytes]]:
+            for number, (channel, time_ns, data) in enumerate(readers[place].raw()):
+                yield time_ns, place, number, channel, data
+
+        with BagWriter(target) as writer:
+            for time_ns, _, _, channel, data in heapq.merge(*map(messages, range(len(readers)))):
+                writer.copy(channel, time_ns, data)
+                count += 1
+                progress(count, total)
+    return count, sorted(topic for topic, of in owners.items() if len(of) > 1 and of[0].topics[topic] in _SINGLE)
+
+
+# Topics of these types make one stream, which two recordings tear apart.
+_SINGLE = frozenset(INPUT_TYPES.values())

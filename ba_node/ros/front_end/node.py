@@ -1,0 +1,354 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Track the images of live topics: the managed node ``ba_front_end``.
+
+============  ==========================================================================================
+configure     topics of images are looked for, by the mode; they and their cameras are subscribed to as they appear
+activate      images are tracked; keyframes, tracks and first points are published
+deactivate    images are ignored, the map of the tracker stays
+cleanup       all of it goes; sessions that begin later have numbers of their own
+============  ==========================================================================================
+
+Poses that the back-end has refined (``ba_node/refined_keyframes``) go into the tracker's map as they come.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import ReliabilityPolicy
+
+from ba_node.arrays import BoolArray
+from ba_node.config import declared
+from ba_node.config.front_end import FrontEndOptions
+from ba_node.config.front_end_node import FrontEndNodeOptions
+from ba_node.core import geometry
+from ba_node.estimate import Correction, Poses
+from ba_node.front_end.front_end import FrontEnd
+from ba_node.front_end.opencv import cv2
+from ba_node.front_end.records import FrontEndError, State, Tracked
+from ba_node.front_end.streams import (
+    MASK,
+    MODES,
+    Frame,
+    OdometryBuffer,
+    Streams,
+    cameras_of,
+    images_of,
+    transform_of,
+)
+from ba_node.io.rig_file import read_rig
+from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages import conversion
+from ba_node.messages.factory import ConversionError, header_message, pose_message, stamp_ns_from_message
+from ba_node.messages.rig import rig_from_infos
+from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
+from ba_node.messages.transforms import StaticTree, tf_message
+from ba_node.ros import qos
+from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.log import Severity, Throttle, log
+from ba_node.ros.parameters import declare
+from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
+from ba_node.ros.tools.adapter import PUBLISHED
+
+NODE_NAME = "ba_front_end"
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_LOOK_S, _LOG_S = 0.5, 5.0
+# Frames that wait for cameras, or for the odometry of their time.
+_MAX_WAITING = 30
+# Share of the time that tracking may take before images get lost.
+_BUSY = 0.95
+# A number of the first session that no run before has had, as long as clocks go on: seconds since 2020.
+_EPOCH_S = 1_577_836_800
+
+
+class FrontEndNode(ManagedNode):
+    """The node.
+
+    Raises:
+        ConfigError: a parameter does not exist or has a wrong value.
+    """
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__(NODE_NAME, **node_options)
+        own, tracking = declared(FrontEndNodeOptions), declared(FrontEndOptions)
+        values: dict[str, Any] = dict(declare(self, (*own, *tracking)))
+        self.options = FrontEndNodeOptions(**{parameter.name: values[parameter.name] for parameter in own})
+        self._tracking = FrontEndOptions(**{parameter.name: values[parameter.name] for parameter in tracking})
+        self.counted: Counter[str] = Counter()  # images tracked and keyframes sent, and images left out by reason
+        self._throttle, self._factory = Throttle(_LOG_S), RclpyFactory()
+        self._entities: list[tuple[str, Any]] = []
+        self._active = False
+        self._session_id = max(1, int(self.get_clock().now().nanoseconds // 10**9) - _EPOCH_S)
+
+    def start(self) -> None:
+        """Configure and activate, if the parameter says so."""
+        if self.options.autostart and self.request("configure"):
+            self.request("activate")
+
+    def configure(self) -> None:
+        """Make publishers and subscriptions; those to images follow when somebody publishes them."""
+        self.cleanup()
+        options = self.options
+        self._rig = read_rig(options.rig_file, rectified=options.rectified) if options.rig_file else None
+        self._mode = "" if options.mode == "auto" else options.mode
+        self._streams: Streams | None = None
+        self._subscribed: dict[str, str] = {}  # topic by stream
+        self._infos: dict[str, Any] = {}
+        self._tree, self._odometry = StaticTree(), OdometryBuffer()
+        self._front_end: FrontEnd | None = None
+        self._mask = read_mask(options.mask_file) if options.mask_file else None
+        self._frames: list[Frame] = []
+        self._state: State | None = None
+        self._busy_s, self._said = 0.0, ""
+        kinds = {name: INPUT_TYPES[name] for name in PUBLISHED}
+        self._out = {name: self._own("publisher", message_class(kind), name, qos.profile(TOPICS[name]))
+                     for name, kind in kinds.items()}  # fmt: skip
+        self._out["odometry"] = self._own("publisher", message_class(_ODOMETRY), "~/odometry", qos.reliable(100))
+        self._out[TF] = self._own("publisher", message_class(TOPICS[TF].type_name), TF, qos.reliable(100))
+        self._listen(TOPICS[TF].type_name, TF_STATIC, self._tree.add, qos.latched(100))
+        self._listen(
+            TOPICS["refined_keyframes"].type_name, "ba_node/refined_keyframes", self._on_refined, qos.reliable(100)
+        )
+        if options.odometry == "topic":
+            self._listen(_ODOMETRY, "odometry", self._on_odometry, qos.reliable(1000))
+        elif options.odometry == "tf":
+            self._listen(TOPICS[TF].type_name, TF, self._on_tf, qos.reliable(1000))
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._own("timer", _LOOK_S, self._look, clock=clock)
+        self._own("timer", _LOG_S, self._report, clock=clock)
+
+    def activate(self) -> None:
+        """Track."""
+        self._active = True
+
+    def deactivate(self) -> None:
+        """Ignore images."""
+        self._active = False
+
+    def cleanup(self) -> None:
+        """Destroy everything."""
+        self._active = False
+        while self._entities:
+            kind, entity = self._entities.pop()
+            getattr(self, f"destroy_{kind}")(entity)
+
+    def _own(self, kind: str, *arguments: Any, **options: Any) -> Any:
+        entity = getattr(self, f"create_{kind}")(*arguments, **options)
+        self._entities.append((kind, entity))
+        return entity
+
+    def _listen(self, kind: str, topic: str, take: Any, profile: Any, **options: Any) -> None:
+        self._own("subscription", message_class(kind), topic, take, profile, **options)
+
+    def _look(self) -> None:
+        """Settle the mode, and subscribe to the images that it needs and that somebody publishes."""
+        found = [mode for mode, names in MODES.items() if all(self._published(name) for name in names)]
+        self._mode = self._mode or (found[0] if found else "")
+        if not self._mode:
+            return
+        names = (*MODES[self._mode], *((MASK,) if self.options.mask_topic else ()))
+        if self._streams is None:
+            self._streams = Streams(names, frozenset((MASK,)), self.options.queue_depth)
+        for name in names:
+            if name not in self._subscribed and (topic := self._published(name)):
+                self._subscribe(name, *topic)
+
+    def _published(self, name: str) -> tuple[str, str] | None:
+        """Return topic and type of an image that somebody publishes, raw before compressed; None if nobody does."""
+        topic = self.resolve_topic_name(name)
+        choices = [(topic, _IMAGE), (f"{topic}/compressedDepth", _COMPRESSED), (f"{topic}/compressed", _COMPRESSED)]
+        return next((choice for choice in choices if self.count_publishers(choice[0])), None)
+
+    def _subscribe(self, name: str, topic: str, kind: str) -> None:
+        profiles = [info.qos_profile.reliability for info in self.get_publishers_info_by_topic(topic)]
+        profile = qos.reliable(self.options.queue_depth)
+        if ReliabilityPolicy.BEST_EFFORT in profiles:
+            profile.reliability = ReliabilityPolicy.BEST_EFFORT
+        self._listen(kind, topic, functools.partial(self._on_image, name), profile)
+        self._subscribed[name] = topic
+        self._log(Severity.INFO, f"{topic} ({kind}) is taken as {name}, mode {self._mode}")
+        if self._rig is None and name in cameras_of(self._mode):
+            beside, take = name.replace("image_raw", "camera_info"), functools.partial(self._on_info, name)
+            # As with the cameras of ba_node: drivers publish them volatile, players latched.
+            self._listen(INPUT_TYPES["camera_info"], beside, take, qos.latched(), **qos.at_peace())
+            self._listen(INPUT_TYPES["camera_info"], beside, take, qos.SENSOR_DATA, **qos.at_peace())
+
+    def _on_info(self, name: str, info: Any) -> None:
+        known = self._infos.setdefault(name, info)
+        if self._front_end is None:
+            self._infos[name] = info
+            self._go_on()
+        elif any(list(getattr(known, key)) != list(getattr(info, key)) for key in ("k", "d", "p")):
+            self._warn("camera_info", f"camera_info of {name} has changed: what came first stays, or configure anew")
+
+    def _on_odometry(self, message: Any) -> None:
+        pose = message.pose.pose
+        self._move(message.header.stamp, str(message.child_frame_id), pose.position, pose.orientation)
+
+    def _on_tf(self, message: Any) -> None:
+        for one in message.transforms:
+            if one.header.frame_id.removeprefix("/") == self.options.odom_frame:
+                self._move(one.header.stamp, one.child_frame_id, one.transform.translation, one.transform.rotation)
+
+    def _move(self, stamp: Any, child: str, position: Any, orientation: Any) -> None:
+        """Take in a pose of the odometry, taken from its frame on the body to that of the rig."""
+        pose, base = transform_of(position, orientation), self._rig.frame_id if self._rig else self.options.base_frame
+        if base and child and child != base:
+            place = self._tree.find(child, base)
+            if place is None:
+                words = f"the odometry is of {child!r} and the rig of {base!r}: /tf_static has no way between them"
+                self._warn("odometry", words)
+                return
+            pose = pose.after(place)
+        self._odometry.add(stamp_ns_from_message(stamp), pose)
+        self._go_on()
+
+    def _on_image(self, name: str, message: Any) -> None:
+        if not self._active or self._streams is None:
+            return
+        before = self._streams.counted.copy()
+        self._frames += self._streams.put(name, stamp_ns_from_message(message.header.stamp), message)
+        for reason in self._streams.counted - before:
+            off = self._streams.apart_ns.get(reason.removeprefix("no "), 0)
+            words = f", the nearest is {off / 1e6:+.1f} ms off" if off else ""
+            self._warn(reason, f"{reason} for {self._streams.counted[reason]} images{words}")
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Track the frames whose cameras and odometry are known, or that have waited long."""
+        while self._frames and self._active:
+            if len(self._frames) <= _MAX_WAITING and not self._is_known(self._frames[0].stamp_ns):
+                return
+            began = time.perf_counter()
+            try:
+                self._track(self._frames.pop(0))
+            except (FrontEndError, ConversionError) as error:
+                self.counted["unusable"] += 1
+                self._warn("unusable", f"{error} (images left out: {self.counted['unusable']})")
+            self._busy_s += time.perf_counter() - began
+
+    def _is_known(self, stamp_ns: int) -> bool:
+        """Return True if the cameras are known, and the odometry of a time."""
+        cameras = self._rig is not None or all(name in self._infos for name in cameras_of(self._mode))
+        return cameras and (self.options.odometry == "none" or self._odometry.covers(stamp_ns))
+
+    def _track(self, frame: Frame) -> None:
+        """Track one frame, and publish what comes of it."""
+        front_end = self._front_end or self._begin()
+        odometry = None if self.options.odometry == "none" else self._odometry.at(frame.stamp_ns)
+        if front_end is None or (odometry is None and self.options.odometry != "none"):
+            reason = "no camera_info" if front_end is None else "no odometry"
+            self.counted[reason] += 1
+            self._warn(reason, f"{reason} for {self.counted[reason]} images")
+            return
+        tracked = front_end.process(images_of(frame, self._mode), odometry)
+        self.counted["images"] += 1
+        for note in tracked.notes:
+            self._warn(note, note)
+        for measurement in tracked.measurements():
+            self._send(measurement, tracked.stamp_ns)
+        self._session_id = max(self._session_id, tracked.session_id + 1)
+        if tracked.state is not self._state:
+            self._state = tracked.state
+            self._log(Severity.WARNING if self._state is State.LOST else Severity.INFO, f"now {self._state.value}")
+        self._publish_pose(tracked)
+
+    def _begin(self) -> FrontEnd | None:
+        """Make the tracker once all cameras are known, and publish the rig."""
+        options, cameras = self.options, cameras_of(self._mode)
+        if self._rig is None:
+            if any(name not in self._infos for name in cameras):
+                return None
+            infos = [self._infos[name] for name in cameras]
+            rig = rig_from_infos(infos, rectified=options.rectified, tree=self._tree, base=options.base_frame)
+            if options.base_frame not in ("", rig.frame_id):
+                raise ConversionError(f"/tf_static has no way from {options.base_frame!r} to {rig.names[0]!r} (yet)")
+            self._rig = rig
+        self._front_end = FrontEnd(
+            self._rig, self._tracking, mask=self._mask, session_id=self._session_id, fixed_frame=options.odom_frame
+        )
+        self._out["camera_rig"].publish(conversion.rig_message(self._factory, self._rig, 0))
+        return self._front_end
+
+    def _send(self, measurement: Measurement, stamp_ns: int) -> None:
+        rig = self._rig
+        assert rig is not None
+        if isinstance(measurement, Keyframe):
+            self.counted["keyframes"] += 1
+            if not self._out["keyframes"].get_subscription_count():
+                self._warn("nobody", f"nobody listens to {self.resolve_topic_name('keyframes')}: keyframes are lost")
+            self._out["keyframes"].publish(conversion.keyframe_message(self._factory, measurement))
+        elif isinstance(measurement, LandmarkGuesses):
+            message = conversion.guesses_message(self._factory, measurement, stamp_ns, self.options.odom_frame)
+            self._out["landmark_guesses"].publish(message)
+        elif isinstance(measurement, FeatureTracks):
+            name = rig.names[measurement.camera_index]
+            self._out["feature_tracks"].publish(conversion.tracks_message(self._factory, measurement, stamp_ns, name))
+
+    def _publish_pose(self, tracked: Tracked) -> None:
+        """Publish where the body is now, with its covariance, and as a transform if nobody else does."""
+        if tracked.pose is None or self._rig is None:
+            return
+        fixed, position = self.options.odom_frame, tracked.pose.translation
+        orientation = geometry.quaternion_from_matrix(tracked.pose.rotation)
+        header = header_message(self._factory, tracked.stamp_ns, fixed)
+        message = message_class(_ODOMETRY)(header=header, child_frame_id=self._rig.frame_id)
+        message.pose.pose = pose_message(self._factory, position, orientation)
+        message.pose.covariance = self._factory.fixed(np.nan_to_num(tracked.covariance, nan=1e6).reshape(-1))
+        self._out["odometry"].publish(message)
+        if self.options.publish_tf and self.options.odometry == "none":
+            placed = Correction(self._rig.frame_id, position, orientation)
+            self._out[TF].publish(tf_message(self._factory, placed, fixed, tracked.stamp_ns))
+
+    def _on_refined(self, message: Any) -> None:
+        if self._front_end is None or message.session_id != self._front_end.session_id:
+            return
+        ids, stamps = np.array(message.keyframe_id, np.uint64), np.array(message.stamp_ns, np.int64)
+        position, orientation = np.reshape(message.position, (-1, 3)), np.reshape(message.orientation, (-1, 4))
+        self._front_end.refine(Poses(ids, stamps, position, orientation))
+
+    def _report(self) -> None:
+        """Log what has become of the images, and what is missing."""
+        wanted = [name for name in MODES.get(self._mode, MODES["stereo"]) if name not in self._subscribed]
+        words = self.summary()
+        if wanted:
+            words += f"; nobody publishes {' and '.join(map(self.resolve_topic_name, wanted))}"
+            words += "" if self._mode else ", nor the images of another mode"
+        elif words == self._said and self._active:
+            words += f"; no image came for {_LOG_S:g} s"
+        if self._busy_s > _BUSY * _LOG_S:
+            words += f"; tracking takes all the time ({self._busy_s / _LOG_S:.0%}): images get lost, lower max_features"
+        self._busy_s = 0.0
+        if words != self._said:
+            self._log(Severity.INFO if words == self.summary() else Severity.WARNING, words)
+            self._said = self.summary()
+
+    def summary(self) -> str:
+        """Return in words what has become of the images."""
+        lost = self.counted if self._streams is None else self.counted + self._streams.counted
+        left = ", ".join(
+            f"{reason} = {n}" for reason, n in sorted(lost.items()) if reason not in ("images", "keyframes")
+        )
+        return f"{self.counted['images']} images, {self.counted['keyframes']} keyframes; left out: {left or 'nothing'}"
+
+    def _warn(self, key: str, words: str) -> None:
+        if self._throttle.passes(key, time.monotonic()):
+            self._log(Severity.WARNING, words)
+
+    def _log(self, severity: Severity, words: str) -> None:
+        log(self, severity, words)
+
+
+def read_mask(path: str) -> BoolArray:
+    """Return the mask in a picture, (h, w), False where it is black; raise FrontEndError if there is none."""
+    picture = cv2().imread(path, cv2().IMREAD_GRAYSCALE)
+    if picture is None:
+        raise FrontEndError(f"mask_file {path!r} is no picture that can be read")
+    return np.asarray(picture > 0)

@@ -1,0 +1,296 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Turn what is known beside pixels into factors of a problem, and find where the map lies in the world.
+
+**Pairing.** A pose prior or a fix of time t, between the keyframes a and b, tells of the nearer one, k: the front-end's
+motion from a to b, at constant velocity, leads from k to the body at t. So what was measured at t is a measurement of
+a point of the body at k, ``l' = p_kt + R_kt l``, l being the lever arm.
+
+**The world.** The map begins where the front-end begins, the world where its surveyors or the first fix have it. Once
+enough is known, ``map_from_world`` is the rotation and translation that bring the priors nearest to the keyframes that
+they tell of: Kabsch's, from weighted pairs of positions, orientations, and the vertical, which both frames have by
+REP-103, for what the rest does not tell. The pairs are weighted by Cauchy's loss, from the best of some minimal sets.
+It is held until the next solve of everything begins, so that the map is drawn to where the world is, and no one fix
+moves the map.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.config import Config, FactorsConfig
+from ba_node.core import geometry
+from ba_node.core.factors import RelativePoses
+from ba_node.core.priors import Directions, PosePriors, root_information
+from ba_node.core.problem import KeyframeFactors, PointPriors, Problem
+from ba_node.scene.scene import Scene
+
+_LOSS = "cauchy"
+# Standard deviation of the vertical of one frame in the other, rad; and of an orientation that was not measured.
+_LEVEL_RAD = 0.05
+_UNKNOWN = 1e6
+# Minimal sets that are tried, pairs in each, pairs that judge them, rounds of weighting.
+_SETS, _IN_SET, _JUDGES, _ROUNDS = 60, 5, 300, 10
+# The path has to spread so many times the noise of positions, and the heading to be known to so much (rad).
+_SPREAD, _HEADING_RAD = 5.0, 0.03
+
+# What a program that embeds the back-end adds: (scene, problem, rows of its keyframes in the scene) -> factors.
+Source = Callable[[Scene, Problem, IntArray], tuple[KeyframeFactors, ...]]
+SOURCES: list[Source] = []
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Absolute measurements and the keyframes that they tell of."""
+
+    row: IntArray  # (n,) of the keyframe in the scene
+    lever_arm: FloatArray  # (n, 3) of the point in its body, m
+    position: FloatArray  # (n, 3) of the point in the world, m
+    rotation: FloatArray  # (n, 3, 3) world from the keyframe's body, as measured; unit where it was not
+    covariance: FloatArray  # (n, 6, 6) rotation about the body's axes, then position
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def take(self, rows: IntArray | BoolArray) -> Pairs:
+        """Return some of them."""
+        return Pairs(*(values[rows] for values in vars(self).values()))
+
+    def points(self, scene: Scene) -> FloatArray:
+        """Return where the map has the points, (n, 3) m."""
+        table = scene.keyframes
+        return np.asarray(table.position[self.row] + (table.rotation[self.row] @ self.lever_arm[:, :, None])[..., 0])
+
+
+def pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
+    """Return all absolute measurements between two keyframes, by the nearer one.
+
+    Keyframes are those from the place ``first`` in the order of time on.
+    """
+    table, order = scene.keyframes, scene.order[max(first - 1, 0) :]
+    stamps = table.stamp_ns[order]
+    since = bisect.bisect_left(scene.constraints.absolute, stamps[0], key=lambda one: one.stamp_ns)
+    known = scene.constraints.absolute[since:]
+    time = np.array([one.stamp_ns for one in known], np.int64)
+    after = np.searchsorted(stamps, time)
+    exact = stamps[np.minimum(after, len(stamps) - 1)] == time
+    after = after + exact
+    inside = (after > 0) & ((after < len(stamps)) | exact)
+    which = np.flatnonzero(inside)
+    a = after[which] - 1
+    b = np.minimum(a + 1, len(stamps) - 1)
+    share = (time[which] - stamps[a]) / np.maximum(stamps[b] - stamps[a], 1)
+    nearer = np.where(share > 0.5, b, a)
+    # Constant velocity from a to b by the front-end, then seen from the nearer one.
+    poses = table.input_rotation[order], table.input_position[order]
+    step = geometry.compose(*geometry.inverse(poses[0][a], poses[1][a]), poses[0][b], poses[1][b])
+    from_a = geometry.so3_exp(share[:, None] * geometry.so3_log(step[0])), share[:, None] * step[1]
+    back = geometry.inverse(*step)
+    is_b = nearer == b
+    start = np.where(is_b[:, None, None], back[0], np.eye(3)), np.where(is_b[:, None], back[1], 0.0)
+    turn, move = geometry.compose(*start, *from_a)
+    antenna = np.array([config.antenna_x_m, config.antenna_y_m, config.antenna_z_m])
+    arm = np.array([antenna * known[i].of_antenna for i in which]).reshape(-1, 3)
+    measured = [known[i].rotation for i in which]
+    rotation = np.array([np.eye(3) if one is None else one for one in measured]).reshape(-1, 3, 3)
+    return Pairs(
+        order[nearer],
+        move + (turn @ arm[:, :, None])[..., 0],
+        np.array([known[i].position for i in which]).reshape(-1, 3),
+        rotation @ np.swapaxes(turn, 1, 2),
+        np.array([_six(known[i].covariance, config) for i in which]).reshape(-1, 6, 6),
+    )
+
+
+def _six(covariance: FloatArray, config: FactorsConfig) -> FloatArray:
+    if len(covariance) == 6:
+        return covariance
+    out = _UNKNOWN**2 * np.eye(6)
+    out[3:, 3:] = covariance if covariance.any() else config.gnss_sigma_m**2 * np.eye(3)
+    return out
+
+
+def align(scene: Scene, config: Config) -> bool:
+    """Find where the map lies in the world by all that is refined; return whether that is known now."""
+    known = scene.constraints
+    if known.world_frame == config.frames.map_frame:
+        known.map_from_world = np.eye(3), np.zeros(3)
+        return True
+    pairs = pair(scene, config.factors)
+    pairs = pairs.take(scene.keyframes.refined[pairs.row])
+    found = _aligned(scene, pairs, config.factors)
+    if found is not None:
+        known.map_from_world = found
+    return known.map_from_world is not None
+
+
+def _aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArray, FloatArray] | None:
+    """Return map from world, None where too little is known."""
+    if not len(pairs):
+        return None
+    there = pairs.points(scene)
+    sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
+    turn_rad = np.sqrt(np.trace(pairs.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0)
+    turned = scene.keyframes.rotation[pairs.row] @ np.swapaxes(pairs.rotation, 1, 2)
+    best, lowest = None, np.inf
+    rng = np.random.default_rng(0)
+    judges = np.unique(np.linspace(0, len(pairs) - 1, _JUDGES).astype(int))
+    for _ in range(_SETS):
+        few = rng.choice(len(pairs), min(_IN_SET, len(pairs)), replace=False)
+        weight = np.zeros(len(pairs))
+        weight[few] = 1.0 / sigma[few] ** 2
+        found = _kabsch(there, pairs.position, weight, turned, turn_rad)
+        cost = float(np.sum(np.log1p(_off(found, there[judges], pairs.position[judges], sigma[judges]) ** 2)))
+        if cost < lowest:
+            best, lowest = found, cost
+    assert best is not None
+    for _ in range(_ROUNDS):
+        off = _off(best, there, pairs.position, sigma) / max(1.0, np.median(_off(best, there, pairs.position, sigma)))
+        weight = 1.0 / (sigma**2 * (1.0 + off**2))
+        best = _kabsch(there, pairs.position, weight, turned, turn_rad)
+    share = weight / weight.sum()
+    spread = float(np.sqrt(np.sum(share[:, None] * (there - share @ there) ** 2)))
+    sigma_m = float(1.0 / np.sqrt(np.mean(1.0 / sigma**2)))
+    heading = sigma_m / (max(spread, 1e-9) * np.sqrt(len(pairs)))
+    told = float(1.0 / np.sqrt(np.sum(1.0 / turn_rad**2)))
+    enough = spread >= max(config.align_m, _SPREAD * sigma_m) and heading <= _HEADING_RAD
+    return best if enough or told <= _HEADING_RAD else None
+
+
+def _kabsch(
+    there: FloatArray, here: FloatArray, weight: FloatArray, turned: FloatArray, turn_rad: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return rotation and translation that bring positions ``here`` (n, 3) to ``there``, best by weights 1/m^2."""
+    share = weight / weight.sum()
+    middle = share @ there, share @ here
+    product = ((there - middle[0]) * weight[:, None]).T @ (here - middle[1])
+    product[2, 2] += 1.0 / _LEVEL_RAD**2
+    product += np.sum(np.where(weight > 0.0, 1.0, 0.0)[:, None, None] * turned / turn_rad[:, None, None] ** 2, axis=0)
+    rotation = geometry.nearest_rotation(product)
+    return rotation, middle[0] - rotation @ middle[1]
+
+
+def _off(found: tuple[FloatArray, FloatArray], there: FloatArray, here: FloatArray, sigma: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(here @ found[0].T + found[1] - there, axis=1) / (1.7 * sigma))
+
+
+def factors(
+    scene: Scene, config: Config, problem: Problem, rows: IntArray, origin: FloatArray
+) -> list[KeyframeFactors]:
+    """Return the factors of a problem whose keyframes stand in some rows of the scene, oldest first.
+
+    ``origin`` (3,) is that of the problem in the map, m.
+    """
+    known = scene.constraints
+    out: list[KeyframeFactors] = []
+    for source in SOURCES:
+        out += source(scene, problem, rows)
+    if not config.factors.enabled:
+        return out
+    number = np.full(len(scene.keyframes), -1)
+    number[rows] = np.arange(len(rows))
+    free = ~problem.fixed
+    if known.relative or known.steps:
+        out += _relative(scene, config, number, free)
+    if known.gravity:
+        out += _gravity(scene, config, number, free)
+    if known.absolute and known.map_from_world is not None and free.any():
+        pairs = pair(scene, config.factors, int(scene.places()[rows[free]].min()))
+        mine = number[pairs.row]
+        pairs = pairs.take((mine >= 0) & free[mine])
+        if len(pairs):
+            out.append(absolute(scene, config, pairs, number[pairs.row], origin))
+    return out
+
+
+def absolute(scene: Scene, config: Config, pairs: Pairs, numbers: IntArray, origin: FloatArray) -> PosePriors:
+    """Return the factors of absolute measurements in the map, whose keyframes have these numbers in a problem."""
+    assert scene.constraints.map_from_world is not None
+    rotation, translation = scene.constraints.map_from_world
+    root = root_information(pairs.covariance)
+    root[:, :, 3:] = root[:, :, 3:] @ rotation.T
+    position = pairs.position @ rotation.T + translation - origin
+    where = numbers[:, None], rotation @ pairs.rotation, position, pairs.lever_arm
+    return PosePriors(*where, root, _LOSS, config.factors.loss_scale)
+
+
+def _relative(scene: Scene, config: Config, number: IntArray, free: BoolArray) -> list[KeyframeFactors]:
+    """Return the measured relative poses, and steps of the front-end whose covariance it told."""
+    known, table = scene.constraints, scene.keyframes
+    found = []
+    for key in _keys(scene, number):
+        one = known.relative[key]
+        ends = [scene.find_keyframe(end) for end in key]
+        if None not in ends:
+            pair_of = number[np.array(ends, np.intp)]
+            if (pair_of >= 0).all() and free[pair_of].any():
+                found.append((pair_of, one.rotation, one.position, one.covariance))
+    if known.steps:
+        # Keyframes that follow each other in the problem and in time.
+        here = np.flatnonzero(number[scene.order] >= 0)
+        for place in here[1:][np.diff(here) == 1]:
+            first, second = scene.order[place - 1], scene.order[place]
+            covariance = known.steps.get(int(table.keyframe_id[second]))
+            ends_of = number[[first, second]]
+            if covariance is not None and free[ends_of].any():
+                back = geometry.inverse(table.input_rotation[first], table.input_position[first])
+                turn, move = geometry.compose(*back, table.input_rotation[second], table.input_position[second])
+                turned = np.eye(6)
+                turned[:3, :3] = turn.T
+                found.append((ends_of, turn, move, turned @ covariance @ turned.T))
+    if not found:
+        return []
+    pairs, rotation, position, covariance = (np.array(values) for values in zip(*found, strict=True))
+    root = root_information(covariance)
+    return [RelativePoses(pairs, rotation, position, root, _LOSS, config.factors.loss_scale)]
+
+
+def _keys(scene: Scene, number: IntArray) -> list[tuple[int, int]]:
+    """Return the relative poses of keyframes of a problem, in the order of these."""
+    known = scene.constraints
+    ids = scene.keyframes.keyframe_id[np.flatnonzero(number >= 0)].tolist()
+    return list(dict.fromkeys(key for one in ids for key in known.relative_of.get(one, ())))
+
+
+def in_place(steps: tuple[RelativePoses, ...], others: list[KeyframeFactors]) -> tuple[KeyframeFactors, ...]:
+    """Return all factors, without the front-end's own steps where something else was measured between keyframes."""
+    told = [kind.keyframes for kind in others if isinstance(kind, RelativePoses)]
+    if told:
+        pairs = {tuple(sorted(ends)) for ends in np.concatenate(told).tolist()}
+        keep = [np.array([tuple(ends) not in pairs for ends in kind.keyframes.tolist()], bool) for kind in steps]
+        same = np.arange(1 + max(int(kind.keyframes.max(initial=0)) for kind in steps)) if steps else np.arange(0)
+        steps = tuple(kind.take(kept, same) for kind, kept in zip(steps, keep, strict=True) if kept.any())
+    return (*steps, *others)
+
+
+def _gravity(scene: Scene, config: Config, number: IntArray, free: BoolArray) -> list[KeyframeFactors]:
+    found = []
+    for row in np.flatnonzero(number >= 0):
+        measured = scene.constraints.gravity.get(int(scene.keyframes.keyframe_id[row]))
+        if measured is not None and free[number[row]]:
+            found.append((number[row], *measured))
+    if not found:
+        return []
+    at, body, sigma_rad = (np.array(values) for values in zip(*found, strict=True))
+    world = np.tile([0.0, 0.0, -1.0], (len(at), 1))
+    return [Directions(at[:, None], world, body, sigma_rad, _LOSS, config.factors.loss_scale)]
+
+
+def point_priors(scene: Scene, config: Config, landmarks: IntArray, origin: FloatArray) -> PointPriors | None:
+    """Return the priors of points that stand in some rows of the scene, in a problem with this origin; None if none."""
+    known = scene.constraints
+    if not (config.factors.enabled and known.landmarks and known.map_from_world is not None):
+        return None
+    rotation, translation = known.map_from_world
+    number = {row: i for i, row in enumerate(landmarks.tolist())}
+    rows = scene.find_landmarks(np.fromiter(known.landmarks, np.uint64, len(known.landmarks))).tolist()
+    found = [(number[row], *one) for row, one in zip(rows, known.landmarks.values(), strict=True) if row in number]
+    if not found:
+        return None
+    point, position, covariance = (np.array(values) for values in zip(*found, strict=True))
+    return PointPriors(point, position @ rotation.T + translation - origin, rotation @ covariance @ rotation.T)

@@ -1,0 +1,88 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings in the layouts of other front-ends, by `ba convert --from`, all the way to refined keyframes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ba_node.cli.main import main
+from ba_node.io.mcap import BagReader
+from ba_node.io.rig_file import rig_yaml
+from ba_node.messages.adapters import SOURCES
+from tests.messages.adapters import layouts
+
+EVERY = {"openvins": 12, "vins_fusion": 9, "vins_mono": 5, "rtabmap": 12, "rtabmap_map": 12}
+
+
+@pytest.mark.parametrize("source", sorted(SOURCES))
+def test_every_keyframe_is_refined(source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = layouts.scene(12, "none" if source.startswith("rtabmap") else "plumb_bob")
+    bag = layouts.write(tmp_path / "bag", getattr(layouts, source)(data))
+    out = tmp_path / "out.mcap"
+    # What has mapData alone is found by the name of its package too.
+    assert main(["convert", str(bag), str(out), "--from", source.removesuffix("_map")]) == 0
+    assert f"{EVERY[source]} keyframes of" in capsys.readouterr().out
+    assert main(["replay", str(out), "--out", str(tmp_path / "replay")]) == 0
+    report = json.loads((tmp_path / "replay" / "report.json").read_text())
+    assert report["keyframes_refined"] == report["keyframes"] == EVERY[source]
+    assert report["rms_px"]["refined"] < 0.32, report["rms_px"]
+
+
+def test_the_last_calibration_is_taken(tmp_path: Path) -> None:
+    messages = list(layouts.openvins(layouts.scene(6)))
+    for sent in messages[:-8]:
+        if sent.topic.endswith("intrinsics"):
+            sent.message.k[0] *= 1.05
+    bag = layouts.write(tmp_path / "bag", messages)
+    out = tmp_path / "out.mcap"
+    assert main(["convert", str(bag), str(out), "--from", "openvins"]) == 0
+    with BagReader(out) as reader:
+        topic, _, _, data = next(reader.messages(["/camera_rig"]))
+        k = reader.decode(topic, data).cameras[0].k
+    assert k[0] == pytest.approx(layouts.scene(6).rig.intrinsics[0, 0], rel=1e-9)
+
+
+def test_without_local_bundle_adjustment_the_rig_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = layouts.scene(12, "none")
+    bag = layouts.write(tmp_path / "bag", layouts.rtabmap(data, bundle=False))
+    out, rig = tmp_path / "out.mcap", tmp_path / "rig.yaml"
+    assert main(["convert", str(bag), str(out), "--from", "rtabmap"]) == 2
+    assert "give it as YAML" in capsys.readouterr().err
+    assert not out.exists()
+    rig.write_text(rig_yaml(data.rig)[0])
+    assert main(["convert", str(bag), str(out), "--from", "rtabmap", "--rig", str(rig)]) == 0
+
+
+def test_topics_of_other_names_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    renamed = [
+        sent._replace(topic=sent.topic.replace("keyframe_pose", "kf")) for sent in layouts.vins_fusion(layouts.scene())
+    ]
+    bag = layouts.write(tmp_path / "bag", renamed)
+    command = ["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "vins_fusion"]
+    assert main(command) == 2
+    assert "no keyframe_pose (nav_msgs/msg/Odometry): say --topic keyframe_pose=TOPIC" in capsys.readouterr().err
+    assert main([*command, "--topic", "keyframe_pose=/vins_estimator/kf"]) == 0
+    assert main([*command, "--topic", "keyframe_pose"]) == 2
+
+
+def test_nothing_that_can_be_used_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    messages = list(layouts.vins_fusion(layouts.scene(), apart_ns=5_000_000))
+    bag = layouts.write(tmp_path / "bag", messages)
+    command = ["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "vins_fusion"]
+    assert main(command) == 2
+    words = capsys.readouterr().err
+    assert "no keyframe comes of 9 images" in words and "no_pose = 9" in words
+    assert not (tmp_path / "out.mcap").exists()
+    assert main([*command, "--tolerance", "0.01"]) == 0
+
+
+def test_faults_of_the_recording_are_in_the_exit_code(tmp_path: Path) -> None:
+    messages = list(layouts.openvins(layouts.scene(6)))
+    messages[3].message.channels[0].values = np.zeros(2, np.float32)
+    bag = layouts.write(tmp_path / "bag", messages)
+    assert main(["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "openvins"]) == 3

@@ -1,0 +1,181 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Images from recordings and folders: which are meant, their rig, stamps and odometry, and what is said of bad ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from ba_node.io.mcap import BagError
+from ba_node.io.rig_file import rig_yaml
+from ba_node.offline.images import ImageRequest, open_images
+from tests.io.test_rig_file import a_rig
+from tests.messages.adapters import layouts
+from tests.messages.adapters.layouts import Sent
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+STEP_NS = 100_000_000
+SIZE = (64, 48)
+
+
+def picture(seed: int) -> Any:
+    return np.random.default_rng(seed).integers(0, 256, SIZE[::-1], dtype=np.uint8)
+
+
+def image(topic: str, stamp_ns: int, seed: int, *, depth: bool = False, compressed: bool = False) -> Sent:
+    header = layouts.header(stamp_ns, topic)
+    if compressed:
+        data = cv2.imencode(".png", picture(seed))[1].reshape(-1)
+        return Sent(topic, COMPRESSED, layouts.make(COMPRESSED, header=header, format="png", data=data), stamp_ns)
+    pixels = np.full(SIZE[::-1], 1500, np.uint16) if depth else picture(seed)
+    fields = {"encoding": "16UC1" if depth else "mono8", "step": SIZE[0] * pixels.itemsize}
+    message = layouts.make(
+        IMAGE, header=header, width=SIZE[0], height=SIZE[1], data=pixels.view(np.uint8).reshape(-1), **fields
+    )
+    return Sent(topic, IMAGE, message, stamp_ns)
+
+
+def info(topic: str, frame: str, shift_m: float = 0.0) -> Sent:
+    message = layouts.make(
+        layouts.CAMERA_INFO, header=layouts.header(1, frame), width=SIZE[0], height=SIZE[1],
+        distortion_model="plumb_bob", d=np.zeros(5), k=np.array([50.0, 0, 31.5, 0, 50.0, 23.5, 0, 0, 1]),
+        r=np.eye(3).reshape(-1), p=np.array([50.0, 0, 31.5, 50.0 * shift_m, 0, 50.0, 23.5, 0, 0, 0, 1, 0]),
+    )  # fmt: skip
+    return Sent(topic, layouts.CAMERA_INFO, message, 1)
+
+
+def stereo(left: str = "/left", right: str = "/right", end: str = "image_raw", **options: Any) -> list[Sent]:
+    sent = [info(f"{left}/camera_info", "left"), info(f"{right}/camera_info", "right", -0.12)]
+    for i in range(4):
+        sent += [
+            image(f"{side}/{end}", (i + 1) * STEP_NS, 10 * i + n, **options) for n, side in enumerate((left, right))
+        ]
+    return sent
+
+
+def read(path: Path, **request: Any) -> tuple[Any, list[Any]]:
+    with open_images(path, ImageRequest(**request)) as source:
+        return source, list(source.read())
+
+
+@pytest.mark.parametrize(
+    ("messages", "request_"),
+    [
+        (stereo(), {}),
+        (stereo("/robot/left", "/robot/right"), {}),
+        (stereo(end="image_raw/compressed", compressed=True), {}),
+        (stereo("/z_first", "/a_second", "image_rect"), {}),  # the right one is told by its p
+        ([*stereo("/cam0", "/cam1"), image("/other/image", 1, 0)],
+         {"topics": {"left": "/cam0/image_raw", "right": "cam1/image_raw"}}),
+    ],
+)  # fmt: skip
+def test_pairs_are_found(messages: list[Sent], request_: Mapping[str, Any], tmp_path: Path) -> None:
+    source, frames = read(layouts.write(tmp_path / "bag", messages), **request_)
+    assert (source.mode, source.total, len(frames)) == ("stereo", 4, 4)
+    assert np.allclose(source.rig.position, [[0.0, 0.0, 0.0], [0.12, 0.0, 0.0]])
+    for i, (images, odometry) in enumerate(frames):
+        assert (images.stamp_ns, images.skew_ns, odometry) == ((i + 1) * STEP_NS, 0, None)
+        assert np.array_equal(images.grey[0], picture(10 * i)) and np.array_equal(images.grey[1], picture(10 * i + 1))
+    assert not source.counted
+
+
+def test_depth_is_told_by_its_encoding(tmp_path: Path) -> None:
+    messages = [info("/camera/color/camera_info", "color")]
+    for i in range(3):
+        messages += [image("/camera/aligned/image", i * STEP_NS, i, depth=True)]
+        messages += [image("/camera/color/image", i * STEP_NS, i)]
+    source, frames = read(layouts.write(tmp_path / "bag", messages))
+    assert (source.mode, len(frames), len(source.rig)) == ("rgbd", 3, 1)
+    assert frames[0][0].depth_m == pytest.approx(np.full(SIZE[::-1], 1.5))
+
+
+def test_odometry_comes_at_the_time_of_the_image(tmp_path: Path) -> None:
+    messages = [info("/camera_info", "cam")]
+    for i in range(4):
+        stamp = (i + 1) * STEP_NS
+        messages.append(image("/image_raw", stamp, i))
+        later = stamp + 50_000_000
+        pose = layouts.odometry(later, "odom", [i, 0, 0], [0, 0, 0, 1])
+        messages.append(Sent("/odom", layouts.ODOMETRY, pose, later))
+    source, frames = read(layouts.write(tmp_path / "bag", messages), topics={"odometry": "/odom"})
+    assert source.mode == "mono"
+    assert [pose.translation[0] for _, pose in frames] == pytest.approx([0.5, 1.5, 2.5])
+    assert source.counted == {"no odometry": 1}
+
+
+def test_what_is_missing_is_counted_with_figures(tmp_path: Path) -> None:
+    messages = stereo()
+    del messages[5]  # the second right one
+    messages[6].message.encoding = "strange"
+    source, frames = read(layouts.write(tmp_path / "bag", messages))
+    assert [images.stamp_ns // STEP_NS for images, _ in frames] == [1, 4]
+    assert source.counted == {"no right/image_raw": 1, "unreadable": 1}
+    assert "100.0 ms off" in source.notes["no right/image_raw"] and "'strange'" in source.notes["unreadable"]
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([info("/a/camera_info", "a")], "cannot tell which images are meant of: none"),
+        ([image(f"/c{i}/image", 1, i) for i in range(3)], "say --topic left=TOPIC"),
+        (stereo()[2:], "no message on /left/camera_info"),
+        (
+            [*stereo()[2:], info("/left/camera_info", "l", -0.1), info("/right/camera_info", "r")],
+            "left and right are swapped",
+        ),
+    ],
+)
+def test_a_recording_that_cannot_be_read_is_said(messages: list[Sent], words: str, tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=words):
+        read(layouts.write(tmp_path / "bag", messages))
+
+
+def folder(tmp_path: Path, names: Mapping[str, list[str]], **files: str) -> Path:
+    for place, pictures in names.items():
+        (tmp_path / place).mkdir(exist_ok=True)
+        for i, name in enumerate(pictures):
+            cv2.imwrite(str(tmp_path / place / name), picture(i))
+    for name, text in files.items():
+        (tmp_path / name.replace("_", ".")).write_text(text)
+    return tmp_path
+
+
+NUMBERS = [f"{i:06d}.png" for i in range(3)]
+RIG = rig_yaml(a_rig())[0]
+
+
+def test_folders_of_pictures(tmp_path: Path) -> None:
+    source, frames = read(folder(tmp_path, {"left": NUMBERS, "right": NUMBERS}, rig_yaml=RIG), rate_hz=20.0)
+    assert (source.mode, len(frames), source.rig.position[1, 0]) == ("stereo", 3, 0.11)
+    assert np.diff([images.stamp_ns for images, _ in frames]).tolist() == [STEP_NS // 2] * 2
+    assert np.array_equal(frames[2][0].grey[1], picture(2))
+
+
+@pytest.mark.parametrize(
+    ("names", "files", "step_ns"),
+    [
+        ([f"170000000{i}000000000.png" for i in range(3)], {}, 10**9),
+        ([f"130503110{i}.250000.jpg" for i in range(3)], {}, 10**9),
+        (NUMBERS, {"times_txt": "0.0\n0.05\n0.1\n"}, 50_000_000),
+    ],
+)
+def test_stamps_of_pictures(names: list[str], files: Mapping[str, str], step_ns: int, tmp_path: Path) -> None:
+    source, frames = read(folder(tmp_path, {".": names}, rig_yaml=RIG, **files))
+    assert (source.mode, len(source.rig)) == ("mono", 1)
+    assert np.diff([images.stamp_ns for images, _ in frames]).tolist() == [step_ns] * 2
+
+
+def test_folders_that_cannot_be_read_are_said(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="no pictures"):
+        read(tmp_path)
+    with pytest.raises(BagError, match="nothing tells the cameras"):
+        read(folder(tmp_path, {"left": NUMBERS, "right": NUMBERS}))
+    (tmp_path / "times.txt").write_text("0.0\n")
+    with pytest.raises(BagError, match="1 lines for 3 pictures"):
+        read(folder(tmp_path, {}, rig_yaml=RIG))

@@ -1,0 +1,64 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""`ba record` beside `ba play`, over a real middleware."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ba_node.io.mcap import BagReader
+from ba_node.offline.recording import record
+from ba_node.synthetic import SyntheticOptions, generate
+
+pytestmark = pytest.mark.dds
+BA = [sys.executable, "-m", "ba_node.cli.main"]
+
+
+def recorder(out: Path, *options: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([*BA, "record", "--out", str(out), *options], stderr=subprocess.PIPE, text=True)
+
+
+def test_what_is_played_is_recorded(tmp_path: Path, domain: int) -> None:  # noqa: ARG001
+    bag, out = tmp_path / "scene.mcap", tmp_path / "again.mcap"
+    data = generate(SyntheticOptions(seed=5, keyframes=6, length_m=10.0, path="line", tracks=50, guesses=True))
+    record(bag, data.timeline(), data.truth)
+    process = recorder(out, "--topics", "ground_truth/pose")
+    played = subprocess.run(
+        [*BA, "play", str(bag), "--wait", "60"],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "nobody listens" not in played.stderr
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 0, error
+    with BagReader(bag) as before, BagReader(out) as after:
+        assert set(after.topics) == set(before.topics)
+        for topic in before.topics:
+            sent, got = ([data for _, _, data in reader.raw([topic])] for reader in (before, after))
+            assert got == sent, topic
+        assert next(channel for channel, _, _ in after.raw(["/camera_rig"])).is_latched
+        assert len(list(after.measurements())) == len(list(before.measurements()))
+
+
+def test_nothing_to_record_is_said(tmp_path: Path, domain: int) -> None:  # noqa: ARG001
+    process = recorder(tmp_path / "none.mcap", "--duration", "1")
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "no message came: expected topics of ba_msgs/msg/Keyframe" in error.splitlines()[-1]
+    assert not (tmp_path / "none.mcap").exists()
+    (tmp_path / "mine.mcap").write_bytes(b"mine")
+    process = recorder(tmp_path / "mine.mcap", "--duration", "1")
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "mine.mcap: File exists" in error
+    assert (tmp_path / "mine.mcap").read_bytes() == b"mine"
