@@ -26,7 +26,7 @@ from ba_node.core.problem import State
 from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import full, quality, view
+from ba_node.window import full, old_keyframes, quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -237,6 +237,8 @@ class CurrentMap:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
             self.scene.moved(np.array(tried.without, np.intp))
+            rows = selection.keyframes, selection.landmarks, selection.origin
+            old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}

@@ -25,6 +25,15 @@ class WindowConfig:
         within=(0, 100_000),
         tune=Tune(0, 40, ("accuracy", "latency"), log=False),
     )
+    old_keyframes: str = option(
+        "fix",
+        "What becomes of keyframes that leave the window. See docs/concepts.md.",
+        choices=(
+            Choice("fix", "those that see the window's points take part with fixed poses"),
+            Choice("marginalise", "what they tell of those that stay becomes a prior"),
+            Choice("drop", "they take no part"),
+        ),
+    )
     max_landmarks: int = option(
         5000,
         "Points in a solve; beyond it those with the fewest observations are left out.",

@@ -22,6 +22,7 @@ each kind of factor):
 
     v = psi^2 / (1 - h d)^2 - kappa d^2 h,    kappa = sum psi^2/(1 - h d)^2 / sum d/(1 - h d)
 
+- for a marginal prior, which is made of pixels: that of the pixels;
 - for factors, which are few and may have another weight than they deserve: a component of variance for each kind
   (Helmert's, as in Foerstner, 1979), v_i = v d_i, so that the scores have the size that is expected of them::
 
@@ -60,7 +61,7 @@ from ba_node.config import SolverOptions
 from ba_node.core import geometry
 from ba_node.core.kernels import DENSE_LIMIT, Kernels
 from ba_node.core.problem import Problem, State
-from ba_node.core.rows import DEPTHS, GIVEN, PIXELS, Rows, rows_of
+from ba_node.core.rows import DEPTHS, GIVEN, MARGINAL, PIXELS, Rows, rows_of
 
 # Eigenvalues of S, scaled to a unit diagonal, that are rounding.
 _ROUNDING = 1e-11
@@ -122,11 +123,14 @@ def uncertainty_of_rows(rows: Rows, squared: bool, conditions: FloatArray) -> Un
     slope = np.maximum(rows.slope, 0.0)
     leverage = reduced.leverages(roots) * slope
     variance = np.zeros(len(rows))
-    for group in np.unique(rows.group[rows.group <= DEPTHS]):
+    for group in np.unique(rows.group[(rows.group <= DEPTHS) & (rows.group > MARGINAL)]):
         of = rows.group == group
         score = rows.weight[of] * rows.residual[of]
         make = _pooled if squared or group > PIXELS else _jackknifed
         variance[of] = slope[of] if group == GIVEN else make(score, slope[of], leverage[of])
+    pixels = rows.group == PIXELS
+    unit = float(variance[pixels].sum()) / max(float(slope[pixels].sum()), 1e-300)
+    variance = np.where(rows.group == MARGINAL, unit * slope, variance)
     _add_factors(reduced, roots, leverage, variance)
     return Uncertainty(reduced, variance, roots, loose)
 

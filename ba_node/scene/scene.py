@@ -49,6 +49,7 @@ class Scene(MapTables):
         self.next_cameras: Cameras | None = None
         self.refused_rig = ""  # why the last rig that was refused was, empty if none was
         self.log = RejectionLog()  # what was turned away
+        self.memory: object | None = None  # what windows know of keyframes that left them, see window/old_keyframes.py
         self.pending: list[FeatureTracks] = []
         self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()

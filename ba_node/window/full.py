@@ -164,7 +164,8 @@ def take_snapshot(
     ``origin`` is the scene that the result is for where this one is a clone of it.
     """
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
-    selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
+    window = dataclasses.replace(config.window, old_keyframes="fix", **sizes)
+    selection = select(scene, dataclasses.replace(config, window=window))
     if isinstance(selection, str):
         return selection
     problem = selection.problem
@@ -246,7 +247,9 @@ def _join(scene: Scene, config: Config, later: int) -> None:
     if later == 0:
         return
     size = min(later + config.window.max_keyframes, _MAX_JOINED)
-    wide = dataclasses.replace(config.window, max_keyframes=size, max_fixed_keyframes=len(scene.keyframes))
+    wide = dataclasses.replace(
+        config.window, old_keyframes="fix", max_keyframes=size, max_fixed_keyframes=len(scene.keyframes)
+    )
     selection = select(scene, dataclasses.replace(config, window=wide))
     if not isinstance(selection, str):
         result = solver.solve(selection.problem, options(config.solver, max_iterations=config.solver.max_iterations))
