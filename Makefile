@@ -10,10 +10,10 @@ RUN := .venv/bin/python
 # Two at a time, grouped by tests/conftest.py.
 PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadgroup
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
-STYLED := $(CHECKED) examples
+STYLED := $(CHECKED) examples docs/conf.py
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
 
-.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness regress consistency lint format clean
+.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness regress consistency docs lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
@@ -59,6 +59,9 @@ consistency: setup ## compare errors with covariances in 200 runs of each of 27 
 
 regress: setup ## replay the shipped recordings and see that no figure is worse than in bags/regress.yaml
 	@$(RUN) -m ba_node.cli.main regress bags/regress.yaml $(ARGS)
+
+docs: setup ## build the documentation as a site into out/docs; any warning is an error (Python 3.11 or later)
+	@$(RUN) -m sphinx -W --keep-going -q -b html docs out/docs $(ARGS)
 
 lint: setup ## check style and types
 	@$(RUN) -m ruff check $(STYLED)

@@ -219,11 +219,11 @@ class Backend:
         if not why:
             begun = self.begin_optimization()
             if isinstance(begun, str):
-                why = begun
-            else:
-                begun.solve(self.config.solver)
-                merged = self.merge(begun)
-                why = self.refusal or ("" if merged else "nothing came of a solve of everything")
+                self.map.correct(int(self.scene.order[-1]))
+                return self.estimate()  # no images to refine it by
+            begun.solve(self.config.solver)
+            merged = self.merge(begun)
+            why = self.refusal or ("" if merged else "nothing came of a solve of everything")
         if why:
             self.scene.restore(before)
             self.scene.log.warn("not_adjusted", f"{what.cause}; the map stays as it is: {why}")
@@ -324,6 +324,7 @@ class Backend:
             return None
         self.solve_count += 1
         newest = int(self.scene.order[-1])
+        self.map.adjustments += 1
         statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)

@@ -23,7 +23,7 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
-from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform
+from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
 from ba_node.window import full, old_keyframes, quality, view
@@ -92,6 +92,7 @@ class CurrentMap:
         report: of the last solve.
         correction: map from odom.
         calibration: what solves of everything found of the cameras, against those that came; None if not asked for.
+        adjustments: how often a solve of everything went into it.
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
@@ -100,6 +101,7 @@ class CurrentMap:
         self.report = SolveReport(reason="not solved yet")
         self.correction = MapCorrection()
         self.calibration: Calibration | None = None
+        self.adjustments = 0
         self._trust = Trust()
 
     @property
@@ -287,6 +289,8 @@ class CurrentMap:
             method=self.config.solver.method,
             rejected=dict(sorted(self.rejected.items())),
             warnings=self.warnings,
+            adjustments=self.adjustments,
+            merged_tracks=len(self.scene.constraints.renamed),
         )
 
     def rms_px(self, state: str = "refined") -> float:
@@ -309,6 +313,7 @@ class CurrentMap:
             cloud=MapCloud.taken(scene),
             report=self.report,
             correction=self._published(),
+            world=self.world(),
             map_index=self.index,
         )
 
@@ -326,6 +331,14 @@ class CurrentMap:
         poses = _rows_by_id(estimate.refined.keyframe_id, taken.keyframe_id, found.poses)
         points = None if found.points is None else _rows_by_id(estimate.cloud.track_id, taken.track_id, found.points)
         return dataclasses.replace(estimate, covariance=poses, point_covariance=points)
+
+    def world(self) -> World | None:
+        """Return where the map lies in the world, None if that is not known."""
+        known = self.scene.constraints
+        if known.map_from_world is None:
+            return None
+        rotation, translation = geometry.inverse(*known.map_from_world)
+        return World(known.world_frame, translation, geometry.quaternion_from_matrix(rotation), known.origin)
 
     def _published(self) -> Correction | None:
         transform = self.correction.published

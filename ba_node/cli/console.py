@@ -158,6 +158,13 @@ def add_fleet_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def say_left_out(left_out: Mapping[str, str]) -> int:
+    """Name the recordings that could not be used, and why; return the exit code."""
+    for name, words in left_out.items():
+        print(f"ba: error: {words if name in words else f'{name}: {words}'}", file=sys.stderr)
+    return 3 if left_out else 0
+
+
 def parameters(args: argparse.Namespace) -> Config:
     """Return all parameters, with what these options change."""
     from ba_node.config import parse_assignment  # noqa: PLC0415

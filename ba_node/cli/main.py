@@ -24,6 +24,10 @@ from ba_node.cli.console import add_json_option, conclude, json_alone, require_f
 
 # Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
 GROUPS: dict[str, tuple[str, ...]] = {
+    "from images": (
+        "run",
+        "track",
+    ),
     "refine": (
         "replay",
         "tune",

@@ -3,10 +3,10 @@
 """Solve a BAL file (.txt, .bz2, .gz), a scene of Bundler (.out) or a model of COLMAP (a folder) as a whole.
 
 BAL ("Bundle Adjustment in the Large") and Bundler: poses, points and each camera's f, k1, k2 are free. The defaults are
-those of the method: squared loss for local_dinm, points behind a camera keep their residual, as the published results
-count. COLMAP: poses, points, and what --refine names of the cameras, which stay shared as they are in the model; method
-auto, and points that are behind their camera at the start are left out, as COLMAP does. Parameters of the node
-(solver.*) and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
+those of the method: squared loss but for irls_*, points behind a camera keep their residual, as the published results
+count. COLMAP: poses, points, and what --refine names of the cameras, which stay shared as they are in the model; points
+that are behind their camera at the start are left out, as COLMAP does. Parameters of the node (solver.*) and
+options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
 
 Exit code: 0 all is well, 2 nothing came of it, 3 the result has to be looked at: it is worse than the start, focal
 lengths are not positive, or many points lie behind their cameras.
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "solve a BAL, Bundler or COLMAP problem as a whole"
 EXAMPLE = (
-    "ba solve problem-49-7776-pre.txt.bz2 --method local_dinm --iterations 50 --json trace.json\n"
+    "ba solve problem-49-7776-pre.txt.bz2 --iterations 50 --json trace.json\n"
     "  ba solve sparse/0 --out refined --refine focal distortion"
 )
 # Nothing came of it; something came of it that has to be looked at.
@@ -51,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problem", type=Path, metavar="PROBLEM")
     parser.add_argument(
         "--method",
-        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: local_dinm,"
-        " for COLMAP auto)",
+        default="auto",
+        help=f"one of {', '.join(options['method'].choices)}; see docs/methods.md (default: auto)",
     )
     parser.add_argument(
         "--iterations", type=int, metavar="N", help=f"{iterations.doc} (default: the method's, {iterations.default})"
@@ -117,10 +117,12 @@ def _solved(args: argparse.Namespace) -> Solution | ModelSolution:
     if not args.problem.is_dir():
         if args.refine:
             raise ConfigError("--refine is for models of COLMAP: BAL and Bundler have f, k1, k2 of each image free")
-        options = solver_options(args.method or "local_dinm", assignments)
+        options = solver_options(args.method, assignments)
         return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
-    options = solver_options(args.method or "auto", [*_OF_MODELS, *assignments])
     groups = [group for group in args.refine or DEFAULT_GROUPS if group != "none"]
+    # Cameras are refined without a region, which the default has; a method that is asked for by name is not changed.
+    own = [*_OF_MODELS, "trust_region=none"] if groups and args.method == "auto" else _OF_MODELS
+    options = solver_options(args.method, [*own, *assignments])
     return solve_model(args.problem, options, groups, clock=time.perf_counter, on_iteration=_show)
 
 

@@ -17,8 +17,10 @@ from ba_node.cli.console import (
     add_topic_options,
     parameters,
     progress_bar,
+    say_left_out,
     table,
     topic_choice,
+    write_result,
 )
 
 SUMMARY = "try every combination of some values of parameters on recordings"
@@ -48,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.batch import recordings  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet  # noqa: PLC0415
     from ba_node.offline.page import PageError  # noqa: PLC0415
+    from ba_node.offline.study import Plan  # noqa: PLC0415
 
     base = parameters(args)
     values = {}
@@ -55,12 +58,12 @@ def run(args: argparse.Namespace) -> int:
         name, listed = split_assignment(text, "window.max_keyframes=5,10,20")
         parameter = find(name)
         values[parameter.name] = [parameter.read(one.strip()) for one in listed.split(",")]
-    plan = tuning.Plan(
+    plan = Plan(
         tuple(recordings(args.bag, each=args.each)), None, (), objective=args.objective, topics=topic_choice(args)
     )
     args.out.mkdir(parents=True, exist_ok=True)
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("sweep", "replays") as progress:
-        found = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
+        found, left_out = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
     print(table(*tuning_page.sweep_rows(found)))
     names = "sweep.csv, sweep.json, index.html"
     try:
@@ -68,4 +71,5 @@ def run(args: argparse.Namespace) -> int:
     except PageError as error:
         names = f"sweep.csv, sweep.json; {error}"
     print(f"written to {args.out}: {names}")
-    return 0
+    write_result(args.json, tuning_page.sweep_as_dict(found))
+    return say_left_out(left_out)

@@ -3,15 +3,17 @@
 """Search for better parameters on recordings.
 
 What counts is the error of the trajectory where a recording has ground_truth/pose, else the residuals of tracks that
-are held out of it. Of several recordings the last one is kept for validation: it takes no part in the search, and shows
-whether what was found is better on others too. The search begins with --params and --set; what it has found is kept in
-DIR/trials.log as it comes, and the same command goes on from there, with more --trials where it was done.
+are held out of it. Of several recordings the last one is kept for validation: it takes no part in the search, decides
+between the ten best trials, and shows whether what was found is better on others too. The search begins with --params
+and --set; what it has found is kept in DIR/trials.log as it comes, and the same command goes on from there, with more
+--trials where it was done.
 
 Writes into DIR: tuned.yaml, ready for --params and for the node; tuning.json; index.html, a page with all trials.
 
     ba tune --apply /ba_node --out out/tune     # sets what was found on a running node
 
-Exit code: 0 better parameters were found, 3 nothing better was, or they are worse on the recording for validation.
+Exit code: 0 better parameters were found, 3 nothing better was, they are worse on the recording for validation, or a
+recording could not be used, which is named and stops no other.
 """
 
 from __future__ import annotations
@@ -29,12 +31,15 @@ from ba_node.cli.console import (
     parameters,
     progress_bar,
     require_folder,
+    say_left_out,
     table,
     topic_choice,
+    write_result,
 )
 
 if TYPE_CHECKING:
-    from ba_node.offline.tuning import Plan, Trial, Tuned
+    from ba_node.offline.study import Plan, Trial
+    from ba_node.offline.tuning import Tuned
 
 SUMMARY = "search for better parameters on recordings"
 EXAMPLE = "ba tune bags/*.mcap --out out/tune --preset accuracy --trials 50 --jobs 2"
@@ -121,12 +126,14 @@ def _tune(args: argparse.Namespace) -> int:
     except PageError as error:
         names = f"tuned.yaml, tuning.json; {error}"
     print(f"written to {args.out}: {names}")
-    return _verdict(tuned)
+    write_result(args.json, tuning_page.tuned_as_dict(tuned))
+    return max(say_left_out(tuned.left_out), _verdict(tuned))
 
 
 def _plan(args: argparse.Namespace) -> Plan:
     from ba_node.offline.batch import recordings  # noqa: PLC0415
-    from ba_node.offline.tuning import Plan, TuneError, chosen, preset  # noqa: PLC0415
+    from ba_node.offline.study import Plan, TuneError  # noqa: PLC0415
+    from ba_node.offline.tuning import chosen, preset  # noqa: PLC0415
 
     found = recordings(args.bag, each=args.each)
     validation = None

@@ -36,9 +36,11 @@ from ba_node.config.estimation import (
     WindowConfig,
 )
 from ba_node.config.node import DiagnosticsConfig, FramesConfig, NodeConfig, OutputConfig
-from ba_node.config.solver import SolverConfig, SolverOptions
+from ba_node.config.solver import METHOD_LOSSES, PLATEAUS, SolverConfig, SolverOptions
 
 __all__ = [
+    "METHOD_LOSSES",
+    "PLATEAUS",
     "CalibrationConfig",
     "Checked",
     "Choice",
@@ -124,10 +126,11 @@ class Config:
                     f"parameter frames.{name} = {frame!r}: tf2 refuses a name that begins with a slash;"
                     f" take {frame.lstrip('/')!r}"
                 )
-        if self.solver.method.startswith("irls_") and self.solver.loss == "squared":
+        own = METHOD_LOSSES.get(self.solver.method)
+        if own is not None and self.solver.loss not in ("auto", own):
             raise ConfigError(
-                f"parameter solver.loss = 'squared': method {self.solver.method!r} reweights residuals, which the"
-                f" squared loss leaves alone; choose another loss or another method"
+                f"parameter solver.loss = {self.solver.loss!r}: method {self.solver.method!r} is named after the loss"
+                f" {own!r}; leave solver.loss at 'auto', or take method 'local_dinm', which has any"
             )
 
 

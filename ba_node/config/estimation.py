@@ -50,6 +50,11 @@ class SceneConfig:
     max_landmarks: int = option(
         500_000, "Tracks kept; beyond it those seen longest ago are forgotten.", within=(100, 100_000_000)
     )
+    max_observations: int = option(
+        20_000_000,
+        "Observations kept (40 bytes each); beyond it the oldest keyframes are forgotten.",
+        within=(1000, 1_000_000_000),
+    )
     max_reorder_s: float = option(
         10.0,
         "Keyframes whose stamps are further than this before the newest begin a new session, as when the clock is set"

@@ -51,6 +51,20 @@ class FrontEndOptions(Checked):
         unit="s",
         within=(0.0, 1.0),
     )
+    stereo_align: bool = option(
+        True,
+        "Learn from the images how the second camera is turned against the rig (a tenth of a degree is a pixel of"
+        " disparity), and correct what it sees by that.",
+    )
+    stereo_yaw_px: float = option(
+        0.0, "What to begin with: all disparities are too small by this.", unit="px", within=(-20.0, 20.0)
+    )
+    stereo_roll_px: float = option(
+        0.0,
+        "Likewise, times the distance below the image's centre by the focal length.",
+        unit="px",
+        within=(-20.0, 20.0),
+    )
     min_depth_m: float = option(0.2, "Points nearer than this are not taken.", unit="m", within=(1e-3, 1e3))
     max_depth_m: float = option(
         0.0, "Depths of a depth camera beyond this are not taken; 0 takes all.", unit="m", within=(0.0, 1e4)

@@ -16,9 +16,10 @@ _INC = "D = 1/step, the steps of the search for the best forward differences"
 
 # Named methods. What each chooses stands in core/methods.py.
 METHODS = (
-    Choice("auto", "the node's default: Marquardt steps by the cheapest linear solver, and points that follow each"),
+    Choice("auto", "the default: local_irls"),
     Choice("lma_cd", "Levenberg-Marquardt with Cholesky decomposition, a baseline", "3.2.2, 3.2.3"),
-    Choice("bal", "Levenberg-Marquardt with PCG and M = B, a baseline (Agarwal et al. 2010)", "3.2.3"),
+    Choice("bal", "Levenberg-Marquardt with PCG and M = B to the letter, a baseline (Agarwal et al. 2010)", "Alg. 7"),
+    Choice("bal_scaled", "bal with PCG in units of the root of diag(H), and M of the matrix on which it works"),
     Choice("inm", "inexact Newton: a scaled region, no damping", "Alg. 5"),
     Choice("tnm", "truncated Newton: damping, no region", "Alg. 7, 8"),
     Choice("dinm", "damped inexact Newton: damping and a scaled region", "Alg. 9"),
@@ -26,7 +27,14 @@ METHODS = (
     Choice("local_dinm", "dinm with local parameterisation", "4.2"),
     Choice("irls_huber", "local_dinm with Huber's loss", "Alg. 11, 4.21"),
     Choice("irls_tq", "local_dinm with a truncated quadratic, led up to by graduated non-convexity", "Alg. 11, 4.22"),
+    Choice(
+        "local_irls",
+        "local DINM/IRLS with Marquardt's damping, inner iterations, and exact steps where they cost less",
+        "4.2, Alg. 11",
+    ),
 )
+# The losses of the methods that are named after theirs.
+METHOD_LOSSES = {"irls_huber": "huber", "irls_tq": "truncated_quadratic"}
 # The functions are those of core/loss.py.
 LOSSES = (
     Choice("squared", "Psi = x^2, w = 1", "2.26"),
@@ -35,6 +43,8 @@ LOSSES = (
     Choice("cauchy", "Psi = c^2 log(1 + x^2/c^2); w = 1/(1 + x^2/c^2)"),
     Choice("geman_mcclure", "Psi = x^2/(1 + x^2/c^2); w = 1/(1 + x^2/c^2)^2"),
 )
+# Losses that pull at next to nothing far out, and have to be led up to (core/annealing.py).
+PLATEAUS = ("truncated_quadratic", "geman_mcclure")
 
 
 @dataclass(frozen=True)
@@ -44,9 +54,11 @@ class SolverConfig:
     method: str = option("auto", "Named method. See docs/methods.md.", choices=METHODS, node={})
     linear_solver: str = option(
         "auto",
-        "How the reduced system S p = rhs is solved. Methods with a trust region always take pcg.",
+        "How the reduced system S p = rhs is solved; an exact step that leaves the trust region is cut off by pcg.",
         choices=(
-            Choice("auto", "pcg with a region, else what costs least by the structure of the problem"),
+            Choice(
+                "auto", "the method's own, that of local_irls being what costs least by the structure of the problem"
+            ),
             Choice("cholesky", "exactly: dense or sparse, whichever costs less", "3.2.2", ("cd",)),
             Choice("dense", "exactly: S as a whole, LAPACK's Cholesky"),
             Choice("sparse", "exactly: S by blocks, sparse Cholesky"),
@@ -105,8 +117,12 @@ class SolverConfig:
         1e-6,
         "Stop when an accepted step lowers the objective by less than this share.",
         within=(0.0, 1.0),
-        node={"default": 1e-3},
-        tune=Tune(1e-6, 1e-1, ("accuracy", "latency")),
+        node={
+            "default": -1.0,
+            "minimum": -1.0,
+            "doc": "Stop when an accepted step lowers the objective by less than this share; -1: 1e-3 of local_irls"
+            " (auto), 1e-5 of all others, whose first steps are small.",
+        },
     )
     gradient_tolerance: float = option(
         1e-9, "Stop when the norm of the gradient falls below this.", within=(0.0, 1e12), node={}
@@ -135,12 +151,22 @@ class SolverOptions(SolverConfig):
             Choice("global", "phi <- phi + dphi, t <- t + dt, on the rotation vector", "3.26-3.28"),
         ),
     )
+    loss_per: str = option(
+        "observation",
+        "Of what the loss is taken.",
+        choices=(
+            Choice("observation", "of the norm of an observation's residual: both rows share its weight"),
+            Choice("component", "of u and of v by itself, each with a weight of its own", "4.20"),
+        ),
+    )
     annealing: str = option(
         "none",
         "How a loss with a plateau is led up to.",
         choices=(
             Choice("none", "the loss itself from the start"),
-            Choice("gnc", "graduated non-convexity: surrogates of the truncated quadratic, one step for each"),
+            Choice(
+                "gnc", "Huber's loss first, then, for the truncated quadratic, graduated non-convexity, a step each"
+            ),
         ),
     )
     damping: str = option(
@@ -203,6 +229,9 @@ class SolverOptions(SolverConfig):
             Choice("b_block", "blocks of B (of C where cameras are eliminated), damped", "Table 3.9", ("b",)),
             Choice("schur_diag", "diagonal of S", "Table 3.9"),
             Choice("b_diag", "diagonal of B (of C where cameras are eliminated), damped", "Table 3.9"),
+            Choice(
+                "b_literal", "B as it stands, while PCG works on D^-1 S D^-1 with D = diag(H), not its root", "Alg. 7"
+            ),
         ),
     )
     inner_iterations: int = option(
@@ -233,15 +262,10 @@ class SolverOptions(SolverConfig):
                 f"loss = {self.loss} with loss_scale_px = {self.loss_scale_px}: a robust loss needs the residual, in"
                 " sigmas, where it leaves the square; set loss_scale_px to a number > 0"
             )
-        if self.trust_region != "none" and self.linear_solver not in ("auto", "pcg"):
+        if self.annealing == "gnc" and self.loss not in PLATEAUS:
             raise ConfigError(
-                f"trust_region = {self.trust_region} with linear_solver = {self.linear_solver}: only pcg"
-                " stops at the boundary of a region; take linear_solver = pcg or trust_region = none"
-            )
-        if self.annealing == "gnc" and self.loss != "truncated_quadratic":
-            raise ConfigError(
-                f"annealing = gnc with loss = {self.loss}: the surrogates are those of the truncated quadratic; take"
-                " loss = truncated_quadratic or annealing = none"
+                f"annealing = gnc with loss = {self.loss}: it leads up to a loss with a plateau; take"
+                f" loss = {' or '.join(PLATEAUS)}, or annealing = none"
             )
 
 

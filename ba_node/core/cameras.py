@@ -219,7 +219,7 @@ def rays(uv: FloatArray, model: ModelArray, params: FloatArray) -> FloatArray:
     """
     fisheye = model == Model.EQUIDISTANT
     out = np.ones((len(uv), 3))
-    straight = ~fisheye
+    straight = ~fisheye if fisheye.any() else slice(None)
     out[straight, :2] = _undistort(uv[straight], params[straight])
     out[straight] /= np.linalg.norm(out[straight], axis=1)[:, None]
     if fisheye.any():

@@ -13,6 +13,8 @@ convex for a small graduation mu and the loss itself for mu without end::
     Psi_mu(x) = x^2                                             x^2 <= mu/(mu + 1) c^2
               = 2 c x sqrt(mu (mu + 1)) - mu (c^2 + x^2)        between
               = c^2                                             x^2 >= (mu + 1)/mu c^2
+
+Before them Huber's loss of the same scale, which is convex, stands in for a loss with a plateau.
 """
 
 from __future__ import annotations
@@ -24,6 +26,9 @@ import numpy as np
 from ba_node.arrays import FloatArray
 
 CostAndWeight = tuple[FloatArray, FloatArray]
+
+# The graduation for which Huber's loss stands in.
+HUBER = 0.0
 
 
 def _squared(norm: FloatArray, _scale: float) -> CostAndWeight:
@@ -62,8 +67,8 @@ LOSSES: dict[str, Callable[[FloatArray, float], CostAndWeight]] = {
 def evaluate(loss: str, norm: FloatArray, scale: float, graduation: float = np.inf) -> CostAndWeight:
     """Return the cost and the IRLS weight of residuals, of norm (n,), for one of LOSSES.
 
-    The loss leaves the square at ``scale``. ``graduation`` is mu of the surrogate of a truncated quadratic; infinite
-    for the loss itself.
+    The loss leaves the square at ``scale``. ``graduation`` is mu of the surrogate of a truncated quadratic, HUBER for
+    Huber's loss in the place of any; infinite for the loss itself.
 
     Returns:
         (n,) Psi and (n,) weights in [0, 1].
@@ -73,6 +78,8 @@ def evaluate(loss: str, norm: FloatArray, scale: float, graduation: float = np.i
     """
     if loss not in LOSSES:
         raise ValueError(f"loss {loss!r} does not exist: choose one of {', '.join(LOSSES)}")
+    if graduation == HUBER:
+        return _huber(norm, scale)
     if loss == "truncated_quadratic" and np.isfinite(graduation):
         return _surrogate(norm, scale, graduation)
     return LOSSES[loss](norm, scale)

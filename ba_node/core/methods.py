@@ -7,7 +7,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-from ba_node.config import SolverConfig, SolverOptions
+from ba_node.config import PLATEAUS, SolverConfig, SolverOptions
+
+# What "auto" stands for.
+DEFAULT = "local_irls"
 
 # What the methods of the thesis have in common. They stop by |g| or the objective alone, so function_tolerance is 0.
 _THESIS = SolverOptions(
@@ -24,8 +27,9 @@ _THESIS = SolverOptions(
     function_tolerance=0.0,
 )
 _LMA_CD = dataclasses.replace(_THESIS, damping="identity", linear_solver="cholesky")
-_BAL = dataclasses.replace(_THESIS, damping="diag", preconditioner="b_block", initial_damping=1e-4)
-_INM = dataclasses.replace(_THESIS, trust_region="inc")
+_BAL = dataclasses.replace(_THESIS, damping="diag", preconditioner="b_literal", initial_damping=1e-4)
+# With 1 a point far away jumps through a camera's plane in the first step, and whether anything follows is rounding.
+_INM = dataclasses.replace(_THESIS, trust_region="inc", initial_radius=0.01)
 _TNM = dataclasses.replace(_THESIS, damping="inc")
 _DINM = dataclasses.replace(_THESIS, damping="identity", trust_region="inc")
 # S on the side of the points is too badly conditioned for PCG alone: its blocks differ as the points' distances do.
@@ -37,12 +41,17 @@ _LOCAL = dataclasses.replace(_DINM, parameterisation="local")
 # Where damping alone holds points back, the gradient falls with mu: a tenth of it is two steps gained.
 _LOCAL_DINM = dataclasses.replace(_LOCAL, initial_damping=1.0)
 _HUBER = dataclasses.replace(_LOCAL, loss="huber")
-_TQ = dataclasses.replace(_LOCAL, loss="truncated_quadratic", annealing="gnc")
+# Without M most of its few iterations at each level are spent on what PCG has not reached.
+_TQ = dataclasses.replace(_LOCAL, loss="truncated_quadratic", annealing="gnc", preconditioner="schur_block")
+
+# Local DINM/IRLS as a window wants it: D of damping and region is Marquardt's, which has no unit, so that nothing needs
+# to be known of the scene; what costs less is solved exactly, the limit t_eps -> 0; points follow each step.
+_LOCAL_IRLS = SolverOptions(trust_region="diag", q_eps=0.1)
 
 _CHOICES = {
-    "auto": SolverOptions(q_eps=0.1),
     "lma_cd": _LMA_CD,
     "bal": _BAL,
+    "bal_scaled": dataclasses.replace(_BAL, preconditioner="b_block"),
     "inm": _INM,
     "tnm": _TNM,
     "dinm": _DINM,
@@ -50,10 +59,15 @@ _CHOICES = {
     "local_dinm": _LOCAL_DINM,
     "irls_huber": _HUBER,
     "irls_tq": _TQ,
+    DEFAULT: _LOCAL_IRLS,
 }
 METHODS: dict[str, SolverOptions] = {
     name: dataclasses.replace(options, method=name) for name, options in _CHOICES.items()
 }
+METHODS = {"auto": METHODS[DEFAULT], **METHODS}
+# Where a window's solve may stop, unless the parameters say; that of other methods than the default later, as their
+# damping falls from large values, and a first step that gains little says nothing.
+_QUICK, _PATIENT = 1e-3, 1e-5
 
 
 def options(name: str) -> SolverOptions:
@@ -71,9 +85,11 @@ def options(name: str) -> SolverOptions:
 def from_config(config: SolverConfig) -> SolverOptions:
     """Return what the parameters ``solver.*`` ask for, and what their method chooses where they leave it open."""
     method = options(config.method)
-    chosen = dataclasses.replace(method, **dataclasses.asdict(config))
-    if config.linear_solver == "auto" or method.trust_region != "none":
-        chosen = dataclasses.replace(chosen, linear_solver=method.linear_solver)
+    changes = dataclasses.asdict(config) | {"method": method.method}
+    if config.linear_solver == "auto" or method.linear_solver == "pcg":
+        changes["linear_solver"] = method.linear_solver
     if config.loss == "auto":
-        chosen = dataclasses.replace(chosen, loss=method.loss if method.loss != "squared" else "cauchy")
-    return chosen if chosen.loss == method.loss else dataclasses.replace(chosen, annealing="none")
+        changes["loss"] = method.loss if method.loss != "squared" else "cauchy"
+    if config.function_tolerance < 0.0:
+        changes["function_tolerance"] = _QUICK if method.method == DEFAULT else _PATIENT
+    return dataclasses.replace(method, **changes, annealing="gnc" if changes["loss"] in PLATEAUS else "none")

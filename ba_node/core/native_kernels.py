@@ -51,6 +51,10 @@ def missing(options: SolverOptions) -> str:
     reason = native.missing(options.parameterisation, options.loss)
     if not reason and options.schur != "points":
         return f"the C++ kernels eliminate points only, not schur = {options.schur}"
+    if not reason and options.loss_per != "observation":
+        return f"the C++ kernels weigh observations, not loss_per = {options.loss_per}"
+    if not reason and options.preconditioner == "b_literal":
+        return "the C++ kernels have no preconditioner = b_literal"
     return reason
 
 

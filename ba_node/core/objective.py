@@ -255,26 +255,28 @@ class Objective:
         return residual
 
     def _costs(self, residual: FloatArray, masked: IntArray, of: _Observed) -> tuple[FloatArray, FloatArray]:
-        """Return Psi of each observation and the square root of the weight of each row, (n, 1) or (n, 3)."""
-        norm = np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)
-        cost, weight = self._loss(norm)
+        """Return Psi of each observation and the square root of the weight of each row, (n, 1), (n, 2) or (n, 3)."""
+        by_component = self.options.loss_per == "component"
+        norm = np.abs(residual[:, :2]) if by_component else np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)[:, None]
+        costs, weight = self._loss(norm)
+        cost = costs.sum(axis=1)
         if self.options.cheirality != "keep" and len(masked):
             behind, _ = self._loss(np.array([_BEHIND_NORM]))
             cost[masked] = behind[0]
         if len(of.ignored):
             cost[of.ignored] = 0.0
-        root = np.sqrt(weight)[:, None]
+        root = np.sqrt(weight)
         if self._has_depth:
             depth_cost, depth_weight = self._loss(np.abs(residual[:, 2]))
             cost += depth_cost
-            root = np.concatenate([root.T, root.T, np.sqrt(depth_weight)[None]]).T
+            root = np.concatenate([root.T[:1], root.T[-1:], np.sqrt(depth_weight)[None]]).T
         return cost, root
 
     def _loss(self, norm: FloatArray) -> tuple[FloatArray, FloatArray]:
         return loss.evaluate(self.options.loss, norm, self.options.loss_scale_px, self.graduation)
 
     def _row_scale(self, root_weight: FloatArray, of: _Observed) -> FloatArray:
-        """Return sqrt(weight) / sigma of each row, (n, 1 or 3)."""
+        """Return sqrt(weight) / sigma of each row, (n, 1, 2 or 3)."""
         scale = root_weight * of.weight[:, None]
         if self._has_depth:
             scale[:, 2] = root_weight[:, 2] * of.depth_weight

@@ -7,6 +7,9 @@ inside the trust region (Algorithm 4). In the scaled space ``x~ = D x`` (3.94-3.
 ``D^-1 S D^-1 x~ = D^-1 rhs``; the region, the residual that ends PCG, and the preconditioner all live there. Without a
 region D is that of the damping (Algorithm 7).
 
+An exact solution is the limit of PCG for t_eps -> 0: it stands if it lies inside the region; if not, PCG goes to the
+boundary, as it would have for any t_eps that small.
+
 Where a step of PCG costs next to nothing beside an exact solution, PCG is tried first, as long as it gets there.
 """
 
@@ -47,48 +50,60 @@ class ReducedSolver:
         if self._tries is None:
             self._tries = self._worth_trying(system)
         if self._tries:
-            found = self._try(system, hessian, self._tries)
+            found = self._try(system, hessian, self._tries, radius)
             if found.iterations < self._tries:
                 return found
             self._tries = 0
         if not self.kind:
             self._choose(system)
-        if self.kind == "dense":
-            return linear.Solution(system.solve_dense())
-        if self.kind == "sparse":
-            x = system.solve_sparse()
-            return linear.Solution(x if x is not None and np.isfinite(x).all() else None)
-        options = self._options
+        options, t_eps, q_eps = self._options, self._options.t_eps, self._options.q_eps
         radius *= system.radius_factor
-        limits = linear.PcgLimits(options.t_eps, options.max_linear_iterations, radius, options.q_eps)
+        if self.kind != "pcg":
+            x = system.solve_dense() if self.kind == "dense" else system.solve_sparse()
+            if x is None or not np.isfinite(x).all():
+                return linear.Solution(None)
+            if not self._outside(x, system, hessian, radius):
+                return linear.Solution(x)
+            t_eps = q_eps = 0.0
+        limits = linear.PcgLimits(t_eps, options.max_linear_iterations, radius, q_eps)
         return self._pcg(system, hessian, limits, options.preconditioner, formed=len(system.rhs) <= DENSE_LIMIT)
+
+    def _outside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> bool:
+        """Return True if a step lies outside the region."""
+        if not np.isfinite(radius):
+            return False
+        d_c, d_p = hessian()
+        kind, by_points = self._options.scaled_space, system.side == "points"
+        # Nearly always so, and quickly seen: |D x| <= max(D) |x|.
+        if kind == "diag" and by_points and max(d_c.max(), 1.0) * (x @ x) <= radius * radius:
+            return False
+        scaled = system.gather(*scaling.scaled_space(kind, (d_c, d_p[:0] if by_points else d_p))) * x
+        return bool(scaled @ scaled > radius * radius)
 
     def _worth_trying(self, system: System) -> int:
         """Return how many steps of PCG to try before an exact solver."""
         options = self._options
-        tries = system.pcg_tries() if options.linear_solver == "auto" and options.trust_region == "none" else 0
+        tries = system.pcg_tries() if options.linear_solver == "auto" else 0
         if tries:
             self.text = f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
         return tries
 
-    def _try(self, system: System, hessian: Hessian, steps: int) -> linear.Solution:
+    def _try(self, system: System, hessian: Hessian, steps: int, radius: float) -> linear.Solution:
         """Solve by a few steps of PCG; if all of them were taken they did not get there.
 
         M is made of B: Z, of which the blocks of S are made, would cost as much as the steps that it saves.
         """
         t_eps, q_eps = (min(eps, _TRIED_EPS) for eps in (self._options.t_eps, self._options.q_eps))
-        return self._pcg(system, hessian, linear.PcgLimits(t_eps, steps, np.inf, q_eps), "b_block", formed=False)
+        return self._pcg(system, hessian, linear.PcgLimits(t_eps, steps, radius, q_eps), "b_block", formed=False)
 
     def _pcg(
         self, system: System, hessian: Hessian, limits: linear.PcgLimits, kind: str, *, formed: bool
     ) -> linear.Solution:
         """Solve by PCG with a preconditioner, in the scaled space."""
-        scale = 1.0 / system.gather(*scaling.scaled_space(self._options.scaled_space, hessian()))
+        d = scaling.scaled_space(self._options.scaled_space, hessian(), literal=kind == "b_literal")
+        scale = 1.0 / system.gather(*d)
         return system.solve_pcg(kind, scale, limits, formed=formed)
 
     def _choose(self, system: System) -> None:
         """Settle on a linear solver."""
-        asked = self._options.linear_solver
-        if asked == "auto" and self._options.trust_region != "none":
-            asked = "pcg"
-        self.kind, self.text = system.choose(asked)
+        self.kind, self.text = system.choose(self._options.linear_solver)

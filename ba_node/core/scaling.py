@@ -41,9 +41,14 @@ def diagonals(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatA
     return np.zeros_like(d_c), np.zeros_like(d_p)
 
 
-def scaled_space(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return D of ``p~ = D p`` (3.94-3.99), as :func:`diagonals`; the root of diag(H), and I for ``none``."""
+def scaled_space(
+    kind: str, hessian: tuple[FloatArray, FloatArray], *, literal: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Return D of ``p~ = D p`` (3.94-3.99), as :func:`diagonals`; the root of diag(H), and I for ``none``.
+
+    ``literal``: diag(H) itself, as Algorithm 7 has it.
+    """
     if kind == "none":
         kind = "identity"
     d_c, d_p = diagonals(kind, hessian)
-    return (np.sqrt(d_c), np.sqrt(d_p)) if kind == "diag" else (d_c, d_p)
+    return (np.sqrt(d_c), np.sqrt(d_p)) if kind == "diag" and not literal else (d_c, d_p)

@@ -84,7 +84,8 @@ def calibrate(
     """
     _require(problem, options)
     problem.check()
-    start = CalibratedState(**vars(problem.start), cameras=problem.cameras)
+    at = problem.start
+    start = CalibratedState(at.rotation, at.translation, at.points, at.intrinsics, problem.cameras)
     problem = replace(problem, start=start)
     with np.errstate(all="ignore"):
         kernels = CalibrationKernels(problem, options, unknowns)
@@ -100,7 +101,7 @@ def _require(problem: Problem, options: SolverOptions) -> None:
         ("annealing", options.annealing, "none"),
     ):
         if has != needs:
-            raise ConfigError(f"{name} = {has}: cameras are refined with {name} = {needs} alone, as by method auto")
+            raise ConfigError(f"{name} = {has}: cameras are refined with {name} = {needs} alone: set it so")
     if options.linear_solver == "pcg" or options.kernels == "native":
         raise ConfigError(
             "cameras are refined by Cholesky and the numpy kernels: take linear_solver and kernels = auto"

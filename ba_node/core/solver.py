@@ -158,7 +158,7 @@ class _Run:
         assert self.annealing is not None
         if accepted:
             self.annealing.see(self.state)
-        if not self.annealing.advance(self.rejected):
+        if not self.annealing.advance(self.rejected, self.state):
             return
         self.rejected = 0
         self._graduate()
@@ -169,7 +169,7 @@ class _Run:
             self.kernels.linearise(self.state)
 
     def _graduate(self) -> None:
-        """Let the kernels work with the present surrogate; those in C++ have no truncated quadratic."""
+        """Let the kernels work with the present surrogate; those in C++ have no loss with a plateau."""
         assert self.annealing is not None and isinstance(self.kernels, NumpyKernels)
         self.kernels.graduate(self.annealing.graduation)
 

@@ -64,29 +64,26 @@ class Triangulation:
 def rays_of(problem: Problem) -> Rays:
     """Return the rays of all observations of a problem at its start poses."""
     obs, cams = problem.observations, problem.cameras
-    rotation_cb, rotation = cams.rotation[obs.camera], problem.start.rotation[obs.keyframe]
     # Camera centre: x with R x + t = -Rc' tc.
-    body_centre = -(np.swapaxes(rotation_cb, -1, -2) @ cams.translation[obs.camera][:, :, None])[..., 0]
-    world_from_body = np.swapaxes(rotation, -1, -2)
-    centre = (world_from_body @ (body_centre - problem.start.translation[obs.keyframe])[:, :, None])[..., 0]
-    params = cams.params[obs.camera]
-    ray = cameras.rays(obs.uv, cams.model[obs.camera], params)
-    direction = (world_from_body @ (np.swapaxes(rotation_cb, -1, -2) @ ray[:, :, None]))[..., 0]
+    turn, n_cam = np.swapaxes(cams.rotation, -1, -2), len(cams.model)
+    body_centre = -(turn @ cams.translation[:, :, None])[..., 0]
+    world_from_body = np.swapaxes(problem.start.rotation, -1, -2)
+    of_image = body_centre - problem.start.translation[:, None, :]
+    centres = (world_from_body[:, None] @ of_image[..., None]).reshape(-1, 3)
+    centre = centres.take(obs.keyframe * n_cam + obs.camera, axis=0)
+    params = cams.params.take(obs.camera, axis=0)
+    ray = cameras.rays(obs.uv, cams.model.take(obs.camera), params)
+    in_body = np.swapaxes(cams.rotation[obs.camera], -1, -2) @ ray[:, :, None]
+    direction = (np.swapaxes(problem.start.rotation[obs.keyframe], -1, -2) @ in_body)[..., 0]
     # A depth is along the axis: of a ray that is across it, or points back, it tells no distance.
     length = 1.0 / np.where(ray[:, 2] > _LEAST_COSINE, ray[:, 2], np.nan)
     focal = np.sqrt(params[:, cameras.FX] * params[:, cameras.FY])
     has_depth = len(obs.depth_m) > 0
     depth = obs.depth_m if has_depth else np.full(len(obs), np.nan)
     sigma = obs.depth_sigma_m if has_depth else np.full(len(obs), np.nan)
+    rays = Rays(obs.point, centre, direction, focal / obs.sigma_px, depth * length, sigma * length)
     good = np.isfinite(ray[:, 2])
-    return Rays(
-        obs.point[good],
-        centre[good],
-        direction[good],
-        (focal / obs.sigma_px)[good],
-        (depth * length)[good],
-        (sigma * length)[good],
-    )
+    return rays if good.all() else rays.part(good)
 
 
 def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulation:

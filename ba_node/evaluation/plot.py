@@ -70,26 +70,37 @@ def draw(target: Path | IO[bytes], comparison: Comparison) -> None:
 def _draw_site(
     axes: Any, comparison: Comparison, before: TrajectoryError | None, after: TrajectoryError | None
 ) -> None:
+    path = _aligned(comparison.after.position, after)
+    across, up = ground_axes(path)
     cloud = _aligned(comparison.cloud, after)
     if len(cloud):
-        axes.scatter(cloud[:, 0], cloud[:, 1], s=5.0, c=_CLOUD, alpha=0.7, linewidths=0, label="map", rasterized=True)
-    path = _aligned(comparison.after.position, after)
+        axes.scatter(
+            cloud[:, across], cloud[:, up], s=5.0, c=_CLOUD, alpha=0.7, linewidths=0, label="map", rasterized=True
+        )
     paths = [path]
     if comparison.before is not None:
         before_path = _aligned(comparison.before.position, before)
         paths.append(before_path)
-        axes.plot(before_path[:, 0], before_path[:, 1], ".--", color=_BEFORE, lw=1.3, ms=4.0, label="before")
+        axes.plot(before_path[:, across], before_path[:, up], ".--", color=_BEFORE, lw=1.3, ms=4.0, label="before")
     if comparison.truth is not None:
         truth = comparison.truth.position
         paths.append(truth)
-        axes.plot(truth[:, 0], truth[:, 1], "-", color=_TRUTH, lw=3.0, alpha=0.35, label="truth")
+        axes.plot(truth[:, across], truth[:, up], "-", color=_TRUTH, lw=3.0, alpha=0.35, label="truth")
     name = "estimate" if comparison.before is None else "after"
-    axes.plot(path[:, 0], path[:, 1], ".-", color=_AFTER, lw=1.3, ms=5.0, label=name)
+    axes.plot(path[:, across], path[:, up], ".-", color=_AFTER, lw=1.3, ms=5.0, label=name)
     axes.set_aspect("equal")
-    _frame_site(axes, np.concatenate(paths)[:, :2], cloud[:, :2])
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    _frame_site(axes, np.concatenate(paths)[:, [across, up]], cloud[:, [across, up]])
+    axes.set_xlabel(f"{'xyz'[across]} [m]")
+    axes.set_ylabel(f"{'xyz'[up]} [m]")
     axes.set_title("From above", fontsize=11)
+
+
+def ground_axes(path: FloatArray) -> tuple[int, int]:
+    """Return the two axes along which a path (n, 3) goes most: those of the ground, whatever the frame is."""
+    spread = np.ptp(path, axis=0) if len(path) else np.zeros(3)
+    # Of equal ones the first: z is up in most frames.
+    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
+    return first, second
 
 
 def _aligned(points: FloatArray, error: TrajectoryError | None) -> FloatArray:

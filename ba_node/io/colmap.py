@@ -9,6 +9,7 @@ pixel less. Rigs of several cameras stay rigs.
 from __future__ import annotations
 
 import importlib
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry
 from ba_node.core.problem import Cameras
+from ba_node.io.files import whole_file
 from ba_node.io.model import ModelError, Reconstruction, lens_values, read_lens, stamps
 
 _PARTS = ("cameras", "images", "points3D")
-# Of the binary files: bytes of a record before its list, and of an entry of that (0: only the least is known).
-_RECORDS = {"cameras": (24, 0), "images": (64, 24), "points3D": (43, 8), "rigs": (8, 0), "frames": (68, 0)}
+_FILES = (*_PARTS, "rigs", "frames")
+# What pycolmap raises, and what numbers lead to that make no sense.
+_DAMAGE = (ValueError, RuntimeError, IndexError, KeyError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -35,9 +38,13 @@ class ColmapModel:
     camera_ids: list[int]
     frame_ids: list[int]
     point_ids: list[int]
+    views: IntArray  # (l, 2) image, and number among its features, of each observation
 
-    def take(self, model: Reconstruction) -> None:
-        """Take over poses, points and cameras of a solution; all else, ids too, stays as it was read."""
+    def take(self, model: Reconstruction, left_out: BoolArray) -> None:
+        """Take over poses, points and cameras of a solution, and delete observations (l,) that took no part in it.
+
+        All else, ids too, stays as it was read. COLMAP deletes what is behind its camera before it adjusts.
+        """
         colmap = library()
         for id_, rotation, translation in zip(self.frame_ids, model.rotation, model.translation, strict=True):
             self.world.frames[id_].rig_from_world = _rigid(colmap, rotation, translation)
@@ -50,6 +57,9 @@ class ColmapModel:
                 if camera.sensor_id in rig.non_ref_sensors:
                     place = model.cameras.rotation[number], model.cameras.translation[number]
                     rig.set_sensor_from_rig(camera.sensor_id, _rigid(colmap, *place))
+        for image, feature in self.views[left_out].tolist():
+            if self.world.images[image].points2D[feature].has_point3D():
+                self.world.delete_observation(image, feature)
         self.world.update_point_3d_errors()
 
 
@@ -83,13 +93,19 @@ def read_colmap(path: Path) -> ColmapModel:
     if not is_model(path):
         raise ModelError(f"{path}: no model of COLMAP: expected {', '.join(_PARTS)} as .bin or .txt")
     colmap = library()
-    for part in (path / f"{name}.bin" for name in _RECORDS):
+    for part in (path / f"{name}.bin" for name in _FILES):
         if part.is_file():
             _require_whole(part)
     try:
-        world = colmap.Reconstruction(path)
-    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+        return _converted(path, colmap.Reconstruction(path))
+    except ModelError:
+        raise
+    except _DAMAGE as error:
         raise ModelError(f"{path}: cannot be read, the model is damaged: {' '.join(str(error).split())}") from None
+
+
+def _converted(path: Path, world: Any) -> ColmapModel:
+    """Return a model in our terms too."""
     camera_ids, point_ids = sorted(world.cameras), sorted(world.points3D)
     frame_ids = sorted(id_ for id_ in world.reg_frame_ids())
     cameras = [world.cameras[id_] for id_ in camera_ids]
@@ -99,6 +115,7 @@ def read_colmap(path: Path) -> ColmapModel:
     ]
     places = [_place(world, camera) for camera in cameras]
     poses = [world.frames[id_].rig_from_world for id_ in frame_ids]
+    frame, camera, point, uv, views = _observations(world, camera_ids, frame_ids, point_ids)
     model = Reconstruction(
         tuple(camera.model_name for camera in cameras),
         np.array([(camera.width, camera.height) for camera in cameras], np.intp).reshape(-1, 2),
@@ -112,47 +129,68 @@ def read_colmap(path: Path) -> ColmapModel:
         np.array([pose.translation for pose in poses]).reshape(-1, 3),
         np.array([world.points3D[id_].xyz for id_ in point_ids]).reshape(-1, 3),
         np.array([world.points3D[id_].color for id_ in point_ids], np.intp).reshape(-1, 3),
-        *_observations(world, camera_ids, frame_ids, point_ids),
+        frame,
+        camera,
+        point,
+        uv,
         stamps(len(frame_ids)),
     )
-    return ColmapModel(world, model, camera_ids, frame_ids, point_ids)
+    return ColmapModel(world, model, camera_ids, frame_ids, point_ids, views)
 
 
 def _require_whole(path: Path) -> None:
     """Raise ModelError if a binary file is shorter than what it claims: pycolmap goes on reading then, for hours."""
     data = path.read_bytes()
-    head, length = _RECORDS[path.stem]
     end, count = 8, int.from_bytes(data[:8], "little")
-    for number in range(count if count * head <= len(data) else 0):
-        end += head
-        if path.stem == "images":
-            end = data.find(b"\0", end) + 1 or len(data) + 1
-        if length:
-            end += 8 + length * int.from_bytes(data[end : end + 8], "little")
+    for number in range(min(count, len(data))):
+        end = _end_of_record(path.stem, data, end)
         if end > len(data):
             raise ModelError(f"{path}: cut off or damaged at record {number} of {count}")
-    if count * head > len(data) or len(data) < 8:
+    if count > len(data) or len(data) < 8:
         raise ModelError(f"{path}: cut off or damaged: {count} records in {len(data)} bytes")
+
+
+def _end_of_record(part: str, data: bytes, begin: int) -> int:
+    """Return where a record of a binary file ends; of a camera, whose parameters differ in number, the least."""
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], "little")
+
+    if part == "cameras":
+        return begin + 24
+    if part == "images":
+        name = data.find(b"\0", begin + 64) + 1 or len(data) + 1
+        return name + 8 + 24 * number(name, 8)
+    if part == "points3D":
+        return begin + 51 + 8 * number(begin + 43, 8)
+    if part == "frames":
+        return begin + 68 + 16 * number(begin + 64, 4)
+    end = begin + 8
+    for sensor in range(min(number(begin + 4, 4), len(data))):
+        end += 8 if sensor == 0 else 9 + 56 * number(end + 8, 1)
+    return end
 
 
 def _observations(
     world: Any, camera_ids: list[int], frame_ids: list[int], point_ids: list[int]
-) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Return frame, camera and point of each observation, and its pixel from the middle of the first one."""
+) -> tuple[IntArray, IntArray, IntArray, FloatArray, IntArray]:
+    """Return frame, camera and point of each observation, its pixel from the middle of the first, and its view."""
     camera_of, frame_of, point_of = (
         {id_: number for number, id_ in enumerate(ids)} for ids in (camera_ids, frame_ids, point_ids)
     )
-    frames, cameras, points, pixels = [], [], [], []
+    frames, cameras, points, pixels, views = [], [], [], [], [np.empty((0, 2), np.intp)]
     for id_ in sorted(world.reg_image_ids()):
         image = world.images[id_]
         seen = image.get_observation_points2D()
+        features = image.get_observation_point2D_idxs()
+        views.append(np.stack([np.full(len(seen), id_), np.array(features, np.intp)], axis=1))
         frames.append(np.full(len(seen), frame_of[image.frame_id]))
         cameras.append(np.full(len(seen), camera_of[image.camera_id]))
         points.append(np.array([point_of[point.point3D_id] for point in seen], np.intp))
         pixels.append(np.array([point.xy for point in seen]).reshape(-1, 2) - 0.5)
     none = [np.empty(0, np.intp)]
     index = [np.concatenate(part or none) for part in (frames, cameras, points)]
-    return index[0], index[1], index[2], np.concatenate([np.empty((0, 2)), *pixels])
+    return index[0], index[1], index[2], np.concatenate([np.empty((0, 2)), *pixels]), np.concatenate(views)
 
 
 def write_colmap(path: Path, world: Any, *, text: bool = False) -> None:
@@ -163,13 +201,15 @@ def write_colmap(path: Path, world: Any, *, text: bool = False) -> None:
     """
     if path.exists() and not is_model(path) and (not path.is_dir() or any(path.iterdir())):
         raise ModelError(f"{path}: is there already and is no model of COLMAP: name another folder")
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as made:
+    with tempfile.TemporaryDirectory(prefix="ba_colmap_") as made:
         (world.write_text if text else world.write_binary)(made)
         path.mkdir(exist_ok=True)
-        for old in (path / f"{part}{suffix}" for part in (*_PARTS, "rigs", "frames") for suffix in (".bin", ".txt")):
-            old.unlink(missing_ok=True)
-        for part in Path(made).iterdir():
-            part.replace(path / part.name)
+        for part in sorted(Path(made).iterdir()):
+            with part.open("rb") as source, whole_file(path / part.name) as stream:
+                shutil.copyfileobj(source, stream)
+    for name in _FILES:
+        # What an older model of the other form has left would be read in its place.
+        (path / f"{name}{'.bin' if text else '.txt'}").unlink(missing_ok=True)
 
 
 def to_colmap(model: Reconstruction) -> Any:

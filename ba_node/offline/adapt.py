@@ -11,6 +11,7 @@ from ba_node.io.bag_topics import absolute
 from ba_node.io.mcap import BagError, BagReader
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.adapters import SOURCES, Adapter, AdapterOptions, Input, Source
+from ba_node.messages.adapters.rtabmap import BODY
 from ba_node.offline.recording import record
 from ba_node.offline.rig import rig_of_recording
 
@@ -81,9 +82,9 @@ def choose_topics(
     for one in inputs:
         if one.role and one.role not in done and one.type_name and not (one.role == "extrinsic" and has_rig):
             there = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(reader.topics.items())) or "none"
-            raise BagError(
-                f"{reader.path}: no {one.name} ({one.type_name}): say --topic {one.name}=TOPIC; there are: {there}"
-            )
+            or_rig = ", or --rig FILE" if one.role == "extrinsic" else ""
+            say = f"say --topic {one.name}=TOPIC{or_rig}"
+            raise BagError(f"{reader.path}: no {one.name} ({one.type_name}): {say}; there are: {there}")
     return chosen
 
 
@@ -100,7 +101,16 @@ def _calibration(reader: BagReader, source: Source, chosen: Mapping[str, str]) -
             break
     if adapter.rig is not None or apart:
         return adapter.rig
-    return rig_of_recording(reader, rectified=True, base="base_link")
+    try:
+        rig = rig_of_recording(reader, rectified=True, base=BODY)
+    except BagError as error:
+        raise BagError(f"{error} (--rig FILE)") from error
+    if rig.frame_id != BODY:
+        raise BagError(
+            f"{reader.path}: /tf_static has no way from {BODY!r}, which the poses are of, to {rig.names[0]!r}:"
+            " give the cameras with --rig FILE"
+        )
+    return rig
 
 
 def _timeline(reader: BagReader, adapter: Adapter, chosen: Mapping[str, str]) -> Iterator[tuple[str, int, Measurement]]:

@@ -9,6 +9,7 @@ Colours are those of Okabe and Ito, told apart by colour-blind readers.
 from __future__ import annotations
 
 import base64
+import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,13 +22,14 @@ from ba_node.arrays import FloatArray
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+from ba_node.evaluation.plot import ground_axes
 from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Run
 
 TRUTH, BEFORE, CLOUD = "#000000", "#D55E00", "#9AA0A6"
 COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 _BAD = {"HELD": "#E69F00", "FAILED": "#D55E00", "SKIPPED": "#9AA0A6"}
 # Points that are drawn at most, in space and from above, and residuals.
-_POINTS, _ABOVE, _ARROWS = 100_000, 6_000, 3_000
+_POINTS, _ABOVE, _ARROWS, _CAMERAS = 100_000, 6_000, 3_000, 4
 # Beyond it a float32 has steps of more than a centimetre.
 _FAR = 1e5
 # Length of a drawn residual: the 90th percentile takes this share of the image's width.
@@ -108,25 +110,25 @@ def _paths(one: _Shown) -> list[tuple[str, FloatArray, str, str]]:
 
 def _above(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
+    across, up = ground_axes(_paths(shown[0])[0][1])
     for number, one in enumerate(shown):
-        cloud = _few(one.aligned(one.run.cloud, one.after), _ABOVE)
+        cloud = _few(_without_strays(one.aligned(one.run.cloud, one.after)), _ABOVE)
         if len(cloud) and number == 0:
-            low, high = np.percentile(cloud[:, :2], [0.5, 99.5], axis=0)
-            cloud = cloud[((cloud[:, :2] >= low) & (cloud[:, :2] <= high)).all(axis=1)]
-            marker = {"color": CLOUD, "size": 3, "opacity": 0.6}
-            data.append(line(cloud[:, 0], cloud[:, 1], "map", CLOUD, mode="markers", marker=marker, hoverinfo="skip"))
+            style = {"mode": "markers", "marker": {"color": CLOUD, "size": 3, "opacity": 0.6}, "hoverinfo": "skip"}
+            data.append(line(cloud[:, across], cloud[:, up], "map", CLOUD, **style))
         for name, path, colour, dash in _paths(one):
             if name != "reference" or number == 0:
-                drawn = line(path[:, 0], path[:, 1], one.name(name), colour)
+                drawn = line(path[:, across], path[:, up], one.name(name), colour)
                 data.append(drawn | {"line": {"color": colour, "width": 2, "dash": dash}})
-    layout = {"xaxis": {"title": "x [m]"}, "yaxis": {"title": "y [m]", "scaleanchor": "x"}}
+    titles = [{"title": f"{'xyz'[axis]} [m]"} for axis in (across, up)]
+    layout = {"xaxis": titles[0], "yaxis": titles[1] | {"scaleanchor": "x"}}
     return Figure("above", "From above", "Trajectories, and points of the map.", data, layout)
 
 
 def _space(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
     for number, one in enumerate(shown):
-        cloud = _few(one.aligned(one.run.cloud, one.after), _POINTS)
+        cloud = _few(_without_strays(one.aligned(one.run.cloud, one.after)), _POINTS)
         for name, path, colour, dash in _paths(one):
             if name != "reference" or number == 0:
                 style = {"mode": "lines", "line": {"color": colour, "width": 5, "dash": dash}}
@@ -134,9 +136,22 @@ def _space(shown: Sequence[_Shown]) -> Figure:
         if len(cloud):
             marker = {"color": CLOUD if number == 0 else one.colour, "size": 1.5, "opacity": 0.6}
             data.append(_in_space(cloud, one.name("map")) | {"mode": "markers", "marker": marker, "hoverinfo": "skip"})
+    # Upwards is the axis along which nothing goes; cameras look along z, with y downwards.
+    vertical = "xyz"[3 - sum(ground_axes(_paths(shown[0])[0][1]))]
+    camera: dict[str, Any] = {"up": dict.fromkeys("xyz", 0) | {vertical: -1 if vertical == "y" else 1}}
+    camera["eye"] = {axis: -1.3 if axis == "y" else 1.3 for axis in "xyz"}
     axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
     note = f" {_POINTS} of its points are drawn." if any(len(one.run.cloud) > _POINTS for one in shown) else ""
-    return Figure("space", "In space", f"Drag to turn.{note}", data, {"scene": axes | {"aspectmode": "data"}})
+    text = f"Drag to turn. Strays of the map, one point in a hundred along each axis, are left out.{note}"
+    return Figure("space", "In space", text, data, {"scene": axes | {"aspectmode": "data", "camera": camera}})
+
+
+def _without_strays(cloud: FloatArray) -> FloatArray:
+    """Return the points that all but 1 % along each axis span: strays must not shrink the picture."""
+    if not len(cloud):
+        return cloud
+    low, high = np.percentile(cloud, [0.5, 99.5], axis=0)
+    return np.asarray(cloud[((cloud >= low) & (cloud <= high)).all(axis=1)])
 
 
 def _in_space(points: FloatArray, name: str) -> dict[str, Any]:
@@ -161,53 +176,84 @@ def _over_time(shown: Sequence[_Shown]) -> Figure:
     return Figure("error", "Error over time", text, data, layout)
 
 
-def _objective(shown: Sequence[_Shown]) -> Figure:
+def _of_solves(shown: Sequence[_Shown], what: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return a figure of each solve: before it, unless several runs are shown, and after it; 0 is none."""
     data = []
     for one in shown:
-        for name, key, colour in (("before", "objective_before", BEFORE), ("after", "objective_after", one.colour)):
-            if len(one.solve_s) and not (name == "before" and one.several):
-                values = np.where(one.details[key] > 0.0, one.details[key], np.nan)
-                data.append(line(one.solve_s, values, one.name(name), colour))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "objective", "type": "log"}}
-    return Figure("objective", "Objective of each solve", "At its start and at its end.", data, layout)
+        for name, colour in (("before", BEFORE), ("after", one.colour))[one.several :]:
+            values = one.details[f"{what}_{name}"] if len(one.solve_s) else np.empty(0)
+            if values.any():
+                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
+    return data, {"xaxis": {"title": "time [s]"}, "yaxis": {"type": "log"}}
+
+
+def _objective(shown: Sequence[_Shown]) -> Figure:
+    text = "The cost at its start and at its end."
+    return Figure("objective", "Objective of each solve", text, *_of_solves(shown, "objective"))
+
+
+def _held_out(shown: Sequence[_Shown]) -> Figure:
+    text = "Median residual [px] of tracks that took no part in a solve, by the front-end's poses and by the solution."
+    return Figure("held_out", "Tracks held out", text, *_of_solves(shown, "held_out_px"))
 
 
 def _arrows(shown: Sequence[_Shown]) -> Figure:
-    """Draw the residuals of the first run as vectors, one image for each camera."""
+    """Draw the residuals of the first run as vectors, for each camera; on images those of one keyframe."""
     details = shown[0].details
-    cameras = np.unique(details["camera"])[:4]
-    length = np.linalg.norm(details["error"][~details["outlier"]], axis=1)
-    width = float(np.ptp(details["uv"][:, 0])) if len(details["uv"]) else 1.0
-    scale = max(1.0, round(_ARROW_SHARE * width / max(float(np.percentile(length, 90)), 1e-3))) if len(length) else 1.0
-    data, layout = [], {}
-    for place, camera in enumerate(cameras):
+    images = {camera: details[f"image_{camera}"] for camera in range(_CAMERAS) if f"image_{camera}" in details}
+    cameras = sorted(images) or np.unique(details["camera"])[:_CAMERAS].tolist()
+    chosen = np.isin(details["camera"], cameras)
+    if images:
+        chosen &= details["keyframe"] == details["shown_keyframe"]
+    uv, error, outlier = details["uv"][chosen], details["error"][chosen], details["outlier"][chosen]
+    text, scale = "Predicted minus measured", 1.0
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {}
+    if len(uv):
+        length = float(np.percentile(np.linalg.norm(error[~outlier], axis=1), 90)) if (~outlier).any() else 1.0
+        scale = max(1.0, round(_ARROW_SHARE * float(np.ptp(uv[:, 0])) / max(length, 1e-3)))
+    for place, camera in enumerate(cameras if len(uv) else ()):
+        own = details["camera"][chosen] == camera
         axis = str(place + 1) if place else ""
-        for outlier, name, colour in ((False, "inliers", shown[0].colour), (True, "outliers", BEFORE)):
-            rows = np.flatnonzero((details["camera"] == camera) & (details["outlier"] == outlier))
-            rows = _few(rows, _ARROWS // len(cameras))
-            end = details["uv"][rows] + (scale if not outlier else 1.0) * details["error"][rows]
-            x, y = (_segments(details["uv"][rows, k], end[:, k]) for k in (0, 1))
+        for left_out, name, colour in (
+            (False, "inliers", "#E69F00" if images else shown[0].colour),
+            (True, "outliers", BEFORE),
+        ):
+            rows = _few(np.flatnonzero(own & (outlier == left_out)), _ARROWS // len(cameras))
+            end = uv[rows] + (1.0 if left_out else scale) * error[rows]
+            x, y = (_segments(uv[rows, k], end[:, k]) for k in (0, 1))
             drawn = line(x, y, name, colour, mode="lines", xaxis=f"x{axis}", yaxis=f"y{axis}")
-            drawn |= {"line": {"color": colour, "width": 1}, "showlegend": place == 0, "legendgroup": name}
-            data.append(drawn | {"visible": "legendonly" if outlier else True})
-        share = 1.0 / len(cameras)
-        low, high = details["uv"].min(axis=0), details["uv"].max(axis=0)
-        domain = [place * share, (place + 1) * share - (0.04 if len(cameras) > 1 else 0.0)]
-        layout[f"xaxis{axis}"] = {
-            "title": f"u [px], camera {camera}",
-            "domain": domain,
-            "range": [float(low[0]), float(high[0])],
-        }
-        layout[f"yaxis{axis}"] = {
-            "title": "v [px]" if place == 0 else "",
-            "anchor": f"x{axis}",
-            "scaleanchor": f"x{axis}",
-            "range": [float(high[1]), float(low[1])],
-        }
-    text = f"Predicted minus measured; inliers {scale:g} times as long as they are. A click on outliers shows them."
-    if len(shown) > 1:
-        text += f" Of {shown[0].run.name}."
-    return Figure("residuals", "Reprojection errors in the image", text, data if len(length) else [], layout, wide=True)
+            drawn |= {"line": {"color": colour, "width": 1.3}, "showlegend": place == 0, "legendgroup": name}
+            data.append(drawn | {"visible": "legendonly" if left_out else True})
+        layout |= _image_axes(axis, place, camera, len(cameras), uv)
+    if images:
+        text += ", in the keyframe that sees the most"
+        layout["images"] = [_picture(images[camera], place) for place, camera in enumerate(cameras)]
+    text += f"; inliers {scale:g} times as long as they are. A click on outliers shows them."
+    text += f" Of {shown[0].run.name}." if len(shown) > 1 else ""
+    return Figure("residuals", "Reprojection errors in the image", text, data, layout, wide=True)
+
+
+def _image_axes(axis: str, place: int, camera: int, count: int, uv: FloatArray) -> dict[str, Any]:
+    """Return the axes of one image of several side by side."""
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    domain = [place / count, (place + 1) / count - (0.04 if count > 1 else 0.0)]
+    across = {"title": f"u [px], camera {camera}", "domain": domain, "range": [float(low[0]), float(high[0])]}
+    down = {"title": "v [px]" if place == 0 else "", "anchor": f"x{axis}", "scaleanchor": f"x{axis}"}
+    return {f"xaxis{axis}": across, f"yaxis{axis}": down | {"range": [float(high[1]), float(low[1])]}}
+
+
+def _picture(grey: NDArray[np.uint8], place: int) -> dict[str, Any]:
+    """Return an image (h, w) as plotly.js lays it below a figure; pixel 0 is its centre."""
+    from PIL import Image  # noqa: PLC0415  # comes with matplotlib
+
+    packed = io.BytesIO()
+    Image.fromarray(grey).save(packed, "JPEG", quality=75)
+    height, width = grey.shape
+    axis = str(place + 1) if place else ""
+    source = f"data:image/jpeg;base64,{base64.b64encode(packed.getvalue()).decode()}"
+    size = {"x": -0.5, "y": -0.5, "sizex": width, "sizey": height, "sizing": "stretch", "layer": "below"}
+    return {"source": source, "xref": f"x{axis}", "yref": f"y{axis}", "yanchor": "top", **size}
 
 
 def _segments(begin: FloatArray, end: FloatArray) -> FloatArray:
@@ -281,18 +327,6 @@ def _health(shown: Sequence[_Shown]) -> Figure:
     }
     text = "Share of a window's observations that agree with its solution, median parallax, and what the guard held."
     return Figure("health", "Health of each window", text, data, layout)
-
-
-def _held_out(shown: Sequence[_Shown]) -> Figure:
-    data = []
-    for one in shown:
-        for name, key, colour in (("before", "held_out_px_before", BEFORE), ("after", "held_out_px_after", one.colour)):
-            values = one.details[key] if len(one.solve_s) else np.empty(0)
-            if values.any() and not (name == "before" and one.several):
-                data.append(line(one.solve_s, np.where(values > 0.0, values, np.nan), one.name(name), colour))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "median residual [px]", "type": "log"}}
-    text = "Tracks that took no part in a solve, by the front-end's poses and by the solution."
-    return Figure("held_out", "Tracks held out", text, data, layout)
 
 
 def _latency(shown: Sequence[_Shown]) -> Figure:

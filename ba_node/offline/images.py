@@ -14,7 +14,7 @@ import contextlib
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +23,16 @@ import numpy as np
 
 from ba_node.estimate import Transform
 from ba_node.front_end.records import FrontEndError, Images
-from ba_node.front_end.streams import MODES, Frame, OdometryBuffer, Streams, cameras_of, images_of, transform_of
+from ba_node.front_end.streams import (
+    MODES,
+    RECTIFIED,
+    Frame,
+    OdometryBuffer,
+    Streams,
+    cameras_of,
+    images_of,
+    transform_of,
+)
 from ba_node.io.bag_topics import absolute
 from ba_node.io.mcap import BagError, BagReader
 from ba_node.io.rig_file import read_rig
@@ -41,7 +50,8 @@ FOLDERS = {
 }
 PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+_INFO, _RIG = "sensor_msgs/msg/CameraInfo", "ba_msgs/msg/CameraRig"
+_PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _BEGIN_NS = 1_000_000_000
 # Digits of nanoseconds since 1970.
@@ -55,7 +65,7 @@ class ImageRequest:
 
     rig: CameraRig | None = None  # in place of what the recording or folder says
     topics: Mapping[str, str] = field(default_factory=dict)  # by left, right, rgb, depth, image, odometry
-    rectified: bool = False  # p of camera_info is the camera
+    rectified: bool = False  # p of camera_info is the camera; so it is where topics are called image_rect
     base: str = ""  # body frame in /tf_static, empty for the first camera
     rate_hz: float = 10.0  # of a folder whose pictures have no stamps
 
@@ -90,8 +100,7 @@ def open_images(path: Path, request: ImageRequest) -> Iterator[ImageSource]:
 def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     chosen = _image_topics(reader, request)
     mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
-    infos = [_info_of(reader, chosen[name]) for name in cameras_of(mode)]
-    rig = request.rig or rig_of_recording(reader, infos, rectified=request.rectified, base=request.base)
+    rig = _first_cameras(request.rig or _recorded_rig(reader, request, chosen, mode), mode, str(reader.path))
     odometry = request.topics.get("odometry")
     topics = {topic: name for name, topic in chosen.items()}
     source = ImageSource(rig, mode, 0, lambda: _frames(reader, source, topics, odometry and absolute(odometry)))
@@ -99,30 +108,35 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     return source
 
 
+def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str, str], mode: str) -> CameraRig:
+    infos = [_info_of(reader, chosen[name], alone=mode != "stereo") for name in cameras_of(mode)]
+    # A camera_rig tells all that camera_info would.
+    known = [] if _RIG in reader.topics.values() and not set(infos) <= set(reader.topics) else infos
+    rectified = request.rectified or any(RECTIFIED in chosen[name] for name in cameras_of(mode))
+    return rig_of_recording(reader, known, rectified=rectified, base=request.base)
+
+
 def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:
     """Return the topic of each image of a mode: by what the user says, by names, or the only ones there."""
-    there = sorted(topic for topic, kind in reader.topics.items() if kind in _TYPES)
-    listed = ", ".join(there) or "none"
+    found = sorted(topic for topic, kind in reader.topics.items() if kind in _TYPES)
     given = {name: absolute(topic) for name, topic in request.topics.items() if name != "odometry"}
     for name, topic in given.items():
-        if topic not in there:
-            raise BagError(f"{reader.path}: {name}={topic}: no such topic of images; there are: {listed}")
+        if topic not in found:
+            raise BagError(f"{reader.path}: {name}={topic}: no such topic of images; there are: {', '.join(found)}")
+    # What is there raw and compressed is one image, and raw the better one.
+    there = [topic for topic in found if topic == _PACKED.sub("", topic) or _PACKED.sub("", topic) not in found]
     for mode, names in MODES.items():
         short = [name.rpartition("/")[0] or "image" for name in names]
         if given and set(given) == set(short):
             return {name: given[key] for name, key in zip(names, short, strict=True)}
-        found = [
-            [topic for topic in there if re.search(rf"(^|/){name}(/compressed(Depth)?)?$", topic)] for name in names
-        ]
-        if not given and all(found) and (mode != "mono" or len(there) == 1):
-            return {name: topics[0] for name, topics in zip(names, found, strict=True)}
-    if not given and len(there) == 1:
-        return {MODES["mono"][0]: there[0]}
-    if not given and len(there) == 2:
-        return _two(reader, there)
+        named = [[topic for topic in there if _PACKED.sub("", topic).endswith(f"/{name}")] for name in names]
+        if not given and [len(topics) for topics in named] == [1] * len(names) and (mode != "mono" or len(there) == 1):
+            return {name: topics[0] for name, topics in zip(names, named, strict=True)}
+    if not given and len(there) in (1, 2):
+        return {MODES["mono"][0]: there[0]} if len(there) == 1 else _two(reader, there)
     raise BagError(
-        f"{reader.path}: cannot tell which images are meant of: {listed}: say --topic left=TOPIC --topic right=TOPIC,"
-        " rgb and depth, or image"
+        f"{reader.path}: cannot tell which images are meant of: {', '.join(there) or 'none'}: say --topic left=TOPIC"
+        " --topic right=TOPIC, rgb and depth, or image"
     )
 
 
@@ -140,11 +154,11 @@ def _two(reader: BagReader, topics: Sequence[str]) -> dict[str, str]:
     return dict(zip(MODES["stereo"], order, strict=True))
 
 
-def _info_of(reader: BagReader, image: str) -> str:
-    """Return the topic of the camera_info of an image: beside it, else the only one there is."""
-    base = re.sub(r"/compressed(Depth)?$", "", image).rpartition("/")[0]
+def _info_of(reader: BagReader, image: str, *, alone: bool = False) -> str:
+    """Return the topic of the camera_info of an image: beside it, or for a camera that is alone, the only one."""
+    beside = f"{_PACKED.sub('', image).rpartition('/')[0]}/camera_info"
     infos = [topic for topic, kind in reader.topics.items() if kind == _INFO]
-    return infos[0] if len(infos) == 1 else f"{base}/camera_info"
+    return infos[0] if alone and beside not in infos and len(infos) == 1 else beside
 
 
 def _frames(
@@ -162,8 +176,11 @@ def _frames(
         stamp_ns = stamp_ns_from_message(message.header.stamp)
         if topic == odometry:
             pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
-            child = str(message.child_frame_id)
-            place = tree.find(child, source.rig.frame_id) if child not in ("", source.rig.frame_id) else None
+            child, body = str(message.child_frame_id), source.rig.frame_id
+            place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
+            if place is None:
+                words = f"it is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
+                source.counted["odometry of another frame"], source.notes["odometry of another frame"] = 1, words
             buffer.add(stamp_ns, pose if place is None else pose.after(place))
         else:
             waiting += streams.put(topics[topic], stamp_ns, message)
@@ -214,7 +231,7 @@ def _of_folder(path: Path, request: ImageRequest) -> ImageSource:
         raise BagError(
             f"{path}: no pictures ({', '.join(PICTURES)}), neither here nor in left/ and right/, rgb/ and depth/"
         )
-    rig = request.rig or _rig_of_folder(path, request, cameras=len(cameras_of(mode)))
+    rig = _first_cameras(request.rig or _rig_of_folder(path, request, len(cameras_of(mode))), mode, str(path))
     stamps = [_stamps(path, files, request.rate_hz) for files in pictures]
     source = ImageSource(rig, mode, len(pictures[0]), lambda: _read_folder(source, pictures, stamps))
     return source
@@ -236,15 +253,16 @@ def _rig_of_folder(path: Path, request: ImageRequest, cameras: int) -> CameraRig
         raise BagError(
             f"{path}: nothing tells the cameras: put a rig.yaml beside the pictures (ba rig --help), or give --rig"
         )
-    if len(rig) < cameras:
-        raise BagError(f"{path}: {', '.join(str(file) for file in files)}: {len(rig)} camera, expected {cameras}")
-    return _first_cameras(rig, cameras)
+    return rig
 
 
-def _first_cameras(rig: CameraRig, count: int) -> CameraRig:
-    arrays = {name: getattr(rig, name)[:count] for name in
-              ("names", "models", "intrinsics", "distortion", "image_size", "position", "orientation")}  # fmt: skip
-    return CameraRig(frame_id=rig.frame_id, **arrays)
+def _first_cameras(rig: CameraRig, mode: str, where: str) -> CameraRig:
+    """Return the cameras of a rig that a mode has."""
+    count = len(cameras_of(mode))
+    if len(rig) < count:
+        raise BagError(f"{where}: {mode} needs {count} cameras, and the rig has {len(rig)} ({', '.join(rig.names)})")
+    names = ("names", "models", "intrinsics", "distortion", "image_size", "position", "orientation")
+    return replace(rig, **{name: getattr(rig, name)[:count] for name in names})
 
 
 def _kitti_rig(path: Path, cameras: int) -> CameraRig:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.backend import Backend, MapEnded, MapSummary
@@ -34,8 +35,9 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, WHOLE_MAP
 from ba_node.offline.attention import attention
+from ba_node.offline.keyframe_images import images_of
 from ba_node.offline.recording import placed, read_truth
-from ba_node.offline.run_folder import recording_facts, versions, write_details
+from ba_node.offline.run_folder import recording_facts, shown_keyframe, versions, write_details
 from ba_node.offline.session_record import SessionRecord
 
 # Topics that hold the whole map: written again only when it has grown by this share, or a long recording would
@@ -110,7 +112,7 @@ def replay(
         report = {
             "bag": reader.path.name,
             "kernels": native.description(config.solver.kernels),
-            **_write(out, run.sessions, truth),
+            **_write(out, run.sessions, truth, _images(reader, run)),
         }
         report |= {"topics_taken": reader.taken, "topics_left": reader.left, "cameras_adjusted": run.camera_notes}
         report["bag_warnings"] = dict(reader.warnings)
@@ -156,6 +158,7 @@ class _Run:
         self._inputs: dict[int, Keyframe] = {}
         self._written = 0
         self.camera_notes: list[str] = []
+        self.frames: tuple[str, ...] = ()  # of the cameras
 
     def load(self, path: Path) -> None:
         """Begin with a map."""
@@ -179,6 +182,7 @@ class _Run:
         for done, measurement in enumerate(measurements, start=1):
             self.counted[type(measurement)] += 1
             if isinstance(measurement, CameraRig):
+                self.frames = self.frames or measurement.names
                 self.camera_notes += [note for note in measurement.notes if note not in self.camera_notes]
             yield measurement
             self._watch.progress(done, total)
@@ -232,7 +236,17 @@ class _Run:
             self._writer.write(f"/{NODE_NAME}/{topic}", kind, message, time_ns, latched=topic in LATCHED_OUTPUTS)
 
 
-def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dict[str, Any]:
+def _images(reader: BagReader, run: _Run) -> dict[int, NDArray[np.uint8]]:
+    """Return images of the keyframe of the newest session that has the most residuals."""
+    record = run.sessions[-1]
+    poses = record.last.trajectory
+    place = shown_keyframe(record)
+    return images_of(reader, int(poses.stamp_ns[place]), run.frames) if place < len(poses) else {}
+
+
+def _write(
+    out: Path, sessions: list[SessionRecord], truth: Poses | None, images: dict[int, NDArray[np.uint8]]
+) -> dict[str, Any]:
     """Write the files of every session; return the summary of the newest, with those of the older ones in it."""
     folders = [*(out / name for name in _folder_names(sessions[:-1])), out]
     for folder, record in zip(folders, sessions, strict=True):
@@ -240,7 +254,7 @@ def _write(out: Path, sessions: list[SessionRecord], truth: Poses | None) -> dic
         write_tum(folder / "trajectory.tum", record.trajectory)
         write_tum(folder / "trajectory_input.tum", record.input_trajectory)
         write_ply(folder / "points.ply", record.last.cloud, record.last.frame_id)
-        write_details(folder, record)
+        write_details(folder, record, images if record is sessions[-1] else {})
     summaries = [record.as_dict() | _against(truth, record) for record in sessions]
     for folder, entry in zip(folders[:-1], summaries, strict=False):
         entry["folder"] = folder.name

@@ -17,7 +17,7 @@ from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.plot import Comparison, draw
 from ba_node.io.files import whole_file
 from ba_node.offline.figures import figures, verdicts
-from ba_node.offline.page import write_page
+from ba_node.offline.page import PageError, write_page
 from ba_node.offline.run_folder import Run, read_run
 
 REPORT = "report.html"
@@ -37,6 +37,21 @@ def write_report(folders: Sequence[Path], path: Path) -> None:
     tail = [_guard(run, several=len(runs) > 1) for run in runs] + [_parameters(runs), _origin(runs)]
     title = f"Replay of {runs[0].report['bag']}" if len(runs) == 1 else f"{len(runs)} replays side by side"
     write_page(path, title, figures(runs), "\n".join(head), "\n".join(tail))
+
+
+def show(folder: Path) -> str:
+    """Write page and picture of a replay into its folder; return what to say of them.
+
+    Raises:
+        RunError: the folder holds no results.
+        OSError: a file cannot be written.
+    """
+    draw_trajectory(folder)
+    try:
+        write_report([folder], folder / REPORT)
+    except PageError as error:
+        return f"trajectory.png; {error}"
+    return f"{REPORT}, trajectory.png and others"
 
 
 def draw_trajectory(folder: Path) -> None:

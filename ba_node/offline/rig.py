@@ -78,4 +78,4 @@ def rig_of_recording(
 def _first(reader: BagReader, topic: str) -> object:
     for name, _, _, data in reader.messages([topic]):
         return reader.decode(name, data)
-    raise BagError(f"{reader.path}: no message on {topic}")
+    raise BagError(f"{reader.path}: no message on {topic}: record it, or give the rig as YAML (--rig FILE)")

@@ -57,8 +57,17 @@ class Run:
     parameters: dict[str, object]  # by full name
 
 
-def write_details(folder: Path, record: SessionRecord) -> None:
-    """Write the figures of each solve, and a summary and a sample of the residuals, to details.npz."""
+def shown_keyframe(record: SessionRecord) -> int:
+    """Return the place of the keyframe, oldest first, that has the most residuals."""
+    seen = record.summary.observed.keyframe
+    return int(np.argmax(np.bincount(seen))) if len(seen) else 0
+
+
+def write_details(folder: Path, record: SessionRecord, images: Mapping[int, NDArray[np.uint8]]) -> None:
+    """Write the figures of each solve, a summary and a sample of the residuals, and images, to details.npz.
+
+    ``images`` are those of :func:`shown_keyframe`, by camera, (h, w) grey; all residuals in them are kept.
+    """
     seen = record.summary.observed
     reports = [report for _, report in record.solves]
     columns: dict[str, NDArray[Any]] = {name: np.array([getattr(one, name) for one in reports]) for name in SOLVES}
@@ -68,7 +77,11 @@ def write_details(folder: Path, record: SessionRecord) -> None:
     scaled = (seen.error / seen.sigma_px[:, None])[good & ~seen.outlier].ravel()
     columns["histogram"] = np.histogram(np.clip(scaled, BINS[0], BINS[-1]), BINS)[0]
     rows = np.flatnonzero(good)
+    shown = rows[seen.keyframe[rows] == shown_keyframe(record)]
     rows = rows[np.linspace(0, max(len(rows) - 1, 0), min(len(rows), _SAMPLE)).astype(np.intp)]
+    rows = np.union1d(rows, shown)
+    columns["shown_keyframe"] = np.array(shown_keyframe(record))
+    columns |= {f"image_{camera}": image for camera, image in images.items()}
     for name in ("error", "uv", "camera", "keyframe", "outlier"):
         column = getattr(seen, name)[rows]
         columns[name] = column.astype(np.float32) if column.dtype == np.float64 else column

@@ -53,8 +53,15 @@ class ModelSolution:
         return self.colmap.model.with_state(moved(self.result.state, self.origin), self.cameras)
 
     def write(self, path: Path) -> None:
-        """Write the model with the solution, binary as COLMAP does by itself; ids and all else are those read."""
-        self.colmap.take(self.refined())
+        """Write the model with the solution, binary as COLMAP does by itself; ids and all else are those read.
+
+        What was behind its camera at the start, and so took no part, is no observation there any more, as in COLMAP.
+        """
+        left_out = np.zeros(len(self.colmap.views), dtype=bool)
+        if self.options.cheirality == "drop":
+            behind = np.isnan(reprojection_errors(self.problem, self.problem.start)[:, 0])
+            left_out[np.argsort(self.colmap.model.point, kind="stable")] = behind
+        self.colmap.take(self.refined(), left_out)
         write_colmap(path, self.colmap.world)
 
     def attention(self) -> tuple[list[str], bool]:
@@ -65,7 +72,7 @@ class ModelSolution:
         if before or after:
             lines.append(
                 f"{before} of {count} observations are of points behind their camera at the start, {after} at the end:"
-                " those at the start take no part in the solve"
+                f" those at the start {'are left out' if self.options.cheirality == 'drop' else 'count'}"
             )
         result, grave = self.result, max(before, after) > _MANY_BEHIND * count
         if result.status.usable and not result.objective_after <= result.objective_before:

@@ -9,7 +9,15 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ba_node.config import ConfigError, SolverOptions, Value, declared, parse_assignment, split_assignment
+from ba_node.config import (
+    PLATEAUS,
+    ConfigError,
+    SolverOptions,
+    Value,
+    declared,
+    parse_assignment,
+    split_assignment,
+)
 from ba_node.core import methods
 from ba_node.core.native_kernels import missing
 
@@ -38,6 +46,8 @@ def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
         raise ConfigError(f"method {method!r} does not exist{_nearest(method, methods.METHODS)}")
     options = methods.options(method)
     _require_scale(options, changes)
+    if changes.get("loss") in PLATEAUS and options.loss not in PLATEAUS:
+        changes.setdefault("annealing", "gnc")
     options = dataclasses.replace(options, **changes)
     options.check()
     reason = missing(options)

@@ -8,7 +8,7 @@ The score of parameters is how their errors on the recordings compare with those
 
 so that recordings count alike, whatever their errors are measured in. For accuracy the score is lowered, under a limit
 of latency if there is one; for latency the p95 of the time of a solve is, with a score of no more than 1.05.
-Parameters are drawn by Optuna's TPE (Bergstra et al., NIPS 2011) from the ranges that ``config/`` declares.
+Parameters are drawn from the ranges that ``config/`` declares.
 """
 
 from __future__ import annotations
@@ -16,54 +16,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations, find
-from ba_node.io.mcap import TopicChoice
-from ba_node.offline.fleet import Fleet, result_of
-from ba_node.offline.measure import Measured, MeasureError, Objective, Question, measure
-
-Goal = Literal["accuracy", "latency"]
-STUDY = "ba_node"
-# How much worse the score may become where latency is lowered.
-_MAX_SCORE = 1.05
-# What says that the search is worth it, and that it fits the recordings alone.
-MIN_GAIN, MAX_LOSS = 0.01, 0.02
-_RANDOM_FIRST = 10
-
-
-class TuneError(ValueError):
-    """A search that cannot be made, or that was begun with other settings."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is to be searched."""
-
-    recordings: tuple[tuple[str, ...], ...]  # by whose errors parameters are chosen
-    validation: tuple[str, ...] | None  # the one that is kept to see that they are better; None for none
-    parameters: tuple[Parameter, ...]
-    goal: Goal = "accuracy"
-    objective: Objective = "auto"
-    max_latency_ms: float | None = None  # limit on p95 of the time of a solve
-    trials: int = 50
-    seed: int = 1
-    topics: TopicChoice = field(default_factory=TopicChoice)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Parameters that were tried, and what came of it."""
-
-    number: int
-    values: dict[str, Value]
-    score: float  # error beside that of the start, 1 for as much
-    latency_ms: float  # p95 of the time of a solve, on the recording where it is largest
-    feasible: bool  # within the limits
+from ba_node.offline.fleet import Fleet, result_of, words_of
+from ba_node.offline.measure import Measured, MeasureError, Question, measure
+from ba_node.offline.study import MAX_LOSS, MAX_SCORE, MIN_GAIN, Goal, Plan, Study, Trial, TuneError
 
 
 @dataclass(frozen=True)
@@ -77,6 +39,7 @@ class Tuned:
     trials: list[Trial]
     failed: int  # trials whose parameters contradict each other, or gave nothing to measure
     importance: dict[str, float]  # of each parameter, share; empty if too few trials tell
+    left_out: dict[str, str]  # recordings that cannot be used, and why
 
     @property
     def improved(self) -> bool:
@@ -93,7 +56,7 @@ class Tuned:
         if self.plan.validation is None:
             return False
         name = self.plan.validation[0]
-        allowed = 1.0 + MAX_LOSS if self.plan.goal == "accuracy" else _MAX_SCORE + MAX_LOSS
+        allowed = 1.0 + MAX_LOSS if self.plan.goal == "accuracy" else MAX_SCORE + MAX_LOSS
         return self.after[name].error > allowed * self.start[name].error
 
     @property
@@ -138,23 +101,39 @@ def tune(
         TuneError: Optuna is missing, or the file is of another search.
         MeasureError, BagError, FleetError: a recording cannot be used.
     """
-    optuna = _optuna()
-    everything = (*plan.recordings, *([plan.validation] if plan.validation else []))
-    start = _measured(fleet, plan, base, everything)
-    study = _Study(optuna, plan, base, storage, {name: one.error for name, one in start.items()})
+    start, left_out = usable(plan, base, fleet)
+    plan = replace(plan, recordings=tuple(place for place in plan.recordings if place[0] in start))
+    if plan.validation is not None and plan.validation[0] not in start:
+        plan = replace(plan, validation=None)
+    study = Study(plan, base, storage, {name: one.error for name, one in start.items()})
     study.begin(start)
     better(study.best())
     _search(plan, base, fleet, study, better, progress)
-    best = study.best()
-    after = _measured(fleet, plan, base.with_values(best.values), everything)
-    return Tuned(plan, start, best, after, study.trials(), study.failed(), study.importance())
+    best = _validated(plan, base, fleet, study)
+    after, useless = usable(plan, base.with_values(best.values), fleet)
+    if useless:
+        raise TuneError(f"with the best parameters: {next(iter(useless.values()))}")
+    return Tuned(plan, start, best, after, study.trials(), study.failed(), study.importance(), left_out)
+
+
+def _validated(plan: Plan, base: Config, fleet: Fleet, study: Study) -> Trial:
+    """Return the best trial; of several that are nearly as good, that which is best on the recording for validation."""
+    finalists = study.finalists()
+    if plan.validation is None or len(finalists) < 2:
+        return study.best()
+    questions = [
+        Question(plan.validation, base.with_values(one.values), plan.topics, plan.objective) for one in finalists
+    ]
+    futures = [fleet.submit(measure, question) for question in questions]
+    errors = [np.inf if isinstance(found, Exception) else found.error for found in map(_result_or_error, futures)]
+    return finalists[int(np.argmin(errors))]
 
 
 def _search(
     plan: Plan,
     base: Config,
     fleet: Fleet,
-    study: _Study,
+    study: Study,
     better: Callable[[Trial], None],
     progress: Callable[[int, int], None],
 ) -> None:
@@ -193,139 +172,33 @@ def _search(
                     better(best)
 
 
-def _measured(fleet: Fleet, plan: Plan, config: Config, places: Sequence[tuple[str, ...]]) -> dict[str, Measured]:
-    questions = [Question(place, config, plan.topics, plan.objective) for place in places]
+def usable(plan: Plan, base: Config, fleet: Fleet) -> tuple[dict[str, Measured], dict[str, str]]:
+    """Return how good parameters are on each recording of a plan, and why those that cannot be used cannot.
+
+    Raises:
+        MeasureError, BagError, FleetError, OSError: none can be used to choose parameters by.
+    """
+    places = (*plan.recordings, *([plan.validation] if plan.validation else []))
+    questions = [Question(place, base, plan.topics, plan.objective) for place in places]
     futures = [fleet.submit(measure, question) for question in questions]
-    return {place[0]: result_of(future) for place, future in zip(places, futures, strict=True)}
+    found: dict[str, Measured] = {}
+    errors: dict[str, Exception] = {}
+    for place, future in zip(places, futures, strict=True):
+        result = _result_or_error(future)
+        if isinstance(result, Measured):
+            found[place[0]] = result
+        else:
+            errors[place[0]] = result
+    if not any(place[0] in found for place in plan.recordings):
+        raise next(iter(errors.values()))
+    return found, {name: words_of(error) for name, error in errors.items()}
 
 
-def _optuna() -> Any:
+def _result_or_error(future: Future[Measured]) -> Measured | Exception:
     try:
-        import optuna  # noqa: PLC0415
-    except ImportError:
-        raise TuneError("tuning needs Optuna: pip install ba_node[tune]") from None
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    return optuna
-
-
-class _Study:
-    """The trials of a search, in a file."""
-
-    def __init__(self, optuna: Any, plan: Plan, base: Config, storage: Path, errors: Mapping[str, float]) -> None:
-        self._optuna, self._plan = optuna, plan
-        self._errors = [errors[place[0]] for place in plan.recordings]
-        self._start = {one.name: base.values()[one.name] for one in plan.parameters}
-        self._ranges = {one.name: _range(optuna, one, self._start[one.name]) for one in plan.parameters}
-        backend = optuna.storages.journal.JournalFileBackend(str(storage))
-        self._study = optuna.create_study(
-            study_name=STUDY,
-            storage=optuna.storages.JournalStorage(backend),
-            load_if_exists=True,
-            sampler=optuna.samplers.TPESampler(seed=plan.seed, multivariate=True, n_startup_trials=_RANDOM_FIRST),
-        )
-        about = {
-            "recordings": [list(place) for place in plan.recordings],
-            "start": {name: value for name, value in base.values().items() if value != Config().values()[name]},
-            "ranges": {name: repr(one) for name, one in self._ranges.items()},
-            "goal": [plan.goal, plan.objective, plan.max_latency_ms],
-        }
-        earlier = self._study.user_attrs.get("about")
-        if earlier is not None and earlier != about:
-            wrong = ", ".join(key for key in about if earlier.get(key) != about[key])
-            raise TuneError(
-                f"{storage}: holds a search with other {wrong}: name another file with --storage, or remove it"
-            )
-        self._study.set_user_attr("about", about)
-
-    def begin(self, start: Mapping[str, Measured]) -> None:
-        """Take in the start as the first trial, unless it is there from an earlier call."""
-        if self.count() == 0:
-            self._study.enqueue_trial(self._start)
-            trial, _ = self.ask()
-            self.tell(trial, [start[place[0]] for place in self._plan.recordings])
-
-    def count(self) -> int:
-        """Return how many trials are done."""
-        return sum(trial.state.is_finished() for trial in self._study.get_trials(deepcopy=False))
-
-    def failed(self) -> int:
-        """Return how many trials were refused."""
-        return self.count() - len(self.trials())
-
-    def ask(self) -> tuple[Any, dict[str, Value]]:
-        """Return a trial and its parameters."""
-        trial = self._study.ask(self._ranges)
-        return trial, _rounded(trial.params)
-
-    def refuse(self, trial: Any) -> None:
-        """Say that the parameters of a trial contradict each other, or gave nothing to measure."""
-        self._study.tell(trial, state=self._optuna.trial.TrialState.FAIL)
-
-    def tell(self, trial: Any, found: Sequence[Measured]) -> None:
-        """Take in what a trial gave on the recordings, in any order: the score is the same."""
-        score = score_of([one.error for one in found], self._errors)
-        latency = max(one.latency_ms for one in found)
-        trial.set_user_attr("score", score)
-        trial.set_user_attr("latency_ms", latency)
-        excess = [latency / self._plan.max_latency_ms - 1.0] if self._plan.max_latency_ms else []
-        excess += [score / _MAX_SCORE - 1.0] if self._plan.goal == "latency" else []
-        for number, value in enumerate(excess):
-            trial.set_constraint(str(number), value)
-        trial.set_user_attr("feasible", all(value <= 0.0 for value in excess))
-        self._study.tell(trial, float(np.log(score)) if self._plan.goal == "accuracy" else latency)
-
-    def trials(self) -> list[Trial]:
-        """Return the trials that came to an end, in order."""
-        done = self._study.get_trials(deepcopy=False, states=[self._optuna.trial.TrialState.COMPLETE])
-        return [Trial(one.number, _rounded(one.params), **one.user_attrs) for one in done]
-
-    def best(self) -> Trial:
-        """Return the best trial within the limits; if none is, that which is nearest to them."""
-        by_score = self._plan.goal == "accuracy"
-
-        def key(one: Trial) -> tuple[bool, float]:
-            if not one.feasible:
-                return True, one.latency_ms if by_score else one.score
-            return False, one.score if by_score else one.latency_ms
-
-        return min(self.trials(), key=key)
-
-    def importance(self) -> dict[str, float]:
-        """Return how much each parameter decides (PED-ANOVA, Watanabe et al., IJCAI 2023), largest first."""
-        if len(self.trials()) < 2 * _RANDOM_FIRST:
-            return {}
-        importance = self._optuna.importance
-        try:
-            found = importance.get_param_importances(
-                self._study, evaluator=importance.PedAnovaImportanceEvaluator(), params=list(self._ranges)
-            )
-        except (ValueError, RuntimeError):
-            return {}
-        return {name: float(value) for name, value in found.items()}
-
-
-def _rounded(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return parameters with as many digits as people read."""
-    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in values.items()}
-
-
-def score_of(errors: Sequence[float], begun: Sequence[float]) -> float:
-    """Return the geometric mean of the ratios of errors."""
-    tiny = 1e-12
-    return float(np.exp(np.mean(np.log(np.maximum(errors, tiny)) - np.log(np.maximum(begun, tiny)))))
-
-
-def _range(optuna: Any, parameter: Parameter, start: Value) -> Any:
-    """Return the range of a parameter as Optuna has it, wide enough for the value that the search begins with."""
-    distributions = optuna.distributions
-    if parameter.tune is None:
-        return distributions.CategoricalDistribution(parameter.choices or (False, True))
-    assert not isinstance(start, (str, bool))
-    low, high = min(parameter.tune.low, start), max(parameter.tune.high, start)
-    log = parameter.tune.log and low > 0
-    if parameter.kind is int:
-        return distributions.IntDistribution(int(low), int(high), log=log)
-    return distributions.FloatDistribution(float(low), float(high), log=log)
+        return result_of(future)
+    except (ValueError, OSError) as error:
+        return error
 
 
 def grid(values: Mapping[str, Sequence[Value]]) -> Iterator[dict[str, Value]]:
@@ -340,13 +213,18 @@ def sweep(
     fleet: Fleet,
     combinations: Sequence[dict[str, Value]],
     progress: Callable[[int, int], None],
-) -> list[tuple[dict[str, Value], dict[str, Measured]]]:
-    """Measure every combination of parameters on every recording; return them in their order.
+) -> tuple[list[tuple[dict[str, Value], dict[str, Measured]]], dict[str, str]]:
+    """Measure every combination of parameters on every recording.
+
+    Returns:
+        The combinations in their order, and which recordings cannot be used, and why.
 
     Raises:
         ConfigError: parameters contradict each other.
         MeasureError, BagError, FleetError: a recording cannot be used.
     """
+    start, left_out = usable(plan, base, fleet)
+    plan = replace(plan, recordings=tuple(place for place in plan.recordings if place[0] in start))
     configs = [base.with_values(values) for values in combinations]
     questions = [
         Question(place, config, plan.topics, plan.objective) for config in configs for place in plan.recordings
@@ -356,10 +234,11 @@ def sweep(
         found[number] = measured
         progress(len(found), len(questions))
     n = len(plan.recordings)
-    return [
+    table = [
         (values, {place[0]: found[row * n + column] for column, place in enumerate(plan.recordings)})
         for row, values in enumerate(combinations)
     ]
+    return table, left_out
 
 
 def _lost(question: Question, words: str) -> Measured:

@@ -142,6 +142,9 @@ class BaNode(ManagedNode):
         host.ignoring.discard("inactive")
         for component in self._components:
             component.activate()
+        if self._kept is not None and self._kept[0].unseen:
+            self._kept[0].unseen = False
+            host.inbox.post(lambda backend: backend.estimate())
 
     def deactivate(self) -> None:
         """Hold the map, and ignore data."""

@@ -253,10 +253,22 @@ class MapTables:
     def _see(self, landmarks: IntArray, stamp_ns: int) -> None:
         self.landmarks.last_seen[landmarks] = np.maximum(self.landmarks.last_seen[landmarks], stamp_ns)
 
-    def _forget_keyframes(self) -> None:
-        """Forget the oldest keyframes with their observations: a tenth at once, so that the cost is spread."""
-        table = self.keyframes
-        n_drop = len(table) - self.config.max_keyframes + self.config.max_keyframes // 10
+    def _limit_keyframes(self) -> IdArray:
+        """Forget the oldest keyframes with their observations once there is too much of either; return their ids.
+
+        A tenth at once, so that the cost is spread; the two newest stay.
+        """
+        table, config, n_drop = self.keyframes, self.config, 0
+        if len(table) > config.max_keyframes:
+            n_drop = len(table) - config.max_keyframes + config.max_keyframes // 10
+        if len(self.observations) > config.max_observations:
+            excess = len(self.observations) - config.max_observations + config.max_observations // 10
+            seen = np.cumsum(np.bincount(self.observations.keyframe, minlength=len(table))[self.order])
+            n_drop = max(n_drop, 1 + int(np.searchsorted(seen, excess)))
+        n_drop = min(n_drop, len(table) - 2)
+        if n_drop <= 0:
+            return table.keyframe_id[:0]
+        forgotten = table.keyframe_id[self.order[:n_drop]]
         keep = np.ones(len(table), bool)
         keep[self.order[:n_drop]] = False
         self._drop_observations(keep[self.observations.keyframe])
@@ -264,6 +276,7 @@ class MapTables:
         self.observations.keyframe[:] = renumbered[self.observations.keyframe]
         self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
         self._index_keyframes()
+        return forgotten
 
     def _limit_landmarks(self) -> None:
         """Forget the landmarks seen longest ago, ties by row, once there are too many; again a tenth at once."""

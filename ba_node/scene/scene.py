@@ -143,7 +143,9 @@ class Scene(MapTables):
         for tracks in self.pending:
             self._reject_waiting(tracks)
         self.pending = []
-        self.constraints.reject_unknown(self.keyframes.keyframe_id, self.log)
+        stamps = self.keyframes.stamp_ns
+        span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
+        self.constraints.end(self.keyframes.keyframe_id, span, self.log)
 
     def refine_cameras(self, cameras: Cameras) -> None:
         """Take refined cameras in the place of the rig that came, which stays known as the same one."""
@@ -189,8 +191,9 @@ class Scene(MapTables):
         self._index_newest()
         self.constraints.add_step(keyframe.keyframe_id, keyframe.covariance, self.log)
         self.blocks.append([])
-        if len(self.keyframes) > self.config.max_keyframes:
-            self._forget_keyframes()
+        forgotten = self._limit_keyframes()
+        if len(forgotten):
+            self.constraints.forget(forgotten, int(self.keyframes.stamp_ns[self.order[0]]))
         self.propagate_corrections()
         self._place_pending()
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
-from ba_node.config import CalibrationConfig, Config, SolverConfig, SolverOptions
+from ba_node.config import METHOD_LOSSES, CalibrationConfig, Config, SolverConfig, SolverOptions
 from ba_node.core import geometry, methods, native_kernels, solver
 from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
@@ -68,10 +68,13 @@ _TOLD = (
 
 def options(config: SolverConfig, method: str = "", max_iterations: int = 0) -> SolverOptions:
     """Return the choices for a solve of everything: those of the parameters but for what is given, and finer."""
-    tolerance = min(config.function_tolerance, _FUNCTION_TOLERANCE)
+    given = config.function_tolerance
+    tolerance = min(given, _FUNCTION_TOLERANCE) if given >= 0.0 else _FUNCTION_TOLERANCE
     changed = dataclasses.replace(
         config,
         method=method or config.method,
+        # A method that is named after a loss brings it.
+        loss="auto" if method in METHOD_LOSSES else config.loss,
         max_iterations=max_iterations or MAX_ITERATIONS,
         function_tolerance=tolerance,
     )

@@ -129,20 +129,22 @@ def determined(
     first = np.ones(len(obs), bool)
     first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
     static = ~moves.take(obs.point)
-    views = np.bincount(obs.point[first], minlength=n_pt)
-    shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
-    known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
+    mostly = np.full(n_kf, True)
     # Several cameras, or depths, place points where nothing moves: if they place few, that is for the guard to say.
-    metric = len(problem.cameras.model) > 1 or bool(np.isfinite(obs.depth_m).any())
-    mostly = np.full(n_kf, True) if metric else known >= _LEAST_PLACED * shared
+    if len(problem.cameras.model) == 1 and not np.isfinite(obs.depth_m).any():
+        views = np.bincount(obs.point[first], minlength=n_pt)
+        shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
+        known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
+        mostly = known >= _LEAST_PLACED * shared
     while True:
         used = usable & keep_pt.take(obs.point)
-        keep_kf = mostly & (np.bincount(obs.keyframe, used & static, n_kf) >= MIN_OBSERVATIONS)
-        keep_kf &= np.bincount(obs.keyframe[used & static & first], minlength=n_kf) >= min_points
+        counted = used & static
+        keep_kf = mostly & (np.bincount(obs.keyframe[counted], minlength=n_kf) >= MIN_OBSERVATIONS)
+        keep_kf &= np.bincount(obs.keyframe[counted & first], minlength=n_kf) >= min_points
         used &= keep_kf.take(obs.keyframe)
-        seen_enough = np.bincount(obs.point, used, n_pt) >= 2
+        seen_enough = np.bincount(obs.point[used], minlength=n_pt) >= 2
         if len(obs.depth_m):
-            seen_enough |= np.bincount(obs.point, used & np.isfinite(obs.depth_m), n_pt) > 0
+            seen_enough |= np.bincount(obs.point[used & np.isfinite(obs.depth_m)], minlength=n_pt) > 0
         before, keep_pt = keep_pt, keep_pt & seen_enough
         if np.array_equal(keep_pt, before):
             break

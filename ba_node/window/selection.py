@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
-from ba_node.core.problem import Observations, Problem
+from ba_node.core.problem import KeyframeFactors, Observations, Problem
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, gauge, moving, odometry, old_keyframes, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
@@ -64,6 +64,7 @@ class Selection:
     place: IntArray  # (n_kf,) of each keyframe in the order of time
     measured: tuple[FloatArray, FloatArray]  # the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m
     strays: tuple[arrival.Stray, ...]  # keyframes that began in the wrong place
+    beside: tuple[KeyframeFactors, ...] = ()  # factors of the problem that are no steps of the front-end
 
     @cached_property
     def whole(self) -> Problem:
@@ -139,7 +140,8 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         held = gauge.Gauge(is_old, np.full(len(is_old), -1))
     active = dataclasses.replace(active, fixed=held.fixed)
     steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
-    factors = constraints.in_place(steps, constraints.factors(scene, config, active, part.keyframes, part.origin))
+    beside = constraints.factors(scene, config, active, part.keyframes, part.origin)
+    factors = constraints.in_place(steps, beside)
     factors += () if prior is None else (prior,)
     priors = constraints.point_priors(scene, config, part.landmarks, part.origin)
     return Selection(
@@ -162,6 +164,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         place=scene.places()[part.keyframes],
         measured=_measured(scene, part),
         strays=strays,
+        beside=tuple(beside),
     )
 
 

@@ -67,8 +67,12 @@ def test_points_behind_a_camera_and_seen_twice_are_told(tmp_path: Path, capsys: 
     image.point2D(free).xy = image.get_observation_points2D()[3].xy + 1.0
     world.add_observation(twice, pycolmap.TrackElement(image.image_id, free))
     model = written(world, tmp_path / "model")
-    figures = solved(model, tmp_path / "refined", "--refine", "none")
+    figures = solved(model, tmp_path / "refined")
     assert figures["problem"]["observations"] == 1001
+    again = pycolmap.Reconstruction(tmp_path / "refined")
+    assert 990 < again.compute_num_observations() < 1001
+    assert objective(again) == pytest.approx(figures["objective_after"], rel=1e-9)
+    assert figures["objective_after"] <= adjusted(world) * (1.0 + 1e-6)
     assert any("of points behind their camera at the start" in line for line in figures["attention"])
     capsys.readouterr()
     assert main(["convert", str(model), str(tmp_path / "scene.mcap")]) == 0

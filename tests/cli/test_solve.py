@@ -46,7 +46,7 @@ def test_solve_writes_trace_and_problem(bal_file: Path, tmp_path: Path, capsys: 
     assert report["objective_after"] < 1e-6 * report["objective_before"]
     assert all(b["objective"] <= a["objective"] for a, b in itertools.pairwise(rows))
     assert report["problem"] == {"file": "four.txt", "cameras": 4, "points": 30, "observations": 120}
-    assert report["method"] == "local_dinm"
+    assert report["method"] == "local_irls"
     assert report["options"]["max_iterations"] == 40
     assert report["setup_s"] > 0.0
     assert report["peak_rss_mb"] > 10.0
@@ -104,7 +104,15 @@ def test_kernels_that_cannot_do_it_are_named() -> None:
 def test_without_settings_the_method_is_as_declared() -> None:
     for name in methods.METHODS:
         assert solver_options(name, []) == methods.options(name)
-        assert describe(methods.options(name))["method"] == name
+        assert describe(methods.options(name))["method"] == (name if name != "auto" else "local_irls")
+
+
+@pytest.mark.parametrize("loss", ["truncated_quadratic", "geman_mcclure"])
+def test_a_loss_with_a_plateau_is_led_up_to_unless_that_is_not_wanted(loss: str) -> None:
+    assert solver_options("auto", [f"loss={loss}", "gamma=1"]).annealing == "gnc"
+    assert solver_options("auto", [f"loss={loss}", "gamma=1", "annealing=none"]).annealing == "none"
+    with pytest.raises(ConfigError, match="annealing = gnc with loss = huber"):
+        solver_options("irls_tq", ["loss=huber"])
 
 
 @pytest.mark.parametrize(
@@ -124,14 +132,13 @@ def test_without_settings_the_method_is_as_declared() -> None:
         ("loss=huber", "without loss_scale_px (gamma): method local_dinm has none"),
         ("solver.loss=huber", "without loss_scale_px (gamma)"),
         ("gamma=0", "option loss_scale_px = 0.0: expected a number in [1e-06, 1e+06] px"),
-        ("linear_solver=cholesky", "only pcg stops at the boundary of a region"),
-        ("annealing=gnc", "take loss = truncated_quadratic or annealing = none"),
+        ("annealing=gnc", "take loss = truncated_quadratic or geman_mcclure, or annealing = none"),
         ("schur=X", "choose one of points, cameras, none, adaptive"),
         ("scaling=X", "choose one of none, identity, diag, inc"),
         ("damping=X", "choose one of none, identity, diag, inc"),
         ("damping_policy=X", "choose one of nielsen, fast"),
         ("linear_solver=X", "choose one of auto, cholesky, dense, sparse, pcg"),
-        ("preconditioner=X", "choose one of none, schur_block, b_block, schur_diag, b_diag"),
+        ("preconditioner=X", "choose one of none, schur_block, b_block, schur_diag, b_diag, b_literal"),
         ("parameterisation=X", "choose one of local, global"),
     ],
 )

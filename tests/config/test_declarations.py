@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from ba_node.config import Config, ConfigError, SolverConfig, SolverOptions, declarations, declared, parse_assignment
+from ba_node.config.front_end import FrontEndOptions
+from ba_node.config.front_end_node import FrontEndNodeOptions
 from ba_node.core import methods
 from ba_node.offline.solver_settings import solver_options
 from ba_node.synthetic import SyntheticOptions
@@ -40,6 +42,8 @@ def test_each_option_is_declared_exactly_once() -> None:
     names = {
         "config/solver.py": len(declared(SolverOptions)),
         "config": len(declarations()) - len(declared(SolverConfig)),
+        "config/front_end.py": len(declared(FrontEndOptions)),
+        "config/front_end_node.py": len(declared(FrontEndNodeOptions)),
         "synthetic/options.py": len(declared(SyntheticOptions)),
     }
     counted = {
@@ -53,7 +57,8 @@ def test_nothing_else_repeats_a_default_of_the_solver() -> None:
     options = {option.name: option.default for option in declared(SolverOptions)}
     # A factor has a loss of its own; for PCG itself 0 is the sign that q_eps is not to be used.
     others = [(file, name) for file, name, default in defaults() if name in options and default == options[name]]
-    assert others == [("core/factors.py", "loss"), ("core/linear.py", "q_eps")]
+    factors = {("core/factors.py", "loss"), ("core/priors.py", "loss")}
+    assert set(others) == {*factors, ("core/linear.py", "q_eps")}
 
 
 def test_parameters_of_the_solver_are_options_of_the_core() -> None:
@@ -64,6 +69,10 @@ def test_parameters_of_the_solver_are_options_of_the_core() -> None:
         same = dataclasses.replace(
             parameter, name=option.name, default=option.default, doc=option.doc, allowed=option.allowed
         )
+        if parameter.name == "solver.function_tolerance":
+            # Below its range stands what the method has.
+            assert parameter.default == parameter.minimum == -1.0
+            same = dataclasses.replace(same, minimum=option.minimum)
         assert same == option
         assert parameter.allowed[: len(option.allowed)] == option.allowed
 

@@ -95,15 +95,16 @@ def test_taylor_remainder_falls_with_slope_two(
     assert order == pytest.approx(2.0, abs=0.1), f"slope {order:.3f}"
 
 
-@pytest.mark.parametrize("graduation", [np.inf, 0.5])
+@pytest.mark.parametrize("per", ["observation", "component"])
+@pytest.mark.parametrize("graduation", [np.inf, 0.5, 0.0])
 @pytest.mark.parametrize("loss", list(LOSSES))
 @pytest.mark.parametrize("shape", SHAPES)
 def test_gradient_is_that_of_the_robust_objective(
-    loss: str, graduation: float, shape: dict[str, bool], make_problem: Make
+    loss: str, graduation: float, per: str, shape: dict[str, bool], make_problem: Make
 ) -> None:
     """g = J' W r, by two routes: the linearisation, and central differences of the objective alone."""
     problem, _ = make_problem(start_error=0.02, **shape)
-    objective = Objective(problem, SolverOptions(loss=loss, loss_scale_px=1.5))
+    objective = Objective(problem, SolverOptions(loss=loss, loss_scale_px=1.5, loss_per=per))
     objective.graduation = graduation
     lin = objective.linearise(problem.start)
     assert lin.objective == pytest.approx(objective.value(problem.start), rel=1e-14)
@@ -118,6 +119,19 @@ def test_gradient_is_that_of_the_robust_objective(
 
 def _weighted_product(objective: Objective, problem: Problem, step: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     return product(objective, problem.start, step)
+
+
+def test_the_loss_of_components_is_the_sum_of_both(make_problem: Make) -> None:
+    """(4.20): Psi of u and of v, which for the squared loss is that of the observation."""
+    problem, _ = make_problem(start_error=0.02)
+    r = Objective(problem, SolverOptions()).errors(problem.start) / problem.observations.sigma_px[:, None]
+    found = Objective(problem, SolverOptions(loss="huber", loss_per="component")).value(problem.start)
+    near = np.minimum(np.abs(r), 1.0)
+    assert found == pytest.approx(0.5 * np.sum(near * (2.0 * np.abs(r) - near)), rel=1e-12)
+    squared = [
+        Objective(problem, SolverOptions(loss_per=per)).value(problem.start) for per in ("observation", "component")
+    ]
+    assert squared[0] == pytest.approx(squared[1], rel=1e-14)
 
 
 class TestPointsBehind:

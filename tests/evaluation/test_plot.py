@@ -12,7 +12,7 @@ import pytest
 
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
-from ba_node.evaluation.plot import Comparison, draw
+from ba_node.evaluation.plot import Comparison, draw, ground_axes
 from ba_node.synthetic import SyntheticOptions, generate
 
 if TYPE_CHECKING:
@@ -51,3 +51,17 @@ def test_nothing_is_written_when_there_is_no_common_time(tmp_path: Path) -> None
 def test_matplotlib_is_imported_only_to_draw() -> None:
     code = "import sys, ba_node.evaluation.plot; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+
+
+def test_from_above_is_across_the_axis_along_which_nothing_goes() -> None:
+    way = np.linspace(0.0, 9.0, 20)
+    still = np.zeros(20)
+    assert ground_axes(np.stack([way, still, 2.0 * way], axis=1)) == (0, 2)
+    assert ground_axes(np.stack([still, way, still], axis=1)) == (0, 1)
+    assert ground_axes(np.empty((0, 3))) == (0, 1)
+
+
+def test_a_picture_without_a_reference_shows_what_was_moved(tmp_path: Path) -> None:
+    c = comparison()
+    draw(tmp_path / "a.png", Comparison(c.before, c.after, None, c.cloud))
+    assert matplotlib.image.imread(tmp_path / "a.png").shape[1] > 800

@@ -53,7 +53,7 @@ def test_half_a_pixel_lies_between_colmap_and_ours(tmp_path: Path) -> None:
 def test_a_solution_is_put_into_the_model_that_was_read(tmp_path: Path) -> None:
     world = make_model("SIMPLE_RADIAL", cameras_per_rig=2)
     read = read_colmap(written(world, tmp_path / "m"))
-    read.take(read.model)
+    read.take(read.model, np.zeros(len(read.views), dtype=bool))
     assert objective(read.world) == pytest.approx(objective(world), rel=1e-9)
     assert {image.name for image in read.world.images.values()} == {image.name for image in world.images.values()}
     assert [camera.num_points2D() for camera in read.world.images.values()] == [

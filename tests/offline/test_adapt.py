@@ -6,14 +6,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ba_node.cli.main import main
+from ba_node.estimate import Poses
 from ba_node.io.mcap import BagReader
 from ba_node.io.rig_file import rig_yaml
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.adapters import SOURCES
+from ba_node.synthetic import SyntheticData
 from tests.messages.adapters import layouts
 
 EVERY = {"openvins": 12, "vins_fusion": 9, "vins_mono": 5, "rtabmap": 12, "rtabmap_map": 12}
@@ -31,6 +35,43 @@ def test_every_keyframe_is_refined(source: str, tmp_path: Path, capsys: pytest.C
     report = json.loads((tmp_path / "replay" / "report.json").read_text())
     assert report["keyframes_refined"] == report["keyframes"] == EVERY[source]
     assert report["rms_px"]["refined"] < 0.32, report["rms_px"]
+
+
+def real_drive(path: Path) -> SyntheticData:
+    """Return what a recording of a real stereo odometry holds as if it had been made up."""
+    with BagReader(path) as reader:
+        found = [measurement for _, _, measurement in reader.measurements()]
+    (rig,) = [one for one in found if isinstance(one, CameraRig)]
+    keyframes = tuple(one for one in found if isinstance(one, Keyframe))
+    tracks = [one for one in found if isinstance(one, FeatureTracks)]
+    by_keyframe = tuple(
+        tuple(sorted((t for t in tracks if t.keyframe_id == k.keyframe_id), key=lambda t: t.camera_index))
+        for k in keyframes
+    )
+    guesses = [one for one in found if isinstance(one, LandmarkGuesses)]
+    ids = np.concatenate([one.track_id for one in guesses])
+    points = np.concatenate([one.position for one in guesses])
+    poses = Poses.of(keyframes)
+    return SyntheticData(rig, keyframes, by_keyframe, (None,) * len(keyframes), poses, points, ids, np.arange(len(ids)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["openvins", "vins_fusion", "rtabmap", "rtabmap_map"])
+def test_a_real_drive_in_each_layout(source: str, shared_data: Path, tmp_path: Path) -> None:
+    """KITTI, 26 keyframes, left camera alone with the odometry's steps; ids below 2^24 as they are there."""
+    data = real_drive(shared_data / "kitti-stereo-vo" / "kitti_stereo.mcap")
+    options: dict[str, dict[str, Any]] = {
+        "rtabmap": {"added": 10**6},
+        "vins_fusion": {"late": 0},
+        "rtabmap_map": {"stereo": True},
+    }
+    bag = layouts.write(tmp_path / "bag", getattr(layouts, source)(data, **options.get(source, {})))
+    out = tmp_path / "out.mcap"
+    assert main(["convert", str(bag), str(out), "--from", source, "--parallax", "0"]) == 0
+    assert main(["replay", str(out), "--out", str(tmp_path / "replay")]) == 0
+    report = json.loads((tmp_path / "replay" / "report.json").read_text())
+    assert report["keyframes_refined"] == report["keyframes"] == 26
+    assert report["rms_px"]["refined"] < 0.4, report["rms_px"]
 
 
 def test_the_last_calibration_is_taken(tmp_path: Path) -> None:
@@ -52,7 +93,7 @@ def test_without_local_bundle_adjustment_the_rig_is_given(tmp_path: Path, capsys
     bag = layouts.write(tmp_path / "bag", layouts.rtabmap(data, bundle=False))
     out, rig = tmp_path / "out.mcap", tmp_path / "rig.yaml"
     assert main(["convert", str(bag), str(out), "--from", "rtabmap"]) == 2
-    assert "give it as YAML" in capsys.readouterr().err
+    assert "give it as YAML (--rig FILE)" in capsys.readouterr().err
     assert not out.exists()
     rig.write_text(rig_yaml(data.rig)[0])
     assert main(["convert", str(bag), str(out), "--from", "rtabmap", "--rig", str(rig)]) == 0

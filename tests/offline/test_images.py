@@ -71,6 +71,7 @@ def read(path: Path, **request: Any) -> tuple[Any, list[Any]]:
         (stereo("/robot/left", "/robot/right"), {}),
         (stereo(end="image_raw/compressed", compressed=True), {}),
         (stereo("/z_first", "/a_second", "image_rect"), {}),  # the right one is told by its p
+        ([*stereo(), *stereo(end="image_raw/compressed", compressed=True)[2:]], {}),  # raw and compressed are one
         ([*stereo("/cam0", "/cam1"), image("/other/image", 1, 0)],
          {"topics": {"left": "/cam0/image_raw", "right": "cam1/image_raw"}}),
     ],
@@ -95,6 +96,14 @@ def test_depth_is_told_by_its_encoding(tmp_path: Path) -> None:
     assert frames[0][0].depth_m == pytest.approx(np.full(SIZE[::-1], 1.5))
 
 
+def test_topics_of_rectified_images_have_the_camera_of_p(tmp_path: Path) -> None:
+    messages = stereo(end="image_rect")
+    for sent in messages[:2]:
+        sent.message.d[0], sent.message.k[0] = -0.3, 60.0
+    rig = read(layouts.write(tmp_path / "bag", messages))[0].rig
+    assert (rig.intrinsics[0, 0], rig.distortion[0].tolist(), rig.position[1, 0]) == (50.0, [], pytest.approx(0.12))
+
+
 def test_odometry_comes_at_the_time_of_the_image(tmp_path: Path) -> None:
     messages = [info("/camera_info", "cam")]
     for i in range(4):
@@ -107,6 +116,29 @@ def test_odometry_comes_at_the_time_of_the_image(tmp_path: Path) -> None:
     assert source.mode == "mono"
     assert [pose.translation[0] for _, pose in frames] == pytest.approx([0.5, 1.5, 2.5])
     assert source.counted == {"no odometry": 1}
+
+
+def test_odometry_of_another_frame_is_said(tmp_path: Path) -> None:
+    pose = layouts.odometry(STEP_NS, "odom", [1, 0, 0], [0, 0, 0, 1], "base_link")
+    messages = [
+        info("/camera_info", "cam"),
+        image("/image_raw", STEP_NS, 0),
+        Sent("/odom", layouts.ODOMETRY, pose, STEP_NS),
+    ]
+    source, frames = read(layouts.write(tmp_path / "bag", messages), topics={"odometry": "/odom"})
+    assert len(frames) == 1 and source.counted == {"odometry of another frame": 1}
+    assert "no way from there to 'cam'" in source.notes["odometry of another frame"]
+
+
+def test_a_rig_is_given_or_recorded(tmp_path: Path) -> None:
+    """Without camera_info; of a rig for two, one camera takes the first."""
+    bag = layouts.write(tmp_path / "bag", [image("/cam0/image_raw", 1, 0), image("/cam1/image_raw", 1, 1)])
+    source, frames = read(bag, rig=a_rig())
+    assert (source.mode, len(frames), np.array_equal(frames[0][0].grey[0], picture(0))) == ("stereo", 1, True)
+    alone = layouts.write(tmp_path / "alone", [image("/cam0/image_raw", 1, 0)])
+    assert len(read(alone, rig=a_rig())[0].rig) == 1
+    with pytest.raises(BagError, match=r"stereo needs 2 cameras, and the rig has 1 \(left\)"):
+        read(bag, rig=read(alone, rig=a_rig())[0].rig)
 
 
 def test_what_is_missing_is_counted_with_figures(tmp_path: Path) -> None:
@@ -124,7 +156,9 @@ def test_what_is_missing_is_counted_with_figures(tmp_path: Path) -> None:
     [
         ([info("/a/camera_info", "a")], "cannot tell which images are meant of: none"),
         ([image(f"/c{i}/image", 1, i) for i in range(3)], "say --topic left=TOPIC"),
+        ([*stereo("/a/left", "/a/right"), *stereo("/b/left", "/b/right")], "cannot tell which images are meant"),
         (stereo()[2:], "no message on /left/camera_info"),
+        ([stereo()[0], *stereo()[2:]], "no message on /right/camera_info"),
         (
             [*stereo()[2:], info("/left/camera_info", "l", -0.1), info("/right/camera_info", "r")],
             "left and right are swapped",

@@ -30,7 +30,7 @@ from ba_node.synthetic import SyntheticOptions, generate
 from tests.ply import read_ply
 
 BAGS = sorted((Path(__file__).resolve().parents[2] / "bags").glob("*.mcap"))
-REPRODUCIBLE = ("trajectory.tum", "trajectory_input.tum", "points.ply", "refined.mcap", "effective.yaml")
+REPRODUCIBLE = ("trajectory.tum", "trajectory_input.tum", "points.ply", "refined.mcap", "effective.yaml", "details.npz")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.estimate import Cloud, Poses
+from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
+from ba_node.messages.factory import header_message
 from ba_node.offline.figures import figures
 from ba_node.offline.page import BROWSERS, PageError, browse, write_pictures
 from ba_node.offline.replay import Watch, replay
@@ -161,6 +163,7 @@ def large(folder: Path, keyframes: int, points: int) -> None:
     (folder / "report.json").write_text(json.dumps(report))
 
 
+@pytest.mark.slow
 def test_several_runs_stand_side_by_side(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(folder, other)
@@ -197,3 +200,33 @@ def test_without_plotly_the_picture_is_there_and_the_line_says_what_to_install(
 def test_a_folder_without_results_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(tmp_path)]) == 2
     assert f"{tmp_path}: no results of ba replay" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_residuals_are_drawn_on_the_image_where_there_is_one(folder: Path, tmp_path: Path) -> None:
+    """A copy of the recording with an image for one keyframe: that which sees the most."""
+    run = read_run(folder)
+    stamp = int(run.after.stamp_ns[int(run.details["shown_keyframe"])])
+    path = tmp_path / "with_images.mcap"
+    with BagReader(BAG) as reader, BagWriter(path) as writer:
+        for topic, kind, time_ns, data in reader.messages():
+            writer.write(topic, kind, reader.decode(topic, data), time_ns)
+        for image_ns, level in ((stamp - 1, 10), (stamp, 200)):
+            header = header_message(ROSBAGS_FACTORY, image_ns, "camera")
+            pixels = np.full(480 * 752, level, np.uint8)
+            fields = {"height": 480, "width": 752, "encoding": "mono8", "is_bigendian": 0, "step": 752, "data": pixels}
+            image = ROSBAGS_FACTORY.make("sensor_msgs/msg/Image", header=header, **fields)
+            writer.write("/camera/image_raw", "sensor_msgs/msg/Image", image, image_ns)
+    out = tmp_path / "out"
+    replay(path, out, Config())
+    found = read_run(out)
+    assert found.details["image_0"].shape == (480, 752)
+    assert (found.details["image_0"] == 200).all()
+    arrows = next(figure for figure in figures([found]) if figure.key == "residuals")
+    assert "in the keyframe that sees the most" in arrows.caption
+    (picture,) = arrows.layout["images"]
+    assert (picture["sizex"], picture["sizey"]) == (752, 480)
+    assert picture["source"].startswith("data:image/jpeg;base64,/9j/")
+    own = (found.details["keyframe"] == found.details["shown_keyframe"]) & ~found.details["outlier"]
+    drawn = np.frombuffer(base64.b64decode(arrows.data[0]["x"]["bdata"]), "<f4")
+    assert len(drawn) == 3 * np.count_nonzero(own) > 0

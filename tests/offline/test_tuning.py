@@ -17,7 +17,8 @@ from ba_node.io.parameters import read_parameters
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.offline.measure import Measured, Question, is_held_out, measure
 from ba_node.offline.recording import record
-from ba_node.offline.tuning import chosen, grid, preset, score_of
+from ba_node.offline.study import score_of
+from ba_node.offline.tuning import chosen, grid, preset
 
 pytest.importorskip("optuna", reason="needs Optuna: pip install ba_node[tune]")
 
@@ -68,6 +69,7 @@ def write(path: Path, keep: object) -> None:
 
 
 @pytest.mark.parametrize("bag", [MONO, pytest.param(STEREO, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_tracks_held_out_tell_bad_parameters_from_good_ones(bag: Path) -> None:
     good, bad = (measured(bag, "held_out", values) for values in ({}, BAD))
     assert (good.unit, bad.unit) == ("sigma", "sigma")
@@ -159,6 +161,7 @@ def test_several_processes_find_as_well_and_one_recording_is_kept(
     assert both["tuned"]["error"] < 0.5 * both["start"]["error"]
 
 
+@pytest.mark.slow
 def test_nothing_better_leaves_the_start_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tune"
     code = main(["tune", str(MONO), "--out", str(out), "--parameters", "scene.max_keyframes", "--trials", "2"])
@@ -179,6 +182,7 @@ def test_a_limit_of_latency_that_nothing_keeps_is_said(tmp_path: Path, capsys: p
     assert main([*arguments[:-1], "0"]) == 2
 
 
+@pytest.mark.slow
 def test_without_truth_tracks_that_are_held_out_decide(truthless: Path, tmp_path: Path) -> None:
     out = tmp_path / "sweep"
     arguments = ["sweep", str(truthless), "--out", str(out), "--values", "window.max_keyframes=4,20"]
@@ -216,3 +220,16 @@ def test_a_sweep_is_every_combination(tmp_path: Path, capsys: pytest.CaptureFixt
     assert errors[0] > 2.0 * errors[1]
     assert main([*arguments, "--values", "tracks.outlier_px=x"]) == 2
     assert "parameter tracks.outlier_px = 'x': expected float" in capsys.readouterr().err
+
+
+def test_a_recording_that_cannot_be_used_is_left_out_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(MONO.read_bytes()[:3000])
+    arguments = ["--out", str(tmp_path / "sweep"), "--values", "window.max_keyframes=20"]
+    assert main(["sweep", str(broken), str(MONO), *arguments]) == 3
+    shown = capsys.readouterr()
+    assert f"ba: error: {broken}: no message can be read" in shown.err
+    assert "mono_loop [m]" in shown.out
+    assert main(["sweep", str(broken), *arguments]) == 2

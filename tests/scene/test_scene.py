@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 
 from ba_node.config import SceneConfig
 from ba_node.core import geometry
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import (
+    CameraRig,
+    FeatureTracks,
+    GravityDirection,
+    Keyframe,
+    LandmarkGuesses,
+    Measurement,
+    PosePrior,
+    RelativePose,
+)
 from ba_node.scene.rejections import NOTES_KEPT, REASONS
 from ba_node.scene.scene import Scene
 
@@ -400,3 +409,38 @@ def test_rows_are_numbered_and_told_apart_without_regard_to_the_rest() -> None:
     for _ in range(2):
         assert scene.distinct(rows).tolist() == [3, 7, 9, 40]
         assert scene.numbers(rows, np.array([40, 7])).tolist() == [1, -1, 1, 0, -1, -1]
+
+
+def test_observations_are_bounded_however_many_an_image_shows() -> None:
+    """The oldest keyframes go, a tenth of the bound at once, and no row of what stays is lost."""
+    scene, n = scene_of(rig(), max_observations=1000), 0
+    for i in range(300):
+        ids = np.arange(10 * i, 10 * i + 60 + i % 7, dtype=np.uint64)
+        scene.add(keyframe(i))
+        scene.add(tracks(i, ids=ids))
+        assert len(scene.observations) <= 1000 + len(ids)
+        n = max(n, len(scene.observations))
+        assert int(scene.keyframes.keyframe_id[scene.order[-1]]) == i
+        last = scene.blocks[scene.order[-1]][0]
+        seen = scene.landmarks.track_id[scene.observations.landmark[last.begin : last.end]]
+        assert seen.tolist() == ids.tolist()
+    assert n > 950
+    scene.add(tracks(299, camera=1, ids=np.arange(5000, dtype=np.uint64)))
+    scene.add(keyframe(300))
+    assert scene.keyframes.keyframe_id.tolist() == [299, 300], "the newest stay, whatever they see"
+
+
+def test_what_hangs_on_forgotten_keyframes_is_forgotten_too() -> None:
+    scene, eye = scene_of(max_keyframes=20), np.eye(6)
+    origin, upright = np.zeros(3), np.array([0.0, 0, 0, 1])
+    for i in range(200):
+        scene.add(keyframe(i))
+        scene.add(RelativePose(0, i, i + 1, False, origin, upright, eye.ravel()))
+        scene.add(GravityDirection(0, i, np.array([0.0, 0, 1]), 0.01))
+        scene.add(PosePrior(i, "site", origin, upright, eye.ravel()))
+    kept = scene.keyframes.keyframe_id.tolist()
+    assert len(kept) <= 20
+    known = scene.constraints
+    assert list(known.relative) == [(key, key + 1) for key in kept]
+    assert list(known.gravity) == kept
+    assert [one.stamp_ns for one in known.absolute] == kept

@@ -3,9 +3,9 @@
 """Read what rtabmap_odom (`odom_info` with `odom`) and rtabmap_slam (`mapData`) publish, as their sources have it.
 
 Ids of ``odom_info`` are words of the local map (F2M odometry). A feature that matched none has an id too, which the
-next image gives to another one; so a row counts only if its word is in the local map, and if it was matched, as an
-inlier. Its lists are there only with ``Odom/FillInfoData``, cameras only with local bundle adjustment. After a reset
-the covariance of ``odom`` is 9999, and words begin anew.
+next image gives to another one; so a row counts only if its word is in the local map (if that is told), and if it was
+matched, as an inlier. Its lists are there only with ``Odom/FillInfoData``, cameras only with local bundle adjustment.
+After a reset the covariance of ``odom`` is 9999, and words begin anew.
 
 Ids of ``mapData`` are words of the vocabulary: two features of one image may have the same one, and are left out.
 Poses of its nodes are the odometry's. A node comes again when somebody subscribes, and may come without its words.
@@ -70,9 +70,9 @@ class Rtabmap(Source):
             self._begun = self._begun or not bad
             yield pose(message, self._session)
             return
-        if message.lost:
+        if _list(message, "lost", False):
             raise LayoutError("the odometry is lost", "lost")
-        for models in message.local_bundle_models[-1:]:
+        for models in _list(message, "local_bundle_models")[-1:]:
             cameras = [model.camera_info for model in models.models]
             yield from self._rig(cameras, [model.local_transform for model in models.models])
         yield self._features(message)
@@ -86,21 +86,15 @@ class Rtabmap(Source):
     def _features(self, info: Any) -> Features:
         ids = np.array(info.words_keys, np.float64).reshape(-1)
         if not len(ids):
-            why = "F2F odometry has no ids: Odom/Strategy 0" if info.type == _F2F else "set Odom/FillInfoData true"
+            is_f2f = _list(info, "type", 0) == _F2F
+            why = "F2F odometry has no ids: Odom/Strategy 0" if is_f2f else "set Odom/FillInfoData true"
             raise LayoutError(f"no words: {why}", "no_words")
         if len(info.words_values) != len(ids):
             raise LayoutError(f"{len(ids)} words_keys and {len(info.words_values)} words_values")
         uv, camera = side_by_side(info.words_values, self.cameras, self._width)
-        keys = np.array(info.local_map_keys, np.float64).reshape(-1)
-        if len(info.local_map_values) != len(keys):
-            raise LayoutError(f"{len(keys)} local_map_keys and {len(info.local_map_values)} local_map_values")
-        order = np.argsort(keys, kind="stable")
-        row = np.searchsorted(keys, ids, sorter=order).clip(max=max(len(keys) - 1, 0))
-        known = keys[order][row] == ids if len(keys) else np.zeros(len(ids), bool)
-        point = nowhere(len(ids), 3)
-        if known.any():
-            point[known] = points(info.local_map_values)[order[row[known]]]
-        inliers = np.isin(ids, np.array(info.word_inliers)) | ~np.isin(ids, np.array(info.word_matches))
+        known, point = _in_local_map(info, ids)
+        matches, inliers = (np.array(_list(info, name)) for name in ("word_matches", "word_inliers"))
+        agrees = np.isin(ids, inliers) | (~np.isin(ids, matches) if len(matches) or not len(inliers) else False)
         return Features(
             stamp_ns_from_message(info.header.stamp),
             ids,
@@ -111,9 +105,9 @@ class Rtabmap(Source):
             wrong={
                 "ambiguous_word": repeated(ids, camera),
                 "not_in_the_local_map": ~known,
-                "outlier_of_the_source": ~inliers,
+                "outlier_of_the_source": ~agrees,
             },
-            is_keyframe=bool(info.key_frame_added),
+            is_keyframe=bool(_list(info, "key_frame_added", False)),
         )
 
 
@@ -154,8 +148,28 @@ class RtabmapMap(Source):
             normalised=nowhere(len(ids), 2),
             point=point[rows],
             point_in_body=True,
+            # That of a disparity is good near and bad far away.
+            has_depth=not len(_list(node.data, "right_camera_info")),
             wrong={"no_word": ids <= 0, "ambiguous_word": repeated(ids, camera[rows])},
         )
+
+
+def _list(message: Any, name: str, default: Any = ()) -> Any:
+    """Return a field that versions, or recordings that were thinned out, may lack."""
+    return getattr(message, name, default)
+
+
+def _in_local_map(info: Any, ids: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Return which words are in the local map, (n,), and their points, (n, 3); without a local map all may be."""
+    keys, values = np.array(_list(info, "local_map_keys"), np.float64), _list(info, "local_map_values")
+    if len(values) != len(keys):
+        raise LayoutError(f"{len(keys)} local_map_keys and {len(values)} local_map_values")
+    if not len(keys):
+        return np.ones(len(ids), bool), nowhere(len(ids), 3)
+    order = np.argsort(keys, kind="stable")
+    row = order[np.searchsorted(keys, ids, sorter=order).clip(max=len(keys) - 1)]
+    known = keys[row] == ids
+    return known, np.where(known[:, None], points(values)[row], np.nan)
 
 
 def rig_of(cameras: Sequence[Any], places: Sequence[Any]) -> CameraRig | None:

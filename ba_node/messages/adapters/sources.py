@@ -60,6 +60,7 @@ class Features:
     normalised: FloatArray  # (n, 2) the same without the camera: x / z and y / z, undistorted; NaN where unknown
     point: FloatArray  # (n, 3) in the fixed frame, or in the body, m; NaN where unknown
     point_in_body: bool = False
+    has_depth: bool = False  # points in the body tell a depth that was measured, by the same share near and far
     wrong: Mapping[str, BoolArray] = field(default_factory=dict)  # rows to leave out, by reason
     is_keyframe: bool = False  # the source says that it is one
 

@@ -16,25 +16,27 @@ from __future__ import annotations
 
 import functools
 import time
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import ReliabilityPolicy
 
-from ba_node.arrays import BoolArray
 from ba_node.config import declared
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.config.front_end_node import FrontEndNodeOptions
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Poses
 from ba_node.front_end.front_end import FrontEnd
-from ba_node.front_end.opencv import cv2
+from ba_node.front_end.images import read_mask
+from ba_node.front_end.opencv import cv2, poselib
 from ba_node.front_end.records import FrontEndError, State, Tracked
 from ba_node.front_end.streams import (
     MASK,
     MODES,
+    RECTIFIED,
     Frame,
     OdometryBuffer,
     Streams,
@@ -62,6 +64,12 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _LOOK_S, _LOG_S = 0.5, 5.0
 # Frames that wait for cameras, or for the odometry of their time.
 _MAX_WAITING = 30
+# Stamps of images further in the future are wrong, s.
+_MAX_AHEAD_S = 1.0
+# Messages that wait for a back-end.
+_MAX_UNSENT = 300
+# A publisher that began anew counts anew.
+_MAX_GAP = 10_000
 # Share of the time that tracking may take before images get lost.
 _BUSY = 0.95
 # A number of the first session that no run before has had, as long as clocks go on: seconds since 2020.
@@ -73,6 +81,8 @@ class FrontEndNode(ManagedNode):
 
     Raises:
         ConfigError: a parameter does not exist or has a wrong value.
+        RigError: there is no rig in the file that is named.
+        FrontEndError: there is no mask in the file that is named, or a library is missing.
     """
 
     def __init__(self, **node_options: Any) -> None:
@@ -81,6 +91,11 @@ class FrontEndNode(ManagedNode):
         values: dict[str, Any] = dict(declare(self, (*own, *tracking)))
         self.options = FrontEndNodeOptions(**{parameter.name: values[parameter.name] for parameter in own})
         self._tracking = FrontEndOptions(**{parameter.name: values[parameter.name] for parameter in tracking})
+        rig_file, mask_file = self.options.rig_file, self.options.mask_file
+        self._given_rig = read_rig(rig_file, rectified=self.options.rectified) if rig_file else None
+        for load in (cv2, poselib):
+            load()  # now: it takes as long as many images
+        self._mask = read_mask(mask_file) if mask_file else None
         self.counted: Counter[str] = Counter()  # images tracked and keyframes sent, and images left out by reason
         self._throttle, self._factory = Throttle(_LOG_S), RclpyFactory()
         self._entities: list[tuple[str, Any]] = []
@@ -96,17 +111,18 @@ class FrontEndNode(ManagedNode):
         """Make publishers and subscriptions; those to images follow when somebody publishes them."""
         self.cleanup()
         options = self.options
-        self._rig = read_rig(options.rig_file, rectified=options.rectified) if options.rig_file else None
+        self._rig = self._given_rig
         self._mode = "" if options.mode == "auto" else options.mode
         self._streams: Streams | None = None
         self._subscribed: dict[str, str] = {}  # topic by stream
+        self._numbers: dict[str, int | None] = {}  # of the last image, as its publisher counts
         self._infos: dict[str, Any] = {}
         self._tree, self._odometry = StaticTree(), OdometryBuffer()
         self._front_end: FrontEnd | None = None
-        self._mask = read_mask(options.mask_file) if options.mask_file else None
         self._frames: list[Frame] = []
+        self._unsent: deque[tuple[str, Any]] = deque(maxlen=_MAX_UNSENT)
         self._state: State | None = None
-        self._busy_s, self._said = 0.0, ""
+        self._busy_s, self._said, self._summary = 0.0, "", ""
         kinds = {name: INPUT_TYPES[name] for name in PUBLISHED}
         self._out = {name: self._own("publisher", message_class(kind), name, qos.profile(TOPICS[name]))
                      for name, kind in kinds.items()}  # fmt: skip
@@ -149,6 +165,7 @@ class FrontEndNode(ManagedNode):
 
     def _look(self) -> None:
         """Settle the mode, and subscribe to the images that it needs and that somebody publishes."""
+        self._publish_unsent()
         found = [mode for mode, names in MODES.items() if all(self._published(name) for name in names)]
         self._mode = self._mode or (found[0] if found else "")
         if not self._mode:
@@ -210,16 +227,32 @@ class FrontEndNode(ManagedNode):
         self._odometry.add(stamp_ns_from_message(stamp), pose)
         self._go_on()
 
-    def _on_image(self, name: str, message: Any) -> None:
+    def _on_image(self, name: str, message: Any, info: Mapping[str, Any]) -> None:
+        self._notice_losses(name, info["publication_sequence_number"])
         if not self._active or self._streams is None:
             return
-        before = self._streams.counted.copy()
-        self._frames += self._streams.put(name, stamp_ns_from_message(message.header.stamp), message)
+        before, stamp_ns = self._streams.counted.copy(), stamp_ns_from_message(message.header.stamp)
+        ahead_s = (stamp_ns - self.get_clock().now().nanoseconds) / 1e9
+        if ahead_s > _MAX_AHEAD_S:
+            self._warn(
+                "future", f"stamps of {name} are {ahead_s:.1f} s ahead of this machine's clock: set the clocks right"
+            )
+        self._frames += self._streams.put(name, stamp_ns, message)
         for reason in self._streams.counted - before:
             off = self._streams.apart_ns.get(reason.removeprefix("no "), 0)
             words = f", the nearest is {off / 1e6:+.1f} ms off" if off else ""
             self._warn(reason, f"{reason} for {self._streams.counted[reason]} images{words}")
         self._go_on()
+
+    def _notice_losses(self, name: str, number: int | None) -> None:
+        """Count images of a publisher that never came here: the numbers of the middleware leave none out."""
+        before, self._numbers[name] = self._numbers.get(name), number
+        if before is None or number is None or not 1 < number - before < _MAX_GAP:
+            return
+        if self.count_publishers(self._subscribed[name]) == 1:
+            self.counted[f"lost {name}"] += number - before - 1
+            words = "they come faster than they are tracked, or the network drops them (queue_depth, max_features)"
+            self._warn(f"lost {name}", f"{self.counted[f'lost {name}']} images of {name} never came: {words}")
 
     def _go_on(self) -> None:
         """Track the frames whose cameras and odometry are known, or that have waited long."""
@@ -267,7 +300,8 @@ class FrontEndNode(ManagedNode):
             if any(name not in self._infos for name in cameras):
                 return None
             infos = [self._infos[name] for name in cameras]
-            rig = rig_from_infos(infos, rectified=options.rectified, tree=self._tree, base=options.base_frame)
+            rectified = options.rectified or any(RECTIFIED in self._subscribed[name] for name in cameras)
+            rig = rig_from_infos(infos, rectified=rectified, tree=self._tree, base=options.base_frame)
             if options.base_frame not in ("", rig.frame_id):
                 raise ConversionError(f"/tf_static has no way from {options.base_frame!r} to {rig.names[0]!r} (yet)")
             self._rig = rig
@@ -278,19 +312,28 @@ class FrontEndNode(ManagedNode):
         return self._front_end
 
     def _send(self, measurement: Measurement, stamp_ns: int) -> None:
-        rig = self._rig
-        assert rig is not None
+        """Publish a measurement once the back-end listens; until then the newest of them wait."""
+        assert self._rig is not None
         if isinstance(measurement, Keyframe):
             self.counted["keyframes"] += 1
-            if not self._out["keyframes"].get_subscription_count():
-                self._warn("nobody", f"nobody listens to {self.resolve_topic_name('keyframes')}: keyframes are lost")
-            self._out["keyframes"].publish(conversion.keyframe_message(self._factory, measurement))
+            message = "keyframes", conversion.keyframe_message(self._factory, measurement)
         elif isinstance(measurement, LandmarkGuesses):
-            message = conversion.guesses_message(self._factory, measurement, stamp_ns, self.options.odom_frame)
-            self._out["landmark_guesses"].publish(message)
-        elif isinstance(measurement, FeatureTracks):
-            name = rig.names[measurement.camera_index]
-            self._out["feature_tracks"].publish(conversion.tracks_message(self._factory, measurement, stamp_ns, name))
+            frame = self.options.odom_frame
+            message = "landmark_guesses", conversion.guesses_message(self._factory, measurement, stamp_ns, frame)
+        else:
+            assert isinstance(measurement, FeatureTracks)
+            name = self._rig.names[measurement.camera_index]
+            message = "feature_tracks", conversion.tracks_message(self._factory, measurement, stamp_ns, name)
+        if len(self._unsent) == self._unsent.maxlen:
+            self._warn("nobody", f"nobody listens to {self.resolve_topic_name('keyframes')}: keyframes are lost")
+        self._unsent.append(message)
+        self._publish_unsent()
+
+    def _publish_unsent(self) -> None:
+        heard = all(self._out[name].get_subscription_count() for name in ("keyframes", "feature_tracks"))
+        while heard and self._unsent:
+            name, message = self._unsent.popleft()
+            self._out[name].publish(message)
 
     def _publish_pose(self, tracked: Tracked) -> None:
         """Publish where the body is now, with its covariance, and as a transform if nobody else does."""
@@ -317,18 +360,18 @@ class FrontEndNode(ManagedNode):
     def _report(self) -> None:
         """Log what has become of the images, and what is missing."""
         wanted = [name for name in MODES.get(self._mode, MODES["stereo"]) if name not in self._subscribed]
-        words = self.summary()
+        words = summary = self.summary()
         if wanted:
             words += f"; nobody publishes {' and '.join(map(self.resolve_topic_name, wanted))}"
             words += "" if self._mode else ", nor the images of another mode"
-        elif words == self._said and self._active:
+        elif summary == self._summary and self._active:
             words += f"; no image came for {_LOG_S:g} s"
         if self._busy_s > _BUSY * _LOG_S:
             words += f"; tracking takes all the time ({self._busy_s / _LOG_S:.0%}): images get lost, lower max_features"
-        self._busy_s = 0.0
+        self._busy_s, self._summary = 0.0, summary
         if words != self._said:
-            self._log(Severity.INFO if words == self.summary() else Severity.WARNING, words)
-            self._said = self.summary()
+            self._log(Severity.INFO if words == summary else Severity.WARNING, words)
+            self._said = words
 
     def summary(self) -> str:
         """Return in words what has become of the images."""
@@ -344,11 +387,3 @@ class FrontEndNode(ManagedNode):
 
     def _log(self, severity: Severity, words: str) -> None:
         log(self, severity, words)
-
-
-def read_mask(path: str) -> BoolArray:
-    """Return the mask in a picture, (h, w), False where it is black; raise FrontEndError if there is none."""
-    picture = cv2().imread(path, cv2().IMREAD_GRAYSCALE)
-    if picture is None:
-        raise FrontEndError(f"mask_file {path!r} is no picture that can be read")
-    return np.asarray(picture > 0)

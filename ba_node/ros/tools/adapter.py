@@ -151,13 +151,15 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("--rig", type=Path, nargs="+", metavar="FILE", help="cameras as YAML, in any form of ba rig")
     parser.add_argument("--tolerance", type=float, default=1e-3, metavar="S", help="stamps pair within (%(default)s)")
     parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")
-    parser.add_argument("--cameras", type=int, default=1, metavar="N", help="NUM_OF_CAM of vins_mono (%(default)s)")
+    parser.add_argument("--cameras", type=int, default=0, metavar="N", help="NUM_OF_CAM of vins_mono (rig's, or 1)")
     said = parser.parse_args(remove_ros_args(given)[1:])
     rclpy.init(args=given)
     try:
         rig = read_rig(*said.rig) if said.rig else None
         options = AdapterOptions(said.tolerance, said.parallax, rig=rig)
-        node = AdapterNode(said.source, Adapter(SOURCES[said.source](said.cameras), options))
+        node = AdapterNode(
+            said.source, Adapter(SOURCES[said.source](said.cameras or (len(rig) if rig else 1)), options)
+        )
     except (RigError, LookupError) as error:
         print(f"{NODE_NAME}: {error}{_HINT if isinstance(error, LookupError) else ''}", file=sys.stderr)
         rclpy.try_shutdown()

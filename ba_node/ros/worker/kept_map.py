@@ -28,6 +28,7 @@ class KeptMap:
 
     def __init__(self, config: Config, log: Callable[[Notice], None]) -> None:
         self._config, self._log = config, log
+        self.unseen = False  # a map was loaded that nobody has seen yet
         self._load, self._save = self._path("load_map"), self._path("save_map")
 
     def _path(self, name: str) -> Path | None:
@@ -53,6 +54,7 @@ class KeptMap:
             return
         try:
             backend.take_over(load_map(path, self._config.scene))
+            self.unseen = True
         except MapFileError as error:
             raise KeptMapError(f"node.load_map: {error}; give another file, or none") from error
 

@@ -45,7 +45,10 @@ int32[] word_matches
 int32[] word_inliers
 int32[] local_map_keys
 Point3f[] local_map_values""",
-    "SensorData": "sensor_msgs/CameraInfo[] left_camera_info\ngeometry_msgs/Transform[] local_transform",
+    "SensorData": """\
+sensor_msgs/CameraInfo[] left_camera_info
+sensor_msgs/CameraInfo[] right_camera_info
+geometry_msgs/Transform[] local_transform""",
     "Node": """\
 int32 id
 int32 map_id
@@ -293,7 +296,7 @@ def rtabmap(data: SyntheticData, *, bundle: bool = True, added: int = 1000) -> I
         yield Sent("/odom_info", "rtabmap_msgs/msg/OdomInfo", message, stamp)
 
 
-def rtabmap_map(data: SyntheticData) -> Iterator[Sent]:
+def rtabmap_map(data: SyntheticData, *, stereo: bool = False) -> Iterator[Sent]:
     """Yield what rtabmap_slam publishes: a node an image, one of them twice; one word is there twice, one is none."""
     before = None
     for now, (keyframe, tracks) in enumerate(images(data)):
@@ -306,6 +309,7 @@ def rtabmap_map(data: SyntheticData) -> Iterator[Sent]:
         data_of = make(
             "rtabmap_msgs/msg/SensorData",
             left_camera_info=[camera_info(data.rig, 0, keyframe.stamp_ns, "", rectified=True)],
+            right_camera_info=[camera_info(data.rig, 1, keyframe.stamp_ns, "", rectified=True)] if stereo else [],
             local_transform=[transform_at(data.rig.position[0], data.rig.orientation[0])],
         )
         back = np.argsort(rows)

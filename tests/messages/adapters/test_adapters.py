@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -207,7 +208,6 @@ def test_words_of_rtabmap_count_only_in_the_local_map_and_as_inliers() -> None:
         ({"lost": True}, "lost", "lost"),
         ({"words_values": []}, "malformed", "words_keys and 0 words_values"),
         ({"local_map_values": []}, "malformed", "local_map_keys and 0 local_map_values"),
-        ({"local_map_keys": np.zeros(0, np.int32), "local_map_values": []}, "not_in_the_local_map", "of"),
     ],
 )
 def test_what_rtabmap_leaves_out_is_said(change: dict[str, Any], reason: str, words: str) -> None:
@@ -219,6 +219,29 @@ def test_what_rtabmap_leaves_out_is_said(change: dict[str, Any], reason: str, wo
     assert words in made.notes[reason]
     assert any(reason in line for line in made.told())
     assert not of(Keyframe, out)
+
+
+def test_fields_of_rtabmap_that_may_be_empty() -> None:
+    """Without the local map or matches, inliers alone count; without these too, all words do."""
+    data = scene_of("rtabmap")
+    n = len(data.tracks[0][0].track_id)
+    empty, none = np.zeros(0, np.int32), {"local_map_keys": np.zeros(0, np.int32), "local_map_values": []}
+    for change, count in (
+        (none, n - 1 + 5),
+        ({**none, "word_matches": empty}, n - 1),
+        ({"word_matches": empty}, n - 1),
+        ({**none, "word_matches": empty, "word_inliers": empty}, n + 5),
+    ):
+        messages = list(layouts.rtabmap(data))[:2]
+        for name, value in change.items():
+            setattr(messages[1].message, name, value)
+        _, out = feed("rtabmap", messages)
+        assert len(of(FeatureTracks, out)[0].track_id) == count, change
+        assert bool(of(LandmarkGuesses, out)) == ("local_map_keys" not in change)
+    thin = list(layouts.rtabmap(data))[:2]
+    fields = ("header", "words_keys", "words_values", "word_inliers", "local_bundle_models")
+    thin[1] = thin[1]._replace(message=SimpleNamespace(**{name: getattr(thin[1].message, name) for name in fields}))
+    assert feed("rtabmap", thin)[0].sent == 1
 
 
 def test_a_reset_of_rtabmap_begins_a_session() -> None:
@@ -282,6 +305,8 @@ def test_what_waits_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> N
     made, _ = feed("openvins", clouds)
     assert made.counted["no_pose"] == 12 - 3
     assert made.notes["no_pose"].startswith("none came")
+    made, _ = feed("rtabmap", layouts.rtabmap(scene_of("rtabmap"), bundle=False))
+    assert made.counted["no_rig"] == 12 - 3 and "--rig FILE" in made.notes["no_rig"]
 
 
 @pytest.mark.parametrize("source", NAMES)

@@ -305,7 +305,9 @@ def test_a_map_is_saved_at_the_end_and_loaded_at_the_start(
         assert saved["keyframes/keyframe_id"].tolist() == [one.keyframe_id for one in scene.keyframes[:last]]
         assert saved["keyframes/refined"].all()
     node, peer = start_node(*kept), make_peer()
-    peer.until(lambda: "activate: done" in node.err, "the third run")
+    peer.listen("points")
+    peer.until(lambda: peer.received["points"], "the map of the runs before")
+    assert peer.received["points"][0].width > 50
     assert node.stop() == 0
     assert len(read_map(tmp_path / "site.npz").arrays["keyframes/keyframe_id"]) == KEYFRAMES
 

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 
+from ba_node.estimate import Correction
 from ba_node.messages.factory import header_message
+from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 
@@ -75,9 +81,9 @@ class Camera:
         self.peer, self.names, self.compressed = peer, names, compressed
         suffix, kind = ("/compressed", "CompressedImage") if compressed else ("", "Image")
         for name in names:
-            topics = {f"{name}/image_raw{suffix}": kind}
+            topics = {f"{name}/image_raw{suffix}".lstrip("/"): kind}
             if name != "depth":
-                topics[f"{name}/camera_info"] = "CameraInfo"
+                topics[f"{name}/camera_info".lstrip("/")] = "CameraInfo"
             for topic, one in topics.items():
                 made = peer.node.create_publisher(message_class(f"sensor_msgs/msg/{one}"), topic, qos.reliable(100))
                 peer.publishers[topic] = made
@@ -85,17 +91,17 @@ class Camera:
     def connect(self) -> None:
         self.peer.until(lambda: all(p.get_subscription_count() for p in self.peer.publishers.values()), "the node")
 
-    def publish(self, name: str, stamp_ns: int, pixels: Any, p: Any, encoding: str = "mono8") -> None:
+    def publish(self, name: str, stamp_ns: int, pixels: Any, p: Any, encoding: str = "mono8", frame: str = "") -> None:
         if name != "depth":
-            info = info_message(stamp_ns, p, pixels.shape[1::-1], name)
-            self.peer.publishers[f"{name}/camera_info"].publish(info)
+            info = info_message(stamp_ns, p, pixels.shape[1::-1], frame or name)
+            self.peer.publishers[f"{name}/camera_info".lstrip("/")].publish(info)
         if self.compressed:
             data = FACTORY.array(cv2.imencode(".png", pixels)[1].reshape(-1))
             message = message_class("sensor_msgs/msg/CompressedImage")(format="png", data=data)
             message.header = header_message(FACTORY, stamp_ns, name)
-            self.peer.publishers[f"{name}/image_raw/compressed"].publish(message)
+            self.peer.publishers[f"{name}/image_raw/compressed".lstrip("/")].publish(message)
         else:
-            self.peer.publishers[f"{name}/image_raw"].publish(image_message(stamp_ns, pixels, encoding))
+            self.peer.publishers[f"{name}/image_raw".lstrip("/")].publish(image_message(stamp_ns, pixels, encoding))
 
 
 def play(camera: Camera, kitti: Kitti, rows: range, apart_ns: int = 0) -> Iterator[int]:
@@ -117,6 +123,8 @@ def test_wrong_parameters_are_refused_in_a_line(start_node: StartNode) -> None:
     for argument, words in (
         ("mode:=fish", "option mode = 'fish': choose one of auto, stereo, rgbd, mono"),
         ("max_feature:=5", "'max_feature' does not exist; did you mean 'max_features'?"),
+        ("rig_file:=/no/rig.yaml", "/no/rig.yaml: cannot be opened"),
+        ("mask_file:=/no/mask.png", "mask /no/mask.png: no picture"),
         ("max_features:=5", "option max_features = 5: expected a number in [50, 10000]"),
     ):
         node = start_node("--ros-args", "-p", argument, program=PROGRAM)
@@ -145,12 +153,147 @@ def test_what_cannot_be_tracked_is_said_with_figures(start_node: StartNode, make
     assert node.out.startswith("stopped: 0 images, 0 keyframes; left out: no right/image_raw = "), node.out
 
 
-def test_pairs_are_tracked(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
-    node, peer = start_node("--ros-args", "-p", "mode:=stereo", program=PROGRAM), make_peer()
-    camera = Camera(peer, "left", "right")
+def at_10_hz(camera: Camera, kitti: Kitti, rows: range, again: Callable[[], None] = lambda: None) -> None:
+    """Publish pairs as a camera does, whatever the node is doing, and take messages in between."""
+    read = {(side, i): kitti.image(side, i) for i in rows for side in ("left", "right")}
+    began = time.monotonic()
+    for n, i in enumerate(rows):
+        while time.monotonic() < began + n * STEP_NS / 1e9:
+            camera.peer.executor.spin_once(timeout_sec=0.005)
+        again()
+        for side, p in zip(("left", "right"), kitti.p, strict=True):
+            camera.publish(side, BEGIN_NS + i * STEP_NS, read[side, i], p)
+
+
+def errors(kitti: Kitti, stamps: Any, position: Any) -> Any:
+    """Return the distances from the truth, m, of positions at stamps in ns; both begin at the first left camera."""
+    return np.linalg.norm(position - kitti.truth[(np.asarray(stamps) - BEGIN_NS) // STEP_NS, :, 3], axis=1)
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(51, marks=pytest.mark.slow)])
+def test_pairs_at_10_hz_come_back_as_refined_keyframes(
+    count: int, start_node: StartNode, make_peer: MakePeer, kitti: Kitti
+) -> None:
+    """None is dropped on the way, and the trajectory is as near to the truth as offline."""
+    back_end, node, peer = start_node(), start_node(program=PROGRAM), make_peer()
+    peer.listen("refined_keyframes", "report")
+    poses = peer.received["odometry"]
+    kind = message_class("nav_msgs/msg/Odometry")
+    peer.node.create_subscription(kind, "ba_front_end/odometry", poses.append, qos.reliable(1000))
+    camera = begin(peer, "left", "right")
+    peer.until(lambda: peer.node.count_subscribers("keyframes"), "the back-end")
+    at_10_hz(camera, kitti, range(count))
+    peer.until(lambda: poses and stamp_of(poses[-1]) == BEGIN_NS + (count - 1) * STEP_NS, "the last pose")
+    assert node.stop() == 0
+    said = re.fullmatch(r"stopped: (\d+) images, (\d+) keyframes; left out: nothing\n", node.out)
+    assert said and int(said[1]) == count, node.out
+    peer.until(lambda: len(peer.refined_ids()) == int(said[2]), "all keyframes")
+    assert back_end.stop() == 0
+    length_m = np.linalg.norm(np.diff(kitti.truth[:count, :, 3], axis=0), axis=1).sum()
+    at = [message.pose.pose.position for message in poses]
+    tracked = errors(kitti, [stamp_of(message) for message in poses], np.array([(p.x, p.y, p.z) for p in at]))
+    last = peer.received["refined_keyframes"][-1]
+    refined = errors(kitti, last.stamp_ns, np.asarray(last.position).reshape(-1, 3))
+    for name, error in (("tracked", tracked), ("refined", refined)):
+        assert error.max() < 0.1 + 0.01 * length_m, f"{name}: {error.max():.3f} m on {length_m:.1f} m"
+
+
+def as_back_end(peer: Any) -> None:
+    """Subscribe to keyframes and tracks: without both nothing is sent."""
+    for topic, kind in (("keyframes", "Keyframe"), ("feature_tracks", "FeatureTracks")):
+        take = peer.received[topic].append
+        peer.node.create_subscription(message_class(f"ba_msgs/msg/{kind}"), topic, take, qos.reliable(1000))
+
+
+def stamp_of(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def test_other_modes_and_compressed_images(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
+    """One compressed camera with odometry by TF from a base that /tf_static places."""
+    node = start_node(
+        "--ros-args", "-p", "odometry:=tf", "-p", "base_frame:=base_link", program=PROGRAM
+    )  # fmt: skip
+    peer = make_peer()
+    sent = peer.received["keyframes"]
+    as_back_end(peer)
+    rigs = peer.received["camera_rig"]
+    peer.node.create_subscription(message_class("ba_msgs/msg/CameraRig"), "camera_rig", rigs.append, qos.latched())
+    tf = message_class("tf2_msgs/msg/TFMessage")
+    static = peer.node.create_publisher(tf, "/tf_static", qos.latched())
+    moving = peer.publishers["/tf"] = peer.node.create_publisher(tf, "/tf", qos.reliable(100))
+    static.publish(tf_message(FACTORY, Correction("camera", np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0])),
+                              "base_link", 0))  # fmt: skip
+    camera = begin(peer, "", compressed=True)
+    for i in range(15):
+        image = kitti.image("left", i)
+        stamp = BEGIN_NS + i * STEP_NS
+        camera.publish("", stamp, image, kitti.p[0], frame="camera")
+        place = Correction("base_link", kitti.truth[i, :, 3], np.array([0.0, 0.0, 0.0, 1.0]))
+        moving.publish(tf_message(FACTORY, place, "odom", stamp))
+    peer.until(lambda: len(sent) >= 3, "keyframes")
+    assert sent[0].header.frame_id == "odom"
+    assert (rigs[0].header.frame_id, rigs[0].body_from_camera[0].position.z) == ("base_link", 1.0)
+    position = sent[-1].pose.pose.position
+    i = (
+        sent[-1].keyframe_id and (sent[-1].header.stamp.sec * 10**9 + sent[-1].header.stamp.nanosec - BEGIN_NS)
+    ) // STEP_NS
+    assert position.z == pytest.approx(kitti.truth[i, 2, 3], abs=0.05)
+    assert node.stop() == 0
+
+
+@pytest.mark.slow
+def test_depth_and_masks(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
+    """Depth from semi-global matching in mm; a mask that lets the lower half alone be seen; stamps in the future."""
+    node, peer = start_node("--ros-args", "-p", "mask_topic:=true", program=PROGRAM), make_peer()
+    as_back_end(peer)
+    camera = Camera(peer, "rgb", "depth")
+    kind = message_class("sensor_msgs/msg/Image")
+    peer.publishers["mask"] = peer.node.create_publisher(kind, "mask", qos.reliable(100))
     camera.connect()
+    match = cv2.StereoSGBM.create(0, 128, 5)
+    begin_ns = time.time_ns() + 10**10
+    for i in range(8):
+        left, right = kitti.image("left", i), kitti.image("right", i)
+        disparity = match.compute(left, right).astype(float) / 16.0
+        depth = np.where(disparity > 1.0, -kitti.p[1][3] / np.maximum(disparity, 1.0), 0.0)
+        mask = np.zeros_like(left)
+        mask[mask.shape[0] // 2 :] = 255
+        stamp = begin_ns + i * STEP_NS
+        camera.publish("rgb", stamp, np.dstack([left] * 3), kitti.p[0], "bgr8")
+        camera.publish("depth", stamp, np.minimum(depth * 1000.0, 65535).astype(np.uint16), kitti.p[0], "16UC1")
+        peer.publishers["mask"].publish(image_message(stamp, mask))
+    peer.until(lambda: len(peer.received["feature_tracks"]) >= 4, "tracks")
+    v = np.concatenate([np.asarray(message.v) for message in peer.received["feature_tracks"]])
+    assert len(v) > 200 and v.min() > left.shape[0] // 2 - 2
+    depth_m = np.concatenate([np.asarray(message.depth_m) for message in peer.received["feature_tracks"]])
+    assert 5.0 < np.nanmedian(depth_m) < 40.0
+    last = peer.received["keyframes"][-1]
+    moved = kitti.truth[(stamp_of(last) - begin_ns) // STEP_NS, 2, 3]
+    assert last.pose.pose.position.z == pytest.approx(moved, rel=0.1)
+    assert "ahead of this machine's clock" in node.err
+    assert node.stop() == 0
+
+
+@pytest.mark.slow
+def test_a_restart_of_the_node_is_another_session(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
+    node, peer = start_node(program=PROGRAM), make_peer()
+    sent = peer.received["keyframes"]
+    as_back_end(peer)
+    camera = begin(peer, "left", "right")
     for _ in play(camera, kitti, range(3)):
         pass
-    peer.until(lambda: "3 images" in node.err, "the log")
+    peer.until(lambda: sent, "a keyframe")
+    for transition in ("deactivate", "cleanup", "configure", "activate"):
+        request = ChangeState.Request(transition=Transition(label=transition))
+        client = peer.node.create_client(ChangeState, "ba_front_end/change_state")
+        peer.until(client.service_is_ready, "the service")
+        future = client.call_async(request)
+        peer.until(future.done, transition)
+        assert future.result().success, transition
+    camera.connect()
+    peer.until(lambda: node.err.count("is taken as right/image_raw") == 2, "the log")
+    for _ in play(camera, kitti, range(3, 6)):
+        pass
+    peer.until(lambda: sent[-1].session_id > sent[0].session_id, "another session")
     assert node.stop() == 0
-    assert node.out.startswith("stopped: 3 images"), node.out

@@ -1,0 +1,139 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Look at images before they are used, and say once what is wrong with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+
+import numpy as np
+
+from ba_node.arrays import FloatArray
+from ba_node.config.front_end import FrontEndOptions
+from ba_node.front_end import features, stereo
+from ba_node.front_end.patches import Floats
+from ba_node.front_end.records import Grey, Images
+from ba_node.front_end.rectify import IdealRig
+from ba_node.front_end.tracking import Frame
+from ba_node.measurements import CameraRig
+
+# Spread of grey values below which there is nothing in an image.
+_DARK = 2.5
+_BACK_NS = 1_000_000_000
+# A pair of which so few features have a partner is looked at with left and right exchanged.
+_FEW_PARTNERS = 0.25
+# Share of an image that is found in any other by chance.
+_STRANGERS = 0.02
+# Corners that are tried, their distance from the border and the side of their patches, px.
+_TRIED, _RIM, _SIDE = 200, 12, 15
+
+
+class ImageWatch:
+    """Tells a cause once, until it is over."""
+
+    def __init__(self, rig: CameraRig, options: FrontEndOptions) -> None:
+        self._rig, self._options = rig, options
+        self._told: set[str] = set()
+        self.counts: Counter[str] = Counter()  # images by cause
+
+    def say(self, cause: str, text: str, notes: list[str]) -> None:
+        """Add a note, once until the cause is cleared."""
+        self.counts[cause] += 1
+        if cause not in self._told:
+            self._told.add(cause)
+            notes.append(text)
+
+    def clear(self, cause: str) -> None:
+        """Take a cause for over."""
+        self._told.discard(cause)
+
+    def look(self, images: Images, last_ns: int | None, notes: list[str]) -> Images | None:
+        """Return the images as they can be used, None if they cannot."""
+        if last_ns is not None and last_ns - _BACK_NS < images.stamp_ns <= last_ns:
+            self.say("stamp", f"stamp {images.stamp_ns} ns is not after the one before, {last_ns} ns: left out", notes)
+            return None
+        if not 1 <= len(images.grey) <= len(self._rig):
+            self.say("count", f"{len(images.grey)} images for a rig of {len(self._rig)} cameras: left out", notes)
+            return None
+        for index, grey in enumerate(images.grey):
+            expected = tuple(int(v) for v in self._rig.image_size[index])
+            size = (grey.shape[1], grey.shape[0])
+            if all(expected) and size != expected:
+                self.say(
+                    "size",
+                    f"camera {index} ({self._rig.names[index]!r}): image of {size[0]} x {size[1]} px where the"
+                    f" calibration is for {expected[0]} x {expected[1]}: left out; calibrate at this resolution,"
+                    " or scale the calibration",
+                    notes,
+                )
+                return None
+        if float(images.grey[0][::4, ::4].std()) < _DARK:
+            self.say(
+                "dark",
+                f"image at {images.stamp_ns} ns shows nothing (black, or covered): the map stays as it is",
+                notes,
+            )
+            return None
+        self.clear("dark")
+        return self._pair(images, notes)
+
+    def _pair(self, images: Images, notes: list[str]) -> Images:
+        """Return the images without a partner of another time or of another size."""
+        limit = self._options.max_skew_s
+        if abs(images.skew_ns) > limit * 1e9 and (len(images.grey) > 1 or images.depth_m is not None):
+            self.say(
+                "skew",
+                f"the second image is {images.skew_ns / 1e6:+.1f} ms off the first, more than max_skew_s ="
+                f" {1e3 * limit:g} ms: not taken for a pair; let the cameras be triggered together",
+                notes,
+            )
+            return dataclasses.replace(images, grey=images.grey[:1], depth_m=None)
+        if len(images.grey) < len(self._rig) and images.depth_m is None:
+            self.say("single", f"no second image at {images.stamp_ns} ns: followed in the first alone", notes)
+        if images.depth_m is not None and images.depth_m.shape != images.grey[0].shape:
+            found, expected = images.depth_m.shape[::-1], images.grey[0].shape[::-1]
+            self.say(
+                "depth_size",
+                f"depth of {found[0]} x {found[1]} px with an image of {expected[0]} x {expected[1]}: left out; depths"
+                " must be registered to the image (aligned_depth_to_color, depth_registered)",
+                notes,
+            )
+            return dataclasses.replace(images, depth_m=None)
+        return images
+
+    def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
+        """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""
+        assert frame.right is not None and frame.right_soft is not None
+        as_given = (frame.grey, frame.right, frame.soft, frame.right_soft)
+        exchanged = (frame.right, frame.grey, frame.right_soft, frame.soft)
+        ours, theirs = (_share(*images, rig) for images in (as_given, exchanged))
+        if theirs > 2.0 * ours and theirs > _FEW_PARTNERS:
+            self.say(
+                "swapped",
+                f"left and right images seem to be exchanged: {100 * theirs:.0f} % of them match the other way round,"
+                f" {100 * ours:.0f} % as given; exchange the topics, or the cameras in the rig",
+                notes,
+            )
+        elif ours < _STRANGERS:
+            self.say(
+                "strangers",
+                f"only {100 * ours:.0f} % of the first image are found in the second: check that both are of one time"
+                " and that the rig is theirs",
+                notes,
+            )
+
+
+def _share(first: Grey, second: Grey, soft: Floats, other_soft: Floats, rig: IdealRig) -> float:
+    """Return which share of an image's corners has a partner in the other, and is found from there again."""
+    uv = features.corners(first, np.ones(first.shape, bool), np.empty((0, 2)), _TRIED, _RIM)
+    begin = stereo.look_up(stereo.dense(first, second, first.shape[1] // 5, rig.baseline < 0.0), uv)
+    found = stereo.measure(soft, other_soft, uv, begin, _SIDE, np.zeros(len(uv)))
+    return float(found.found.mean()) if len(uv) else 0.0
+
+
+def covariance_of(found: FloatArray, fixed_from_camera: FloatArray) -> FloatArray:
+    """Return x, y, z, turn in the fixed frame of a covariance of turn and place in the camera's: (6, 6)."""
+    order = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+    R = np.kron(np.eye(2), fixed_from_camera)
+    return np.asarray(R @ found[order] @ R.T)

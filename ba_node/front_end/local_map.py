@@ -1,0 +1,161 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Remember points that were seen: a patch each, in the keyframe that it was cut from, and how far away it was there.
+
+A point hangs on its keyframe (its anchor): it moves with it when that is refined. Its distance is kept as inverse depth
+``w = 1 / Z``, in which errors of disparities are Gaussian and infinity is an ordinary value, with the slant of its
+surface, which is linear in the image too: ``w(p) = w + s_x p_x + s_y p_y`` is a plane. So where a patch appears in
+another camera (R, t from the anchor) is a homography, which matters: a road seen from a car that has moved by 2 m is
+bent by a third of a pixel over a patch.
+
+    m(p) = R K^-1 [x + p, 1] + t w(p),   W(p) = pi(m(p)) = W(0) + A p / (1 + g p),   A = dW/dp (0),   g = d log m_z / dp
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.estimate import Transform
+from ba_node.front_end.patches import Floats
+from ba_node.front_end.rectify import IdealRig
+
+# Inverse depths below this are as good as zero, 1/m.
+_FAR = 1e-4
+_MOST = 12_000
+
+
+@dataclass
+class Warp:
+    """Where patches appear in an image."""
+
+    uv: FloatArray  # (n, 2) px, NaN behind the camera
+    affine: FloatArray  # (n, 2, 2) A
+    bend: FloatArray  # (n, 2) g, 1/px
+    depth: FloatArray  # (n,) m in that camera
+
+    def __getitem__(self, rows: IntArray) -> Warp:
+        """Return some of them."""
+        return Warp(self.uv[rows], self.affine[rows], self.bend[rows], self.depth[rows])
+
+    @property
+    def scale(self) -> FloatArray:
+        """Return how much larger patches appear than in their anchor: (n,)."""
+        return np.asarray(np.sqrt(np.abs(np.linalg.det(np.nan_to_num(self.affine)))))
+
+
+class LocalMap:
+    """Points by row; a row keeps its number until :meth:`forget`."""
+
+    def __init__(self, rig: IdealRig, side: int) -> None:
+        self._rig = rig
+        self.track_id: IdArray = np.empty(0, np.uint64)
+        self.patch: Floats = np.empty((0, side + 2, side + 2), np.float32)
+        self.anchor: IntArray = np.empty(0, np.intp)  # keyframe, by its place in the lists below
+        self.uv = np.empty((0, 2))  # in the anchor's image, px
+        self.inverse_depth = np.empty(0)  # 1/m, in the anchor; NaN while unknown
+        self.sigma = np.empty(0)  # of it, 1/m
+        self.slant = np.empty((0, 2))  # s, 1/m a px
+        self.last_seen: IntArray = np.empty(0, np.intp)  # keyframe, by its place
+        self.views: IntArray = np.empty(0, np.intp)  # keyframes that saw it
+        self.keyframe_id: list[int] = []
+        self.rotation = np.empty((0, 3, 3))  # map from camera of keyframes
+        self.position = np.empty((0, 3))
+        self._next_id = 1
+
+    def __len__(self) -> int:
+        return len(self.track_id)
+
+    @property
+    def known(self) -> BoolArray:
+        """Return which points have a depth: (n,)."""
+        return np.isfinite(self.inverse_depth)
+
+    def add_keyframe(self, keyframe_id: int, camera_from_map: Transform) -> int:
+        """Add a keyframe; return its place."""
+        pose = camera_from_map.inverse()
+        self.keyframe_id.append(keyframe_id)
+        self.rotation = np.concatenate([self.rotation, pose.rotation[None]])
+        self.position = np.concatenate([self.position, pose.translation[None]])
+        return len(self.keyframe_id) - 1
+
+    def add(self, keyframe: int, uv: FloatArray, patch: Floats) -> IntArray:
+        """Add points of unknown depth that a keyframe sees; return their rows."""
+        n = len(uv)
+        rows = np.arange(len(self), len(self) + n)
+        ids = np.arange(self._next_id, self._next_id + n, dtype=np.uint64)
+        self._next_id += n
+        nowhere = np.full(n, np.nan)
+        place = np.full(n, keyframe, np.intp)
+        self.track_id = np.concatenate([self.track_id, ids])
+        self.patch = np.concatenate([self.patch, patch])
+        self.anchor = np.concatenate([self.anchor, place])
+        self.uv = np.concatenate([self.uv, uv])
+        self.inverse_depth = np.concatenate([self.inverse_depth, nowhere])
+        self.sigma = np.concatenate([self.sigma, nowhere])
+        self.slant = np.concatenate([self.slant, np.zeros((n, 2))])
+        self.last_seen = np.concatenate([self.last_seen, place])
+        self.views = np.concatenate([self.views, np.ones(n, np.intp)])
+        return rows
+
+    def place(self, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, slant: FloatArray) -> None:
+        """Set how far points are from their anchors."""
+        self.inverse_depth[rows], self.sigma[rows], self.slant[rows] = inverse_depth, sigma, slant
+
+    def move(self, rows: IntArray, keyframe: int, uv: FloatArray, patch: Floats) -> None:
+        """Give points another anchor, from which they are seen better; :meth:`place` them next."""
+        self.anchor[rows], self.uv[rows], self.patch[rows] = keyframe, uv, patch
+
+    def points(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return positions in the map (n, 3), m, and one standard deviation of each by its depth, a vector (n, 3)."""
+        w = np.maximum(self.inverse_depth[rows], _FAR)
+        ray = np.einsum("nij,nj->ni", self.rotation[self.anchor[rows]], self._rig.rays(self.uv[rows]))
+        position = self.position[self.anchor[rows]] + ray / w[:, None]
+        return position, ray * (self.sigma[rows] / (w * w))[:, None]
+
+    def warp(self, rows: IntArray, camera_from_map: Transform, unknown: float = 0.0) -> Warp:
+        """Return where points appear from a camera; those of unknown depth as at the inverse depth ``unknown``."""
+        anchor = self.anchor[rows]
+        R = camera_from_map.rotation @ self.rotation[anchor]
+        t = self.position[anchor] @ camera_from_map.rotation.T + camera_from_map.translation
+        w = self.inverse_depth[rows]
+        w = np.where(np.isfinite(w), np.maximum(w, 0.0), unknown)
+        m = np.einsum("nij,nj->ni", R, self._rig.rays(self.uv[rows])) + t * w[:, None]
+        by_p = R[:, :, :2] / self._rig.focal + t[:, :, None] * self.slant[rows][:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = np.where(m[:, 2:] > 1e-3, m[:, :2] / m[:, 2:], np.nan)
+            affine = (by_p[:, :2] - flat[:, :, None] * by_p[:, 2:]) * (self._rig.focal / m[:, 2])[:, None, None]
+            depth = m[:, 2] / np.maximum(w, _FAR)
+            bend = by_p[:, 2] / m[:, 2:]
+        return Warp(self._rig.focal * flat + self._rig.centre, affine, bend, depth)
+
+    def refine(self, track_id: IdArray, position: FloatArray) -> None:
+        """Take positions (n, 3) of points in the map, m."""
+        order = np.argsort(track_id, kind="stable")
+        at = order[np.clip(np.searchsorted(track_id[order], self.track_id), 0, len(order) - 1)]
+        rows = np.flatnonzero(track_id[at] == self.track_id)
+        anchor = self.anchor[rows]
+        ahead = np.einsum("nj,nj->n", position[at[rows]] - self.position[anchor], self.rotation[anchor][:, :, 2])
+        rows, ahead = rows[ahead > 1e-3], ahead[ahead > 1e-3]
+        w = 1.0 / ahead
+        known = self.known[rows]
+        self.slant[rows] *= np.where(known, w / np.where(known, np.maximum(self.inverse_depth[rows], _FAR), 1.0), 0.0)[
+            :, None
+        ]
+        self.inverse_depth[rows] = w
+        self.sigma[rows] = np.where(known, self.sigma[rows], 0.1 * w)
+
+    def forget(self) -> IntArray:
+        """Forget points that were seen longest ago, if there are too many; return the new row of each, -1 of none."""
+        n = len(self)
+        new = np.arange(n)
+        if n <= _MOST:
+            return new
+        keep = np.sort(np.argsort(-self.last_seen, kind="stable")[: _MOST * 3 // 4])
+        new = np.full(n, -1)
+        new[keep] = np.arange(len(keep))
+        for name in ("track_id", "patch", "anchor", "uv", "inverse_depth", "sigma", "slant", "last_seen", "views"):
+            setattr(self, name, getattr(self, name)[keep])
+        return new

@@ -1,0 +1,202 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Align many small patches with an image at once, to a few hundredths of a pixel.
+
+A template T(p), p in a square around 0, was cut from one image; in another image the same plane appears at
+``W(p) = x + A p / (1 + g p)``, a homography. Inverse-compositional Lucas-Kanade (Baker and Matthews, *Lucas-Kanade 20
+Years On*, IJCV 2004) with gain and offset: with S(p) = I(W(p)),
+
+    S = g (T + J e) + o,   J = dT/dp B,     e = H^-1 J' w S / g,    H = J' w J,     W <- W o (p - B e)
+
+where w is the window and B what may move: the place alone, or along a row with a slant (``stereo.py``). J is made
+orthogonal to 1 and T beforehand, so that g and o never enter.
+
+Why it has no bias towards whole pixels: noise of T enters J only by central differences, to which noise of T itself is
+uncorrelated; noise of I, which interpolation damps by how far between pixels it is, enters linearly. A symmetric
+or forward scheme multiplies it by its own gradient, the mean of which is not zero between pixels (pixel locking).
+Interpolation is linear, on images smoothed by :data:`SMOOTHING_PX`: what is left is below 0.015 px (a bicubic kernel as
+OpenCV has it is off by 0.04 px, as it does not keep a ramp).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ba_node.arrays import FloatArray
+from ba_node.front_end.opencv import cv2
+
+Floats = NDArray[np.float32]
+# Steps shorter than this end an alignment, px.
+_STEP_PX = 0.005
+_LEAST_STD = 0.5
+_STRIDE = 2
+
+
+@cache
+def grid(side: int) -> Floats:
+    """Return which pixels of a patch are compared, around its centre: (P, 2) x, y; every second in row and column.
+
+    Images are smoothed, so those between tell little more.
+    """
+    half = side // 2
+    along = np.arange(-half, half + 1, _STRIDE, dtype=np.float32)
+    x, y = np.meshgrid(along, along)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+@cache
+def window(side: int) -> Floats:
+    """Return the weight of each pixel of a patch, (side^2,), sum 1: Gaussian, with a third of the side as its sigma."""
+    p = grid(side)
+    weight = np.exp(-0.5 * (p * p).sum(axis=1) / (side / 3.0) ** 2)
+    return np.asarray(weight / weight.sum(), dtype=np.float32)
+
+
+def sample(image: Floats, x: Floats, y: Floats) -> Floats:
+    """Return an image at places (n, m) each, px; beyond its border as at the border."""
+    if not x.size:
+        return np.empty(x.shape, np.float32)
+    out: Floats = cv2().remap(image, x, y, cv2().INTER_LINEAR, borderMode=cv2().BORDER_REPLICATE)
+    return out
+
+
+def cut(image: Floats, uv: FloatArray, side: int) -> Floats:
+    """Return patches around uv (n, 2), with a border of one pixel: (n, side + 2, side + 2)."""
+    half = side // 2 + 1
+    along = np.arange(-half, half + 1, dtype=np.float32)
+    x, y = np.meshgrid(along, along)
+    at = uv.astype(np.float32)
+    values = sample(image, at[:, :1] + x.ravel(), at[:, 1:] + y.ravel())
+    return values.reshape(-1, side + 2, side + 2)
+
+
+@dataclass(frozen=True)
+class Templates:
+    """Patches ready to be found."""
+
+    side: int
+    values: Floats  # (n, P), weighted mean 0
+    weighted: Floats  # (n, P) values times window
+    std: Floats  # (n,) weighted standard deviation
+    jacobian: Floats  # (n, k, P) change by each of k movements, orthogonal to 1 and T, times window
+    hessian: FloatArray  # (n, k, k)
+
+    @classmethod
+    def of(cls, patches: Floats, basis: str, prior: FloatArray | None = None) -> Templates:
+        """Prepare patches as :func:`cut` gives them.
+
+        Args:
+            patches: (n, side + 2, side + 2).
+            basis: ``place`` (2 movements: x, y), or ``row`` (3: x, x by p_x, x by p_y).
+            prior: (k,) added to the diagonal of the Hessian, grey values squared.
+        """
+        side = patches.shape[1] - 2
+        w = window(side)
+        k = _STRIDE
+        values = patches[:, 1:-1:k, 1:-1:k].reshape(len(patches), -1)
+        dx = (0.5 * (patches[:, 1:-1:k, 2::k] - patches[:, 1:-1:k, :-2:k])).reshape(values.shape)
+        values = values - (values @ w)[:, None]
+        weighted = values * w
+        variance = np.einsum("np,np->n", values, weighted)
+        if basis == "place":
+            dy = (0.5 * (patches[:, 2::k, 1:-1:k] - patches[:, :-2:k, 1:-1:k])).reshape(values.shape)
+            jacobian = np.stack([dx, dy], axis=1)
+        else:
+            p = grid(side)
+            jacobian = np.stack([dx, dx * p[:, 0], dx * p[:, 1]], axis=1)
+        jacobian -= (jacobian @ w)[..., None]
+        along = np.einsum("nkp,np->nk", jacobian, weighted) / np.maximum(variance, _LEAST_STD**2)[:, None]
+        jacobian -= along[..., None] * values[:, None]
+        moved = jacobian * w
+        hessian = np.matmul(moved, jacobian.transpose(0, 2, 1)).astype(np.float64)
+        if prior is not None:
+            hessian += np.diag(prior)
+        return cls(side, values, weighted, np.sqrt(variance), moved, hessian)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Where templates were found."""
+
+    uv: FloatArray  # (n, 2) px
+    slant: FloatArray  # (n, 2) of ``row``: change of x' - x by p_x and by p_y; 0 of ``place``
+    correlation: FloatArray  # (n,) of template and image, -1 to 1
+    covariance: FloatArray  # (n, k, k) of the movements, px^2, by what is left unexplained
+    step_px: FloatArray  # (n,) length of the last step
+
+
+def align(
+    templates: Templates,
+    image: Floats,
+    uv: FloatArray,
+    affine: FloatArray,
+    bend: FloatArray | None = None,
+    iterations: int = 10,
+) -> Aligned:
+    """Find templates in an image, from a first place each.
+
+    Args:
+        templates: n of them.
+        image: (h, w) float32.
+        uv: (n, 2) first places, px.
+        affine: (n, 2, 2) A; its first row changes for templates of ``row``.
+        bend: (n, 2) g, 1/px; None for 0.
+        iterations: most steps.
+    """
+    n, k = len(templates), templates.hessian.shape[1]
+    p, w = grid(templates.side), window(templates.side)
+    place, a = uv.astype(np.float64).copy(), affine.astype(np.float64).copy()
+    inverse = np.linalg.pinv(templates.hessian, hermitian=True)
+    step = np.full(n, np.inf)
+    correlation, left = np.zeros(n), np.full(n, np.inf)
+    active = np.arange(n)
+    depth = None if bend is None else 1.0 / (1.0 + bend.astype(np.float32) @ p.T)
+    for _ in range(iterations):
+        s = _at(image, place[active], a[active], p, None if depth is None else depth[active])
+        s -= (s @ w)[:, None]
+        variance = np.maximum(np.einsum("np,np->n", s * w, s), 1e-6)
+        std = templates.std[active]
+        correlation[active] = (
+            np.einsum("np,np->n", s, templates.weighted[active]) / np.sqrt(variance) / np.maximum(std, 1e-6)
+        )
+        gain = std / np.sqrt(variance)
+        right = np.matmul(templates.jacobian[active], s[:, :, None])[:, :, 0].astype(np.float64) * gain[:, None]
+        e = np.einsum("nij,nj->ni", inverse[active], right)
+        left[active] = 2.0 * std**2 * np.maximum(1.0 - correlation[active], 0.0)
+        _move(place, a, active, e)
+        step[active] = np.linalg.norm(e[:, :2] if k == 2 else e[:, :1], axis=1)
+        active = active[(step[active] > _STEP_PX) & np.isfinite(step[active])]
+        if not len(active):
+            break
+    # As many independent values as pixels under the window.
+    independent = 1.0 / float((w * w).sum())
+    covariance = inverse * (left / independent)[:, None, None]
+    return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance, step)
+
+
+def _at(image: Floats, place: FloatArray, a: FloatArray, p: Floats, depth: Floats | None) -> Floats:
+    offset = np.matmul(a.astype(np.float32), p.T)
+    if depth is not None:
+        offset *= depth[:, None]
+    offset += place.astype(np.float32)[:, :, None]
+    return sample(image, offset[:, 0], offset[:, 1])
+
+
+def _move(place: FloatArray, a: FloatArray, rows: NDArray[np.intp], e: FloatArray) -> None:
+    """Compose warps with p - B e."""
+    if e.shape[1] == 2:
+        e = e * np.minimum(1.0, 3.0 / np.maximum(np.linalg.norm(e, axis=1), 1e-9))[:, None]
+        place[rows] -= np.einsum("nij,nj->ni", a[rows], e)
+        return
+    along = a[rows, 0, 0]
+    e = e * np.minimum(1.0, 3.0 / np.maximum(np.abs(e[:, 0]), 1e-9))[:, None]
+    place[rows, 0] -= along * e[:, 0]
+    a[rows, 0, 0] -= along * e[:, 1]
+    a[rows, 0, 1] -= along * e[:, 2]

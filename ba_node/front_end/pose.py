@@ -1,0 +1,125 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find the pose of a camera from points that it sees: by consensus (PoseLib's P3P in RANSAC), then weighted.
+
+The weighted step minimises ``sum rho(|C^-1/2 (u - pi(R X + t))|^2)`` by Gauss-Newton with Cauchy's rho, where C is the
+covariance of a pixel and of the point's own depth as it appears in the image: a point that is far has an uncertain
+depth, which matters for a camera that has come nearer and not for its turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ba_node.arrays import BoolArray, FloatArray
+from ba_node.core import geometry
+from ba_node.estimate import Transform
+from ba_node.front_end.opencv import poselib
+from ba_node.front_end.rectify import IdealRig
+
+_STEPS = 8
+_CAUCHY = 2.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Points and where they are seen."""
+
+    points: FloatArray  # (n, 3) in the map, m
+    uv: FloatArray  # (n, 2) px
+    sigma: FloatArray  # (n,) of u and of v, px
+    along: FloatArray  # (n, 3) one standard deviation of the point by its depth, a vector in the map, m
+
+    def __getitem__(self, rows: BoolArray) -> Seen:
+        """Return some of them."""
+        return Seen(self.points[rows], self.uv[rows], self.sigma[rows], self.along[rows])
+
+
+def consensus(rig: IdealRig, seen: Seen, error_px: float) -> tuple[Transform, BoolArray] | None:
+    """Return camera from map, and which points agree with it to so many pixels; None where RANSAC finds nothing."""
+    if len(seen.points) < 4:
+        return None
+    width, height = rig.size
+    camera = {"model": "PINHOLE", "width": width, "height": height, "params": [rig.focal, rig.focal, *rig.centre]}
+    pose, info = poselib().estimate_absolute_pose(
+        seen.uv,
+        seen.points,
+        camera,
+        {"max_reproj_error": error_px, "min_iterations": 50, "max_iterations": 1000, "seed": 1},
+        {},
+    )
+    agree = np.array(info.get("inliers", []), dtype=bool)
+    if agree.shape != (len(seen.points),) or agree.sum() < 4:
+        return None
+    return Transform(np.array(pose.R), np.array(pose.t)), agree
+
+
+def relative(rig: IdealRig, before: FloatArray, now: FloatArray, error_px: float) -> tuple[Transform, BoolArray] | None:
+    """Return camera now from camera before, 1 apart, by what both see (n, 2), px, and which agree."""
+    if len(before) < 8:
+        return None
+    width, height = rig.size
+    camera = {"model": "PINHOLE", "width": width, "height": height, "params": [rig.focal, rig.focal, *rig.centre]}
+    options = {"max_epipolar_error": error_px, "min_iterations": 100, "max_iterations": 2000, "seed": 1}
+    pose, info = poselib().estimate_relative_pose(before, now, camera, camera, options, {})
+    agree = np.array(info.get("inliers", []), dtype=bool)
+    length = float(np.linalg.norm(pose.t))
+    if agree.shape != (len(before),) or agree.sum() < 8 or length < 1e-9:
+        return None
+    return Transform(np.array(pose.R), np.array(pose.t) / length), agree
+
+
+def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Transform, FloatArray, FloatArray]:
+    """Return the weighted pose, its (6, 6) covariance (turn, place; of the camera) and each point's error in sigmas."""
+    pose = camera_from_map
+    for _ in range(_STEPS):
+        error, jacobian = _linear(rig, seen, pose)
+        weighted, _ = _weights(error)
+        H = np.einsum("nik,nil,n->kl", jacobian, jacobian, weighted)
+        H += (1e-9 * np.trace(H) + 1e-300) * np.eye(6)
+        step = np.linalg.solve(H, np.einsum("nik,ni,n->k", jacobian, error, weighted))
+        if not np.isfinite(step).all():
+            return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
+        pose = Transform(geometry.so3_exp(step[:3]), step[3:]).after(pose)
+        if np.linalg.norm(step) < 1e-8:
+            break
+    error, jacobian = _linear(rig, seen, pose)
+    weighted, size = _weights(error)
+    H = np.einsum("nik,nil,n->kl", jacobian, jacobian, weighted)
+    if not (np.isfinite(H).all() and np.isfinite(size).all()):
+        return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
+    return pose, np.linalg.inv(H + (1e-12 * np.trace(H) + 1e-300) * np.eye(6)), size
+
+
+def _weights(error: FloatArray) -> tuple[FloatArray, FloatArray]:
+    size = np.linalg.norm(error, axis=1)
+    return 1.0 / (1.0 + (size / _CAUCHY) ** 2), size
+
+
+def _linear(rig: IdealRig, seen: Seen, pose: Transform) -> tuple[FloatArray, FloatArray]:
+    """Return whitened errors (n, 2) and Jacobians (n, 2, 6) by turn and place."""
+    x = seen.points @ pose.rotation.T + pose.translation
+    z = np.maximum(x[:, 2], 1e-3)
+    f = rig.focal
+    by_point = np.zeros((len(x), 2, 3))
+    by_point[:, 0, 0] = by_point[:, 1, 1] = f / z
+    by_point[:, :, 2] = -f * x[:, :2] / (z * z)[:, None]
+    smear = np.einsum("nij,nj->ni", by_point, seen.along @ pose.rotation.T)
+    # C = s^2 I + m m':  C^-1/2 = (I - m m' k) / s with k as below.
+    m2 = (smear * smear).sum(axis=1)
+    s = seen.sigma
+    k = np.where(m2 > 0.0, (1.0 - 1.0 / np.sqrt(1.0 + m2 / (s * s))) / np.maximum(m2, 1e-300), 0.0)
+    whiten = (np.eye(2) - k[:, None, None] * smear[:, :, None] * smear[:, None]) / s[:, None, None]
+    error = seen.uv - (f * x[:, :2] / z[:, None] + rig.centre)
+    jacobian = np.concatenate([-by_point @ geometry.hat(x), by_point], axis=2)
+    return np.einsum("nij,nj->ni", whiten, error), whiten @ jacobian
+
+
+def errors(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> FloatArray:
+    """Return how far each point is from where a pose has it, in standard deviations: (n,)."""
+    if not len(seen.points):
+        return np.empty(0)
+    error, _ = _linear(rig, seen, camera_from_map)
+    return np.asarray(np.linalg.norm(error, axis=1))

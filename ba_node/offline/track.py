@@ -1,0 +1,215 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Track the images of a recording or a folder, and write what comes of it as a recording of keyframes and tracks.
+
+The back-end runs along: what it refines goes back to the tracker, as it does live. The recording holds what the tracker
+told, not what was refined.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.config.front_end import FrontEndOptions
+from ba_node.core import geometry
+from ba_node.estimate import Poses, Transform
+from ba_node.front_end import FrontEnd, Images, State, Tracked
+from ba_node.front_end.images import read_mask
+from ba_node.io.trajectory import read_tum
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.offline.images import ImageRequest, ImageSource, open_images
+from ba_node.offline.recording import record
+
+# Poses of an odometry further from an image than this are none of its time.
+_APART_NS = 50_000_000
+_TRUTH = "poses.txt"
+
+
+class TrackError(ValueError):
+    """Images of which no recording comes."""
+
+
+@dataclass(frozen=True)
+class TrackRequest:
+    """What to do with the images."""
+
+    images: ImageRequest = field(default_factory=ImageRequest)
+    options: FrontEndOptions = field(default_factory=FrontEndOptions)
+    mask: Path | None = None  # a picture, black where nothing is to be looked at
+    odometry: Path | None = None  # TUM file of fixed frame from body
+    config: Config = field(default_factory=Config)  # of the back-end that runs along
+
+
+def track(
+    path: Path,
+    out: Path,
+    request: TrackRequest,
+    clock: Callable[[], float] = lambda: 0.0,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> dict[str, Any]:
+    """Track images; write the recording; return what there is to tell.
+
+    Raises:
+        BagError: there are no images, or nothing tells their rig.
+        FrontEndError: the rig cannot be used, or a library is missing.
+        TrackError: no keyframe came of the images.
+        OSError: a file cannot be read or written.
+    """
+    with open_images(path, request.images) as source:
+        run = _Run(source, request, clock)
+        for done, (images, odometry) in enumerate(source.read(), start=1):
+            run.take(images, odometry)
+            progress(done, source.total)
+        run.end()
+        if not run.keyframes:
+            why = run.notes[-1] if run.notes else _left_out(source) or "no image could be used"
+            raise TrackError(f"{path}: no keyframe came of {source.total} images: {why}")
+        truth = _truth(path, source, run)
+        count = record(out, run.timeline(), truth)
+        return run.report() | {"source": path.name, "messages": count, "truth": truth is not None}
+
+
+class _Run:
+    """One pass over the images."""
+
+    def __init__(self, source: ImageSource, request: TrackRequest, clock: Callable[[], float]) -> None:
+        self.source, self.request = source, request
+        self.rig: CameraRig = source.rig
+        self.notes: list[str] = []
+        self.stamps: list[int] = []  # of all images
+        self.keyframes: list[Keyframe] = []
+        self.measurements: list[tuple[int, Measurement]] = []
+        self.states: Counter[str] = Counter()
+        self.busy_s = 0.0
+        self._clock = clock
+        self._front_end: FrontEnd | None = None
+        self._backend = Backend(request.config)
+        self._odometry = None if request.odometry is None else read_tum(request.odometry)
+        if self._odometry is not None:
+            self._rotation = geometry.matrix_from_quaternion(self._odometry.orientation)
+
+    def take(self, images: Images, odometry: Transform | None) -> None:
+        """Track images."""
+        began = self._clock()
+        front_end = self._front_end or self._begin(images)
+        tracked = front_end.process(images, odometry or self._pose_at(images.stamp_ns))
+        self.busy_s += self._clock() - began
+        self.stamps.append(images.stamp_ns)
+        self.states[tracked.state.value] += 1
+        self.notes += [note for note in tracked.notes if note not in self.notes]
+        self._add(tracked, front_end)
+
+    def _begin(self, images: Images) -> FrontEnd:
+        """Make the tracker; a rig that does not say how large its images are learns it from the first."""
+        sizes = [self.rig.image_size[i] if self.rig.image_size[i].all() else grey.shape[::-1]
+                 for i, grey in enumerate(images.grey)]  # fmt: skip
+        size = np.array(sizes, dtype=np.int64)
+        if len(size) == len(self.rig):
+            self.rig = dataclasses.replace(self.rig, image_size=size)
+        mask = None if self.request.mask is None else read_mask(self.request.mask)
+        self._front_end = FrontEnd(self.rig, self.request.options, mask=mask)
+        self._backend.add(self.rig)
+        return self._front_end
+
+    def _pose_at(self, stamp_ns: int) -> Transform | None:
+        """Return the odometry of a time from the file: the nearest pose, if it is near."""
+        if self._odometry is None:
+            return None
+        stamps = self._odometry.stamp_ns
+        after = bisect_left(stamps, stamp_ns)
+        near = min(
+            (i for i in (after - 1, after) if 0 <= i < len(stamps)), key=lambda i: abs(int(stamps[i]) - stamp_ns)
+        )
+        if abs(int(stamps[near]) - stamp_ns) > _APART_NS:
+            raise TrackError(
+                f"{self.request.odometry}: no pose within {_APART_NS * 1e-9:g} s of the image at {stamp_ns} ns;"
+                f" the nearest is at {int(stamps[near])} ns"
+            )
+        return Transform(self._rotation[near], self._odometry.position[near])
+
+    def _add(self, tracked: Tracked, front_end: FrontEnd) -> None:
+        """Keep what came of images, and refine the tracker's map."""
+        for measurement in tracked.measurements():
+            if isinstance(measurement, Keyframe):
+                self.keyframes.append(measurement)
+            self.measurements.append((self.keyframes[-1].stamp_ns, measurement))
+            self._backend.add(measurement)
+        if tracked.keyframe is not None:
+            self._backend.flush()
+            estimate = self._backend.solve()
+            if estimate is not None and estimate.report.status.usable:
+                front_end.refine(estimate.refined, estimate.cloud)
+
+    def end(self) -> None:
+        """Say what was left out."""
+        left = _left_out(self.source)
+        if left:
+            self.notes.append(left)
+        if self.states[State.LOST.value]:
+            self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
+
+    def timeline(self) -> Iterator[tuple[str, int, Measurement]]:
+        """Yield topic, stamp and measurement of all that is to be recorded."""
+        yield "camera_rig", self.measurements[0][0], self.rig
+        topics = {Keyframe: "keyframes", FeatureTracks: "feature_tracks", LandmarkGuesses: "landmark_guesses"}
+        for stamp_ns, measurement in self.measurements:
+            yield topics[type(measurement)], stamp_ns, measurement
+
+    def report(self) -> dict[str, Any]:
+        """Return what there is to tell."""
+        tracks = [one for _, one in self.measurements if isinstance(one, FeatureTracks)]
+        front_end = self._front_end
+        assert front_end is not None
+        turn = front_end.alignment
+        learned = None if turn is None or len(self.rig) < 2 else [*turn[0].tolist(), *turn[1].tolist()]
+        return {
+            "mode": self.source.mode,
+            "images": len(self.stamps),
+            "keyframes": len(self.keyframes),
+            "sessions": len({one.session_id for one in self.keyframes}),
+            "tracks": len(np.unique(np.concatenate([one.track_id for one in tracks]))),
+            "observations": sum(len(one.track_id) for one in tracks),
+            "states": dict(self.states),
+            "stereo_turn_px": learned,
+            "time_per_image_s": self.busy_s / max(len(self.stamps), 1),
+            "left_out": dict(self.source.counted),
+            "causes": front_end.counts,
+            "notes": self.notes,
+        }
+
+
+def _left_out(source: ImageSource) -> str:
+    """Return which images were left out by the reader, in words."""
+    parts = [
+        f"{count} images: {reason}{' (' + source.notes[reason] + ')' if reason in source.notes else ''}"
+        for reason, count in sorted(source.counted.items())
+    ]
+    return "left out " + "; ".join(parts) if parts else ""
+
+
+def _truth(path: Path, source: ImageSource, run: _Run) -> Poses | None:
+    """Return the true poses of keyframes from a folder in KITTI's layout: a line an image, world from first camera."""
+    file = path / _TRUTH
+    if not path.is_dir() or not file.exists() or source.rig.position[0].any():
+        return None
+    values = np.array(file.read_text().split(), dtype=np.float64)
+    if len(values) != 12 * source.total or source.total != len(run.stamps):
+        run.notes.append(f"{file}: {len(values)} numbers, expected 12 for each of {source.total} images: left aside")
+        return None
+    matrix = values.reshape(-1, 3, 4)
+    stamps: Sequence[int] = run.stamps
+    rows = np.array([bisect_left(stamps, one.stamp_ns) for one in run.keyframes])
+    ids = np.array([one.keyframe_id for one in run.keyframes], dtype=np.uint64)
+    rotation = geometry.nearest_rotation(matrix[rows, :, :3])
+    orientation = geometry.quaternion_from_matrix(rotation)
+    return Poses(ids, np.array(stamps, dtype=np.int64)[rows], matrix[rows, :, 3], orientation)
