@@ -121,11 +121,6 @@ class Backend:
         self.scene.config = config.scene
 
     @property
-    def _checks_setup(self) -> bool:
-        """Return True if a set-up that contradicts the tracks holds solves; what is to be refined may do so."""
-        return self.config.guard.check_setup and not self.config.calibration.wanted
-
-    @property
     def held(self) -> list[Keyframe]:
         """Return the keyframes that wait for others to tell what they are."""
         return self._sessions.held
@@ -200,7 +195,7 @@ class Backend:
         """
         if len(self.scene.keyframes) == 0:
             return None
-        wrong = self.setup.look(self.scene) if self._checks_setup else ""
+        wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
         estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
         return estimate if wrong else self.adjust() or estimate
@@ -268,7 +263,7 @@ class Backend:
 
     def take_check(self, check: Check) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
-        if not self._checks_setup or check.scene is not self.scene or not self.setup.take(check):
+        if not self.config.checks_setup or check.scene is not self.scene or not self.setup.take(check):
             return None
         self.map.hold_all(self.solve_count, self.setup.reason(self.scene))
         return self.estimate()
@@ -311,7 +306,7 @@ class Backend:
             return None
         found = taken.outcome(result.state, self.config)
         verdict = guard.decide(self.config, taken.selection, found)
-        wrong = self.setup.reason(self.scene) if self._checks_setup else ""
+        wrong = self.setup.reason(self.scene) if self.config.checks_setup else ""
         self.refusal = wrong or ("" if verdict.odd else verdict.reason)
         if self.refusal:
             self.map.hold(f"a solve of everything: {self.refusal}")

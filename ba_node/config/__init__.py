@@ -95,6 +95,11 @@ class Config:
     node: NodeConfig = field(default_factory=NodeConfig)
     diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
 
+    @property
+    def checks_setup(self) -> bool:
+        """Return True if a set-up that contradicts the tracks holds solves: not if it is what is to be refined."""
+        return self.guard.check_setup and not self.calibration.wanted
+
     def values(self) -> dict[str, Value]:
         """Return every parameter by its full name, in declaration order."""
         return {p.name: _get(self, p.name) for p in declarations()}
