@@ -26,6 +26,7 @@ __all__ = [
     "Status",
     "Transform",
     "WindowView",
+    "World",
 ]
 
 
@@ -139,6 +140,17 @@ class Correction:
 
 
 @dataclass(frozen=True)
+class World:
+    """Where the map lies in a frame that is fixed to the world."""
+
+    frame_id: str  # name of that frame
+    position: FloatArray  # (3,) of the map's origin, m
+    orientation: FloatArray  # (4,) world from map, unit quaternion x y z w
+    # (3,) latitude, longitude (deg, WGS 84), altitude over the ellipsoid (m) of its origin; None without GNSS
+    geodetic: FloatArray | None = None
+
+
+@dataclass(frozen=True)
 class WindowView:
     """What there is to see of a solve; rows as in ``Estimate.refined``."""
 
@@ -161,7 +173,11 @@ class Extras:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is published after a solve."""
+    """What is published after a solve.
+
+    That of a map shares with the one before what has not changed; path and cloud are put together when somebody looks
+    at them (``backend/whole_map.py``), and stay as they were, whatever becomes of the map.
+    """
 
     stamp_ns: int  # stamp of the newest keyframe, ns
     frame_id: str  # name of the map's frame
@@ -177,6 +193,7 @@ class Estimate:
     # (n_cloud, 3, 3) m^2, of the points; NaN where unknown. None unless a solve of everything was asked for it.
     point_covariance: FloatArray | None = None
     view: WindowView | None = None  # what there is to see; None likewise
+    world: World | None = None  # where the map lies in the world; None as long as that is not known
     map_index: int = 0  # number of the map; another one has another, whatever the session ids
 
     @property

@@ -21,11 +21,12 @@ from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
+from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
-from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform
+from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import full, quality, view
+from ba_node.window import full, old_keyframes, quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -90,6 +91,8 @@ class CurrentMap:
         completion: which keyframes are complete.
         report: of the last solve.
         correction: map from odom.
+        calibration: what solves of everything found of the cameras, against those that came; None if not asked for.
+        adjustments: how often a solve of everything went into it.
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
@@ -97,6 +100,8 @@ class CurrentMap:
         self.completion = Completion()
         self.report = SolveReport(reason="not solved yet")
         self.correction = MapCorrection()
+        self.calibration: Calibration | None = None
+        self.adjustments = 0
         self._trust = Trust()
 
     @property
@@ -234,6 +239,8 @@ class CurrentMap:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
             self.scene.moved(np.array(tried.without, np.intp))
+            rows = selection.keyframes, selection.landmarks, selection.origin
+            old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}
@@ -282,6 +289,8 @@ class CurrentMap:
             method=self.config.solver.method,
             rejected=dict(sorted(self.rejected.items())),
             warnings=self.warnings,
+            adjustments=self.adjustments,
+            merged_tracks=len(self.scene.constraints.renamed),
         )
 
     def rms_px(self, state: str = "refined") -> float:
@@ -304,8 +313,15 @@ class CurrentMap:
             cloud=MapCloud.taken(scene),
             report=self.report,
             correction=self._published(),
+            world=self.world(),
             map_index=self.index,
         )
+
+    def calibrate(self, found: Calibration) -> None:
+        """Take refined cameras for all that follows."""
+        self.scene.refine_cameras(found.cameras)
+        assert self.scene.given_cameras is not None
+        self.calibration = found.since(self.scene.given_cameras)
 
     def with_covariances(self, estimate: Estimate, taken: full.Optimization) -> Estimate:
         """Return an estimate of everything with the covariances of a solve of everything that was merged."""
@@ -315,6 +331,14 @@ class CurrentMap:
         poses = _rows_by_id(estimate.refined.keyframe_id, taken.keyframe_id, found.poses)
         points = None if found.points is None else _rows_by_id(estimate.cloud.track_id, taken.track_id, found.points)
         return dataclasses.replace(estimate, covariance=poses, point_covariance=points)
+
+    def world(self) -> World | None:
+        """Return where the map lies in the world, None if that is not known."""
+        known = self.scene.constraints
+        if known.map_from_world is None:
+            return None
+        rotation, translation = geometry.inverse(*known.map_from_world)
+        return World(known.world_frame, translation, geometry.quaternion_from_matrix(rotation), known.origin)
 
     def _published(self) -> Correction | None:
         transform = self.correction.published

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from ba_node.arrays import IntArray
 from ba_node.config import OutputConfig
-from ba_node.estimate import Cloud, Estimate
+from ba_node.estimate import Cloud, Estimate, World
+from ba_node.measurements import GlobalFix
 from ba_node.messages.cdr import cloud_message, path_message, pose_messages
-from ba_node.messages.factory import MessageFactory, float32, header_message
+from ba_node.messages.conversion import side_message
+from ba_node.messages.factory import MessageFactory, float32, header_message, pose_message
 from ba_node.messages.report import Report, report_message
 from ba_node.messages.topics import OUTPUT_TYPES
 
@@ -41,6 +43,8 @@ def output_messages(
             out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
     if "report" in wanted:
         out.append(("report", report_message(factory, Report(estimate.report), estimate.stamp_ns, estimate.frame_id)))
+    if estimate.world is not None and estimate.report.status.usable:
+        out += [(name, message) for name, message in _world(factory, estimate, estimate.world) if name in wanted]
     if estimate.replaces_map:
         if "path" in wanted:
             poses = estimate.trajectory[-config.path_max_poses :]
@@ -75,6 +79,16 @@ def _refined(factory: MessageFactory, estimate: Estimate) -> Any:
         position=factory.array(poses.position.reshape(-1)),
         orientation=factory.array(poses.orientation.reshape(-1)),
     )
+
+
+def _world(factory: MessageFactory, estimate: Estimate, world: World) -> Iterator[tuple[str, Any]]:
+    """Yield where the map lies in the world, and where that begins on the earth."""
+    header = header_message(factory, estimate.stamp_ns, world.frame_id)
+    pose = pose_message(factory, world.position, world.orientation)
+    yield "map_in_world", factory.make(OUTPUT_TYPES["map_in_world"], header=header, pose=pose)
+    if world.geodetic is not None:
+        fix = GlobalFix(estimate.stamp_ns, world.frame_id, world.geodetic, np.zeros(9), is_fix=True)
+        yield "world_origin", side_message(factory, fix)[1]
 
 
 def _points(estimate: Estimate, limit: int) -> bytes:

@@ -130,10 +130,24 @@ _ALL = (
         _SIDE,
     ),
     Topic(
+        "map_in_world",
+        "geometry_msgs/msg/PoseStamped",
+        "Where the map's origin is in the world's frame, once priors or GNSS tell; see docs/factors.md.",
+        _OUT,
+        _LATCHED,
+    ),
+    Topic(
+        "world_origin",
+        "sensor_msgs/msg/NavSatFix",
+        "Where the origin of that frame (east, north, up) is on the earth, with GNSS.",
+        _OUT,
+        _LATCHED,
+    ),
+    Topic(
         "pose_with_covariance",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "As `~/pose`, with a covariance against what the solve held fixed; with a robust loss its standard"
-        " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed.",
+        "As `~/pose`, with a covariance against what the solve held fixed; after `~/optimize` of the whole path"
+        " against the map's first keyframe. See docs/frames.md. Only while subscribed.",
         _SIDE,
     ),
     Topic(

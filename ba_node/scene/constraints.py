@@ -226,11 +226,19 @@ class Constraints:
         """Drop what hangs on keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
         gone = set(keyframes.tolist())
         self.relative = {key: value for key, value in self.relative.items() if gone.isdisjoint(key)}
+        self.unchecked = [key for key in self.unchecked if key in self.relative]
+        self.relative_of = {}
+        for key in self.relative:
+            for one in key:
+                self.relative_of.setdefault(one, []).append(key)
         self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}
+        self.steps = {key: value for key, value in self.steps.items() if key not in gone}
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
+        self.adjusted_at = max(0, self.adjusted_at - len(gone))
 
-    def reject_unknown(self, keyframes: IdArray, log: RejectionLog) -> None:
-        """Give up what names keyframes that never came."""
+    def end(self, keyframes: IdArray, span_ns: tuple[int, int], log: RejectionLog) -> None:
+        """Give up what names keyframes that never came; count what lies outside the time of all keyframes."""
+        log.notice("unpaired", sum(not span_ns[0] <= one.stamp_ns <= span_ns[1] for one in self.absolute))
         known = set(keyframes.tolist())
         for key in [key for key in self.relative if not known.issuperset(key)]:
             missing = next(one for one in key if one not in known)

@@ -35,7 +35,6 @@ REASONS: dict[str, str] = {
     "bad_merge": "A merge of two tracks that one image sees both, or that are one already or unknown.",
     "other_world": "A prior in another frame than the one that came first, or in none.",
     "no_geo": "A fix of GNSS where pymap3d is missing: pip install ba_node[geo].",
-    "unpaired": "A pose prior or a fix of GNSS without keyframes on both sides of its time.",
     "pending_overflow": "A message that waited for the camera rig, or for the first keyframe of its session, longer"
     " than scene.max_pending messages or until the end.",
 }
@@ -48,6 +47,7 @@ NOTICES: dict[str, str] = {
     "ids_reused": "A track whose views went over to another point; the older views keep theirs under another id.",
     "repeated_factor": "A second relative pose of the same keyframes, or gravity at the same; the first one stays.",
     "no_fix": "A message of a receiver that has no fix.",
+    "unpaired": "A pose prior or a fix of GNSS without keyframes on both sides of its time.",
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
     "empty_tracks": "A tracks message without rows.",
     "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
@@ -71,6 +71,7 @@ WARNINGS: dict[str, str] = {
     "equal_stamps": "Two keyframes have one stamp.",
     "reused_id": "An id was used for a second keyframe of the session.",
     "no_geo": "Fixes of GNSS are left out, as pymap3d is missing.",
+    "unaligned": "Priors or fixes that were not used, as the path is too short to tell where the map lies in them.",
     "not_adjusted": "A loop or priors that the map would have to be bent too far for, or that images contradict.",
     "setup": "A set-up that the tracks contradict: the likely mistake, and what to change. All solves are held.",
 }

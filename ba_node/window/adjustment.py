@@ -24,7 +24,7 @@ from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config, OdometryConfig, SolverOptions
 from ba_node.core import geometry, native_kernels, solver
 from ba_node.core.factors import RelativePoses
-from ba_node.core.priors import root_information
+from ba_node.core.priors import PosePriors, root_information
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, full
@@ -34,6 +34,8 @@ from ba_node.window.problems import problem_of
 _LEAST, _WIDE = 6, 3.0
 # What a step of the map is worth, by what one of the front-end's is; how far (rms, in sigmas) steps may be bent.
 _WORTH, _BENT = 1.0 / 3.0, 4.0
+# How far the first keyframe may be turned where nothing else tells.
+_UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
 _RECENT, _TELLING = 50, 4.0
 # And again once the map has grown by this share, and by so many keyframes.
@@ -60,6 +62,13 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
         return None
     if (known.absolute or known.landmarks) and known.map_from_world is None and constraints.align(scene, config):
         known.adjusted_at = len(scene.keyframes)
+    if final and (known.absolute or known.landmarks) and known.map_from_world is None:
+        n = len(known.absolute) + len(known.landmarks)
+        scene.log.warn(
+            "unaligned",
+            f"{n} priors in frame {known.world_frame!r} were not used: the path is too short, or they are too few or"
+            " too noisy, to tell where the map lies in it (factors.align_m)",
+        )
     found = _merged(scene, config, final) if known.merges else None
     found = found or (_measured(scene, config) if known.unchecked else None)
     return found or _left_the_world(scene, config, final)
@@ -69,7 +78,7 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
     """Bend the map, join tracks; return why not, in words, in which case nothing was changed."""
     known, table, order = scene.constraints, scene.keyframes, scene.order
     scene.propagate_corrections()
-    if known.absolute:
+    if known.absolute or known.landmarks:
         constraints.align(scene, config)
     place = scene.places()
     steps = _steps(scene, config.odometry)
@@ -78,10 +87,10 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
     others = tuple(kind.take(np.arange(len(kind)), place) for kind in what.loops)
     others += tuple(kind.take(np.arange(len(kind)), place) for kind in _loops(scene))
     world: tuple[KeyframeFactors, ...] = ()
-    if known.absolute and known.map_from_world is not None:
-        pairs = constraints.pair(scene, config.factors)
+    if known.map_from_world is not None:
+        pairs = constraints.every_pair(scene, config.factors)
         if len(pairs):
-            world = (constraints.absolute(scene, config, pairs, place[pairs.row], origin),)
+            world = constraints.absolute(scene, config, pairs, place[pairs.row], origin), _upright(scene)
     fixed = np.zeros(len(order), bool)
     fixed[0] = not world
     start = State(*geometry.inverse(table.rotation[order], table.position[order] - origin), *2 * (np.empty((0, 3)),))
@@ -103,9 +112,18 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
         return f"steps would have to be bent by {bent:.1f} of their standard deviations"
     rotation, position = geometry.inverse(state.rotation, state.translation)
     _move(scene, geometry.nearest_rotation(rotation)[place[rows]], (position + origin)[place[rows]])
+    # Where the world holds them they need no images.
+    table.refined[:] |= bool(world)
     join(scene, what.joined)
     known.adjusted_at = len(table)
     return ""
+
+
+def _upright(scene: Scene) -> PosePriors:
+    """Return what holds the first keyframe as it is turned: positions along a straight road do not tell its roll."""
+    root = np.diag(np.repeat([1.0 / _UPRIGHT_RAD, 0.0], 3))
+    first, none = scene.keyframes.rotation[scene.order[:1]], np.zeros((1, 3))
+    return PosePriors(np.array([[0]]), first, none, none, root[None])
 
 
 def _move(scene: Scene, rotation: FloatArray, position: FloatArray) -> None:
@@ -169,11 +187,11 @@ def _measured(scene: Scene, config: Config) -> Due | None:
 def _left_the_world(scene: Scene, config: Config, final: bool) -> Due | None:
     """Return whether recent absolute measurements agree that the map lies beside where they are."""
     known, n = scene.constraints, len(scene.keyframes)
-    if not known.absolute or known.map_from_world is None or config.factors.adjust_m <= 0.0:
+    if known.map_from_world is None or config.factors.adjust_m <= 0.0:
         return None
     if n - known.adjusted_at < (1 if final else max(_FEW, _GROWN * n)):
         return None
-    pairs = constraints.pair(scene, config.factors, max(n - _RECENT, 0))
+    pairs = constraints.every_pair(scene, config.factors, max(n - _RECENT, 0))
     if not len(pairs):
         return None
     rotation, translation = known.map_from_world

@@ -74,7 +74,7 @@ def pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
     """
     table, order = scene.keyframes, scene.order[max(first - 1, 0) :]
     stamps = table.stamp_ns[order]
-    since = bisect.bisect_left(scene.constraints.absolute, stamps[0], key=lambda one: one.stamp_ns)
+    since = bisect.bisect_left(scene.constraints.absolute, int(stamps[0]), key=lambda one: one.stamp_ns)
     known = scene.constraints.absolute[since:]
     time = np.array([one.stamp_ns for one in known], np.int64)
     after = np.searchsorted(stamps, time)
@@ -107,6 +107,29 @@ def pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
     )
 
 
+def every_pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
+    """Return the same, and points whose places are known: each by the last keyframe that sees it, as a point of that.
+
+    How far a point is from there is taken as known to a twentieth.
+    """
+    pairs, known, points = pair(scene, config, first), scene.constraints.landmarks, scene.landmarks
+    if not known:
+        return pairs
+    rows = scene.find_landmarks(np.fromiter(known, np.uint64, len(known)))
+    good = np.flatnonzero((rows >= 0) & points.has_position[rows] & (points.last[rows] >= 0))
+    seen = scene.observations.keyframe[points.last[rows[good]]].astype(np.intp)
+    recent = scene.places()[seen] >= first
+    good, seen = good[recent], seen[recent]
+    away = points.position[rows[good]] - scene.keyframes.position[seen]
+    priors = list(known.values())
+    covariance = np.array([_six(priors[i][1], config) for i in good]).reshape(-1, 6, 6)
+    covariance[:, 3:, 3:] += (0.05**2 * np.sum(away**2, axis=1))[:, None, None] * np.eye(3)
+    back = np.swapaxes(scene.keyframes.rotation[seen], 1, 2)
+    position = np.array([priors[i][0] for i in good]).reshape(-1, 3)
+    more = Pairs(seen, (back @ away[:, :, None])[..., 0], position, np.tile(np.eye(3), (len(good), 1, 1)), covariance)
+    return Pairs(*(np.concatenate(both) for both in zip(vars(pairs).values(), vars(more).values(), strict=True)))
+
+
 def _six(covariance: FloatArray, config: FactorsConfig) -> FloatArray:
     if len(covariance) == 6:
         return covariance
@@ -116,14 +139,12 @@ def _six(covariance: FloatArray, config: FactorsConfig) -> FloatArray:
 
 
 def align(scene: Scene, config: Config) -> bool:
-    """Find where the map lies in the world by all that is refined; return whether that is known now."""
+    """Find where the map lies in the world; return whether that is known now."""
     known = scene.constraints
     if known.world_frame == config.frames.map_frame:
         known.map_from_world = np.eye(3), np.zeros(3)
         return True
-    pairs = pair(scene, config.factors)
-    pairs = pairs.take(scene.keyframes.refined[pairs.row])
-    found = _aligned(scene, pairs, config.factors)
+    found = _aligned(scene, every_pair(scene, config.factors), config.factors)
     if found is not None:
         known.map_from_world = found
     return known.map_from_world is not None
@@ -190,7 +211,7 @@ def factors(
     out: list[KeyframeFactors] = []
     for source in SOURCES:
         out += source(scene, problem, rows)
-    if not config.factors.enabled:
+    if not config.factors.enabled or not (known.relative or known.steps or known.gravity or known.absolute):
         return out
     number = np.full(len(scene.keyframes), -1)
     number[rows] = np.arange(len(rows))
@@ -213,6 +234,7 @@ def absolute(scene: Scene, config: Config, pairs: Pairs, numbers: IntArray, orig
     assert scene.constraints.map_from_world is not None
     rotation, translation = scene.constraints.map_from_world
     root = root_information(pairs.covariance)
+    root[pairs.covariance[:, 0, 0] >= _UNKNOWN**2, :3] = 0.0
     root[:, :, 3:] = root[:, :, 3:] @ rotation.T
     position = pairs.position @ rotation.T + translation - origin
     where = numbers[:, None], rotation @ pairs.rotation, position, pairs.lever_arm

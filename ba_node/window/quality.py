@@ -13,7 +13,7 @@ import numpy as np
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry, objective, triangulation
-from ba_node.core.problem import Problem, State
+from ba_node.core.problem import KeyframeFactors, Problem, State
 from ba_node.core.result import Result
 from ba_node.scene.scene import Scene
 from ba_node.window.problems import problem_of
@@ -22,6 +22,8 @@ from ba_node.window.selection import Selection
 STATES = ("input", "refined")
 # A residual that is longer counts as this: it tells no more than that it is wrong.
 BOUND_PX = 1000.0
+# A factor that is this many scales of a loss off that fades pulls at a twentieth of its weight, or less.
+_OUTVOTED, _FADING = 5.0, ("cauchy", "geman_mcclure")
 # And this, where two states are compared: outliers are as far off in the one as in the other.
 _COMPARED_PX = 20.0
 
@@ -58,8 +60,17 @@ def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[
         "landmarks": problem.n_points,
         "observations": len(problem.observations),
         "held_keyframes": len(set(selection.window.tolist()) - set(selection.keyframes.tolist())),
+        "factors": problem.n_factors + (0 if problem.point_priors is None else len(problem.point_priors.point)),
+        "outvoted_factors": sum(_outvoted(kind, result.state) for kind in selection.beside),
         "outliers": int(np.count_nonzero(~selection.inlier & ~selection.held_out[selection.observations.point])),
     }
+
+
+def _outvoted(kind: KeyframeFactors, state: State) -> int:
+    """Return how many factors of a kind are so far off that their loss lets them pull at next to nothing."""
+    if kind.loss not in _FADING:
+        return 0
+    return int(np.count_nonzero(np.linalg.norm(kind.residuals(state), axis=1) > _OUTVOTED * kind.loss_scale))
 
 
 def rms_px(scene: Scene, config: Config, state: str) -> float:

@@ -31,7 +31,7 @@ class Definitions(Component):
         for topic in (*INPUT_TYPES, *OUTPUT_TYPES):
             name = node.resolve_topic_name(TOPICS[topic].given_name)
             count = node.count_publishers(name) + node.count_subscribers(name)
-            if self._counts.get(topic) != count:
+            if self._counts.get(topic, 0) != count:
                 self._counts[topic] = count
                 self._compare(name)
 

@@ -1,0 +1,283 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is known beside pixels: wheel odometry, GNSS, priors of points, loops; and what of it is turned away."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ba_node.arrays import FloatArray
+from ba_node.backend import Backend
+from ba_node.backend.archive import unpack
+from ba_node.config import Config
+from ba_node.core import geometry
+from ba_node.estimate import Estimate
+from ba_node.measurements import (
+    GlobalFix,
+    GravityDirection,
+    Keyframe,
+    LandmarkPriors,
+    Measurement,
+    PosePrior,
+    RelativePose,
+    TrackMerge,
+)
+from ba_node.scene.map_content import MapContent, MapError
+from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from ba_node.synthetic.world import Path as Motion
+from ba_node.synthetic.world import World
+from ba_node.window import constraints
+
+pymap3d = pytest.importorskip("pymap3d", reason="needs pymap3d")
+ORIGIN = (48.0, 11.0, 500.0)
+ARM = np.array([0.5, 0.1, 1.2])
+TURN, SHIFT = geometry.so3_exp(np.array([0.0, 0.0, 0.7])), np.array([120.0, -40.0, 3.0])
+More = Callable[[int, Keyframe], Iterable[Measurement]]
+
+
+def stream(data: SyntheticData, more: More) -> Iterator[Measurement]:
+    """Yield a recording, and more after each keyframe."""
+    number = 0
+    for _, _, measurement in data.timeline():
+        yield measurement
+        if isinstance(measurement, Keyframe):
+            yield from more(number, measurement)
+            number += 1
+
+
+def replayed(data: SyntheticData, more: More = lambda *_: (), **values: object) -> tuple[Backend, Estimate]:
+    """Return a back-end that has seen a recording, and its last estimate."""
+    backend = Backend(Config().with_values(values))
+    estimates = [event for event in backend.replay(stream(data, more)) if isinstance(event, Estimate)]
+    return backend, estimates[-1]
+
+
+def aligned_rms(position: FloatArray, truth: FloatArray) -> float:
+    """Return the rms distance after the best rotation and translation, m."""
+    here, there = position - position.mean(axis=0), truth - truth.mean(axis=0)
+    turn = geometry.nearest_rotation(there.T @ here)
+    return float(np.sqrt(np.mean(np.sum((here @ turn.T - there) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def street() -> SyntheticData:
+    """Return a street of 300 m that few tracks with much noise show: vision drifts by metres."""
+    return generate(
+        SyntheticOptions(
+            seed=3, keyframes=100, length_m=250.0, landmarks=5000, path="line", noise_px=1.0, tracks=60, track_loss=0.1,
+            max_range_m=40.0, reobserve=False, drift_rotation_deg=0.3, drift_translation=0.02,
+        )
+    )  # fmt: skip
+
+
+def first(data: SyntheticData, n: int) -> SyntheticData:
+    """Return the first keyframes of a recording."""
+    return dataclasses.replace(data, keyframes=data.keyframes[:n], tracks=data.tracks[:n], guesses=data.guesses[:n])
+
+
+def fixes(data: SyntheticData, outliers: float) -> More:
+    """Return a receiver of 1 m noise on an antenna beside the body; some fixes are 1 km off."""
+    rng, rotation = np.random.default_rng(1), geometry.matrix_from_quaternion(data.truth.orientation)
+
+    def of(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        place = TURN @ (data.truth.position[k] + rotation[k] @ ARM) + SHIFT + rng.normal(0.0, 1.0, 3)
+        place = place + 1000.0 * (rng.random() < outliers) * np.array([0.6, -0.8, 0.0])
+        geodetic = np.array(pymap3d.enu2geodetic(*place, *ORIGIN), float)
+        yield GlobalFix(keyframe.stamp_ns, "gps", geodetic, np.eye(3).ravel(), is_fix=True)
+
+    return of
+
+
+def wheels(data: SyntheticData) -> More:
+    """Return wheel odometry of 1 %."""
+    rng, rotation = np.random.default_rng(2), geometry.matrix_from_quaternion(data.truth.orientation)
+
+    def of(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        if k == 0:
+            return
+        back = geometry.inverse(rotation[k - 1], data.truth.position[k - 1])
+        turn, move = geometry.compose(*back, rotation[k], data.truth.position[k])
+        sigma = np.array([0.01 * np.linalg.norm(move)] * 3 + [0.002] * 3)
+        turn, move = turn @ geometry.so3_exp(rng.normal(0.0, sigma[3:])), move + rng.normal(0.0, sigma[:3])
+        before = int(data.truth.keyframe_id[k - 1])
+        pose = move, geometry.quaternion_from_matrix(turn)
+        yield RelativePose(0, before, keyframe.keyframe_id, False, *pose, np.diag(sigma**2).ravel())
+
+    return of
+
+
+ANTENNA = {"factors.antenna_x_m": 0.5, "factors.antenna_y_m": 0.1, "factors.antenna_z_m": 1.2}
+
+
+@pytest.mark.parametrize("outliers", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_wheels_and_gnss_bound_the_drift(street: SyntheticData, outliers: float) -> None:
+    """The map ends where the world has it; fixes that are 1 km off are outvoted, and one origin is published."""
+    sources = wheels(street), fixes(street, outliers)
+    backend, estimate = replayed(street, lambda *at: [one for source in sources for one in source(*at)], **ANTENNA)
+    assert estimate.world is not None and estimate.world.geodetic is not None
+    turn = geometry.matrix_from_quaternion(estimate.world.orientation)
+    here = estimate.trajectory.position @ turn.T + estimate.world.position
+    here = here + np.array(pymap3d.geodetic2enu(*estimate.world.geodetic, *ORIGIN))
+    there = street.truth.position @ TURN.T + SHIFT
+    off = float(np.sqrt(np.mean(np.sum((here - there) ** 2, axis=1))))
+    assert off < 0.5
+    assert aligned_rms(estimate.trajectory.position, street.truth.position) < 0.3
+    assert not backend.report.warnings
+    assert backend.report.adjustments >= 1
+
+
+def test_priors_that_contradict_each_other_bend_nothing(street: SyntheticData) -> None:
+    """Every second pose prior has a rotation and a place of its own, in the map's frame: the majority stands."""
+    rotation, rng = geometry.matrix_from_quaternion(street.truth.orientation), np.random.default_rng(5)
+
+    def of(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        place = street.truth.position[k] + rng.normal(0.0, 0.1, 3) + (k % 3 == 0) * rng.normal(0.0, 50.0, 3)
+        yield PosePrior(
+            keyframe.stamp_ns, "map", place, geometry.quaternion_from_matrix(rotation[k]), 0.01 * np.eye(6).ravel()
+        )
+
+    _, estimate = replayed(street, of)
+    off = np.linalg.norm(estimate.trajectory.position - street.truth.position, axis=1)
+    assert float(np.sqrt(np.mean(off**2))) < 0.15
+
+
+def test_known_points_hold_the_map(street: SyntheticData) -> None:
+    """Surveyed points along the street bound the drift as pose priors do."""
+    known = np.arange(0, len(street.track_id), 25)
+    priors = LandmarkPriors(
+        0,
+        "map",
+        street.track_id[known],
+        street.landmarks[street.track_landmark[known]],
+        np.tile(1e-4 * np.eye(3), (len(known), 1, 1)),
+    )
+    _, free = replayed(street)
+    _, held = replayed(street, lambda k, _: [priors] if k == 0 else [])
+    errors = [float(np.linalg.norm((one.trajectory.position - street.truth.position)[-1])) for one in (free, held)]
+    assert errors[1] < 0.25 * errors[0]
+
+
+def round_trip(noise_px: float) -> SyntheticData:
+    """Return a loop of which the last keyframes see the first ones' points again, under other ids."""
+    n = 200
+    options = SyntheticOptions(
+        seed=3, keyframes=n, length_m=200.0, landmarks=12000, reobserve=False, noise_px=noise_px, tracks=150,
+        track_loss=0.3, drift_rotation_deg=3.0, drift_translation=0.02,
+    )  # fmt: skip
+
+    def again(world: World, path: Motion) -> tuple[World, Motion]:
+        rows = np.concatenate([np.linspace(0, n - 1, n - 12).round().astype(int)[:-1], np.arange(13)])
+        step = np.linalg.norm(np.diff(path.position[rows], axis=0), axis=1)
+        return world, Motion(path.position[rows], path.rotation[rows], np.append(0.0, np.cumsum(step + 1e-3)))
+
+    return generate(options, again)
+
+
+def merges(data: SyntheticData, count: int = 20) -> list[tuple[int, int]]:
+    """Return pairs of late and early tracks of the same points."""
+    n = len(data.keyframes)
+    last: dict[int, int] = {}
+    begun: dict[int, int] = {}
+    for k, images in enumerate(data.tracks):
+        for track in images[0].track_id.tolist():
+            last[track] = k
+            begun.setdefault(track, k)
+    early = {int(data.track_landmark[t]): t for t in last if last[t] < n // 10}
+    late = [t for t in last if begun[t] > n // 2 and last[t] >= n - 6 and int(data.track_landmark[t]) in early]
+    return [(t, early[int(data.track_landmark[t])]) for t in late][:count]
+
+
+def test_a_loop_closes_and_the_odometry_frame_stays() -> None:
+    data = round_trip(0.5)
+    pairs = merges(data)
+    assert len(pairs) == 20
+    # One pair is of two points that one image sees both.
+    table = np.array([*pairs, (pairs[0][1], pairs[1][1])], np.uint64)
+    backend = Backend(Config())
+    measurements = [*(one for _, _, one in data.timeline()), TrackMerge(0, table[:, 0], table[:, 1])]
+    estimates = [event for event in backend.replay(measurements) if isinstance(event, Estimate)]
+    before, after = (float(np.linalg.norm(one.trajectory.position[-1] - data.truth.position[len(one.trajectory) - 1]))
+                     for one in estimates[-2:])  # fmt: skip
+    assert before > 5.0
+    assert after < 0.1 * before
+    assert (backend.report.adjustments, backend.report.merged_tracks) == (1, 20)
+    assert backend.report.rejected["bad_merge"] == 1
+    # Beyond its gate the correction waits for others to agree: who steers by map -> odom sees no jump.
+    assert backend.report.correction_held
+
+
+def test_what_cannot_be_is_counted(street: SyntheticData) -> None:
+    good, pose = np.eye(6).ravel(), (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    negative = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]).ravel()
+    ids = np.array([1], np.uint64)
+    sent: list[Measurement] = [
+        RelativePose(0, 3, 10**9, False, *pose, good),
+        RelativePose(0, 3, 3, False, *pose, good),
+        RelativePose(0, 1, 2, False, *pose, negative),
+        RelativePose(0, 1, 2, False, np.full(3, np.nan), pose[1], good),
+        GravityDirection(0, 10**9, np.array([0.0, 0.0, -1.0]), 0.1),
+        GravityDirection(0, 4, np.zeros(3), 0.1),
+        GravityDirection(0, 4, np.array([0.0, 0.0, -1.0]), 0.0),
+        LandmarkPriors(0, "map", ids, np.zeros((1, 3)), -np.eye(3)[None]),
+        LandmarkPriors(0, "elsewhere", ids, np.zeros((1, 3)), np.eye(3)[None]),
+        PosePrior(0, "", *pose, good),
+        GlobalFix(0, "gps", np.array([91.0, 0.0, 0.0]), np.eye(3).ravel(), is_fix=True),
+        GlobalFix(0, "gps", np.array([50.0, 0.0, 0.0]), np.eye(3).ravel(), is_fix=False),
+    ]
+    short = dataclasses.replace(
+        street, keyframes=street.keyframes[:8], tracks=street.tracks[:8], guesses=street.guesses[:8]
+    )
+    prior = LandmarkPriors(0, "map", ids, np.zeros((1, 3)), np.eye(3)[None])
+    _, plain = replayed(short)
+    backend, estimate = replayed(short, lambda k, _: [prior, *sent] if k == 7 else [])
+    counts = dict(backend.report.rejected)
+    assert counts == {"unknown_keyframe": 2, "bad_factor": 4, "bad_covariance": 3, "other_world": 2}
+    assert backend.notices["no_fix"] == 1
+    np.testing.assert_allclose(estimate.trajectory.position, plain.trajectory.position, atol=0.05)
+
+
+def test_the_example_of_the_page_counts(street: SyntheticData) -> None:
+    """The code in docs/factors.md, as it stands there: heights that wander come back to one."""
+    page = (Path(__file__).parents[2] / "docs" / "factors.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(code.splitlines()) <= 32
+    short = first(street, 40)
+    _, free = replayed(short)
+    known = list(constraints.SOURCES)
+    try:
+        exec(compile(code, "factors.md", "exec"), {"__name__": __name__})
+        _, level = replayed(short)
+    finally:
+        constraints.SOURCES[:] = known
+    spread = [float(np.std(one.trajectory.position[:, 2])) for one in (free, level)]
+    assert spread[1] < 0.3 * spread[0]
+
+
+def test_a_saved_map_keeps_its_place_in_the_world(street: SyntheticData) -> None:
+    backend, _ = replayed(first(street, 40), fixes(street, 0.0), **(ANTENNA | {"factors.align_m": 1.0}))
+    known = backend.scene.constraints
+    assert known.map_from_world is not None and known.origin is not None
+    known.renamed = {5: 7, 7: 9}
+    content = backend.snapshot()
+    content.facts.update(json.loads(json.dumps(content.facts)))
+    loaded = unpack(content, Config().scene).scene.constraints
+    assert loaded.map_from_world is not None and loaded.origin is not None
+    np.testing.assert_array_equal(loaded.origin, known.origin)
+    for one, other in zip(loaded.map_from_world, known.map_from_world, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (loaded.world_frame, loaded.name_of(5)) == ("enu", 9)
+    for name, value in (
+        ("origin", [1.0, 2.0]),
+        ("renamed", [[1, 2], [2, 1]]),
+        ("map_from_world", [[2.0] * 9, [0.0] * 3]),
+    ):
+        broken = MapContent(content.arrays, content.facts | {"world": content.facts["world"] | {name: value}})
+        with pytest.raises(MapError, match="world"):
+            unpack(broken, Config().scene)
