@@ -94,6 +94,7 @@ def run(args: argparse.Namespace) -> int:
         return _start_ranks(args)
     solution = _solved(args)
     if solution is None:
+        args.json = None  # rank 0 writes it
         return 0
     summary = solution.as_dict()
     summary["peak_rss_mb"] = _peak_rss_mb()
@@ -139,6 +140,7 @@ def _start_ranks(args: argparse.Namespace) -> int:
             if not framed and not line.startswith("-----"):
                 print(line, end="", file=sys.stderr)
     code = ranks.returncode
+    args.json = args.json if args.json is not None and not args.json.is_file() else None  # rank 0 has written it
     if code not in (0, NOTHING, ATTENTION):
         hint = (
             f": go on from {args.checkpoint} with --resume"

@@ -156,16 +156,13 @@ class Checkpoint:
         """
         try:
             with np.load(self.path, allow_pickle=False) as found:
-                if str(found["digest"]) != digest:
-                    raise RanksError(
-                        f"{self.path}: a checkpoint of another problem: leave --resume out, or name its file"
-                    )
+                of = str(found["digest"])
                 state = State(*(found[field.name] for field in dataclasses.fields(State)))
                 damping, radius = float(found["damping"]), float(found["radius"])
-        except (OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise RanksError(f"{self.path}: no checkpoint to go on from ({error}): leave --resume out") from None
         shapes = [getattr(state, field.name).shape for field in dataclasses.fields(State)]
-        if shapes != [getattr(problem.start, field.name).shape for field in dataclasses.fields(State)]:
+        if of != digest or shapes != [getattr(problem.start, field.name).shape for field in dataclasses.fields(State)]:
             raise RanksError(f"{self.path}: a checkpoint of another problem: leave --resume out, or name its file")
         return state, damping, radius
 
