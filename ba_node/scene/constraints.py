@@ -29,6 +29,8 @@ ENU = "enu"
 _TANGENT = np.array([3, 4, 5, 0, 1, 2])
 _SYMMETRIC = 1e-6
 _STRANGE_M = 1e7
+# Absolute measurements that are kept, the newest: keyframes may never come.
+_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -250,6 +252,7 @@ class Constraints:
 
     def _insert(self, one: Absolute) -> None:
         bisect.insort(self.absolute, one, key=lambda known: known.stamp_ns)
+        del self.absolute[:-_MOST]
 
     def _same_world(self, name: str, frame_id: str, log: RejectionLog) -> bool:
         frame = ingest.plain_name(frame_id)

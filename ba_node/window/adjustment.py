@@ -57,17 +57,18 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
 
     ``final``: nothing more will come.
     """
-    known = scene.constraints
-    if not config.factors.enabled:
+    known, n = scene.constraints, len(scene.keyframes)
+    if not config.factors.enabled or n < 2 or scene.cameras is None:
         return None
-    if (known.absolute or known.landmarks) and known.map_from_world is None and constraints.align(scene, config):
-        known.adjusted_at = len(scene.keyframes)
+    unaligned = bool(known.absolute or known.landmarks) and known.map_from_world is None
+    if unaligned and (final or n - known.adjusted_at >= _GROWN * n):
+        known.adjusted_at = n
+        constraints.align(scene, config)
     if final and (known.absolute or known.landmarks) and known.map_from_world is None:
-        n = len(known.absolute) + len(known.landmarks)
         scene.log.warn(
             "unaligned",
-            f"{n} priors in frame {known.world_frame!r} were not used: the path is too short, or they are too few or"
-            " too noisy, to tell where the map lies in it (factors.align_m)",
+            f"{len(known.absolute) + len(known.landmarks)} priors in frame {known.world_frame!r} were not used: the path is"
+            " too short, or they are too few or too noisy, to tell where the map lies in it (factors.align_m)",
         )
     found = _merged(scene, config, final) if known.merges else None
     found = found or (_measured(scene, config) if known.unchecked else None)

@@ -34,6 +34,8 @@ _LOSS = "cauchy"
 # Standard deviation of the vertical of one frame in the other, rad; and of an orientation that was not measured.
 _LEVEL_RAD = 0.05
 _UNKNOWN = 1e6
+# Pairs that map and world are aligned by, spread over all.
+_ALIGNED = 2000
 # Minimal sets that are tried, pairs in each, pairs that judge them, rounds of weighting.
 _SETS, _IN_SET, _JUDGES, _ROUNDS = 60, 5, 300, 10
 # The path has to spread so many times the noise of positions, and the heading to be known to so much (rad).
@@ -154,6 +156,7 @@ def _aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatAr
     """Return map from world, None where too little is known."""
     if not len(pairs):
         return None
+    pairs = pairs.take(np.unique(np.linspace(0, len(pairs) - 1, _ALIGNED).astype(int)))
     there = pairs.points(scene)
     sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     turn_rad = np.sqrt(np.trace(pairs.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0)

@@ -133,6 +133,7 @@ def test_wheels_and_gnss_bound_the_drift(street: SyntheticData, outliers: float)
     assert backend.report.adjustments >= 1
 
 
+@pytest.mark.slow
 def test_priors_that_contradict_each_other_bend_nothing(street: SyntheticData) -> None:
     """Every second pose prior has a rotation and a place of its own, in the map's frame: the majority stands."""
     rotation, rng = geometry.matrix_from_quaternion(street.truth.orientation), np.random.default_rng(5)
@@ -148,6 +149,7 @@ def test_priors_that_contradict_each_other_bend_nothing(street: SyntheticData) -
     assert float(np.sqrt(np.mean(off**2))) < 0.15
 
 
+@pytest.mark.slow
 def test_known_points_hold_the_map(street: SyntheticData) -> None:
     """Surveyed points along the street bound the drift as pose priors do."""
     known = np.arange(0, len(street.track_id), 25)
@@ -281,3 +283,30 @@ def test_a_saved_map_keeps_its_place_in_the_world(street: SyntheticData) -> None
         broken = MapContent(content.arrays, content.facts | {"world": content.facts["world"] | {name: value}})
         with pytest.raises(MapError, match="world"):
             unpack(broken, Config().scene)
+
+
+def test_gravity_holds_the_tilt(street: SyntheticData) -> None:
+    """A front-end that tells which way is down keeps the map level, however few tracks there are."""
+    short = first(street, 60)
+    rotation = geometry.matrix_from_quaternion(street.truth.orientation)
+
+    def of(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        down = rotation[k].T @ np.array([0.0, 0.0, -9.81])
+        yield GravityDirection(0, keyframe.keyframe_id, down, 0.002)
+
+    tilt = []
+    for more in ((lambda *_: ()), of):
+        _, estimate = replayed(short, more)
+        found = geometry.matrix_from_quaternion(estimate.trajectory.orientation)
+        tilt.append(float(np.degrees(np.arccos(np.clip((found[:, 2] * rotation[:60, 2]).sum(axis=1), -1, 1)).max())))
+    assert tilt[1] < 0.15
+    assert tilt[1] < 0.3 * tilt[0]
+
+
+def test_priors_without_keyframes_or_a_path_to_align_by_are_said(street: SyntheticData) -> None:
+    backend = Backend(Config())
+    fix = GlobalFix(0, "gps", np.array([48.0, 11.0, 500.0]), np.eye(3).ravel(), is_fix=True)
+    assert list(backend.replay([fix, fix])) == []
+    backend, _ = replayed(first(street, 3), fixes(street, 0.0))
+    (text,) = backend.report.warnings
+    assert text.startswith("3 priors in frame 'enu' were not used: the path is too short")
