@@ -67,5 +67,6 @@ def read_page(_app: object, name: str, source: list[str]) -> None:
 
 
 def setup(app: Any) -> None:
-    """Have pages read by :func:`read_page`."""
+    """Have pages read by :func:`read_page`, and those that others make stale read every time."""
     app.connect("source-read", read_page)
+    app.connect("env-get-outdated", lambda *_: ["commands", "index"])

@@ -52,6 +52,11 @@ def generate_launch_description() -> LaunchDescription:
                 default_value=PathJoinSubstitution([share, "config", "ba_node.yaml"]),
                 description="YAML file with the parameters of ba_node",
             ),
+            DeclareLaunchArgument(
+                "front_end_params_file",
+                default_value=PathJoinSubstitution([share, "config", "ba_front_end.yaml"]),
+                description="YAML file with the parameters of ba_front_end, but for those that are arguments here",
+            ),
             DeclareLaunchArgument("log_level", default_value="info", description="the least severity that is logged"),
             *(
                 DeclareLaunchArgument(name, default_value=listed[name][0], description=listed[name][1])
@@ -67,6 +72,7 @@ def generate_launch_description() -> LaunchDescription:
                 name="ba_front_end",
                 namespace=LaunchConfiguration("namespace"),
                 parameters=[
+                    LaunchConfiguration("front_end_params_file"),
                     {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in TEXTS},
                     {name: ParameterValue(LaunchConfiguration(name), value_type=bool) for name in SWITCHES},
                 ],

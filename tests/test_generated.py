@@ -30,7 +30,9 @@ def generator() -> ModuleType:
 @pytest.mark.parametrize(
     "name",
     [
+        "config/ba_front_end.yaml",
         "config/ba_node.yaml",
+        "docs/front_end.md",
         "docs/methods.md",
         "docs/parameters.md",
         "docs/robustness.md",

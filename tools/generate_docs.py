@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write config/ba_node.yaml, docs/parameters.md, docs/topics.md and the tables of docs/methods.md from the code.
+"""Write config/*.yaml, docs/parameters.md, docs/topics.md and tables of docs/methods.md and front_end.md from the code.
 
 docs/thesis.md and docs/open_problems.md are written from docs/thesis_results.json, which `ba thesis --all` makes,
 docs/robustness.md from docs/robustness_results.json, which is results.json of `ba robustness`.
@@ -11,14 +11,17 @@ Run it without arguments to write them, with --check to learn whether they are u
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ba_node.config import Config, SolverOptions, Value, declared
+from ba_node.config import Config, Parameter, SolverOptions, Value, declared
+from ba_node.config.front_end import FrontEndOptions
+from ba_node.config.front_end_node import FrontEndNodeOptions
 from ba_node.core.methods import METHODS
-from ba_node.io.parameters import parameters_markdown, parameters_yaml
+from ba_node.io.parameters import parameters_markdown, parameters_yaml, plain_yaml
 from ba_node.messages.topics import ACTIONS, INTERFACE_VERSION, SERVICES, TOPICS, Command, Direction, Topic
 from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
@@ -96,15 +99,20 @@ def parameters_page() -> str:
     return PARAMETERS_INTRO + parameters_markdown()
 
 
-def methods_page() -> str:
-    """Return docs/methods.md with its tables renewed."""
-    text = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+def renewed(name: str, tables: str) -> str:
+    """Return a page of docs/ with its tables renewed."""
+    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
     begin = BEGIN.format(made_by=MADE_BY)
     before, found, rest = text.partition(begin)
     _, closed, after = rest.partition(END)
     if not (found and closed):
-        raise SystemExit(f"docs/methods.md: expected the lines {begin.strip()} and {END.strip()}")
-    return before + begin + "\n" + methods_tables() + "\n" + END + after
+        raise SystemExit(f"docs/{name}: expected the lines {begin.strip()} and {END.strip()}")
+    return before + begin + "\n" + tables + "\n" + END + after
+
+
+def of_the_front_end(*groups: type) -> list[Parameter]:
+    """Return options of ba_front_end, which are all set at start."""
+    return [dataclasses.replace(parameter, live=False) for group in groups for parameter in declared(group)]
 
 
 def methods_tables() -> str:
@@ -152,15 +160,24 @@ def yaml_file() -> str:
     return f"{LICENCE}# All parameters with their defaults; written by `{MADE_BY}`.\n{parameters_yaml(Config())}"
 
 
+def front_end_yaml() -> str:
+    """Return config/ba_front_end.yaml: how images are tracked; which ones are is said to the launch file."""
+    note = f"# How ba_front_end tracks, with the defaults; written by `{MADE_BY}`.\n"
+    return LICENCE + note + plain_yaml(of_the_front_end(FrontEndOptions))
+
+
 def pages() -> dict[str, str]:
     """Return the content of every generated file by its path from the root."""
     results = json.loads((ROOT / "docs" / "thesis_results.json").read_text(encoding="utf-8"))
     robustness = json.loads((ROOT / "docs" / "robustness_results.json").read_text(encoding="utf-8"))
     note = f"<!-- Written by `{MADE_BY}`: do not edit. -->\n\n"
+    front_end_table = parameters_markdown(of_the_front_end(FrontEndNodeOptions, FrontEndOptions))
     return {
         "config/ba_node.yaml": yaml_file(),
         "docs/parameters.md": note + parameters_page(),
-        "docs/methods.md": methods_page(),
+        "docs/methods.md": renewed("methods.md", methods_tables()),
+        "docs/front_end.md": renewed("front_end.md", front_end_table),
+        "config/ba_front_end.yaml": front_end_yaml(),
         "docs/thesis.md": note + claims_page(results),
         "docs/open_problems.md": note + open_page(results),
         "docs/robustness.md": note + robustness_page(robustness),

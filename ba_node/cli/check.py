@@ -83,7 +83,7 @@ def _check_all(args: argparse.Namespace, config: Config) -> int:
 
     tasks = [batch.ReplayTask((place,), "", config, TopicChoice()) for place in expand(args.bag)]
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("check", "recordings") as progress:
-        rows = batch.check_all(fleet, tasks, progress)
+        rows = batch.each(fleet, batch.check_one, tasks, progress)
     for row in rows:
         print(f"{row['recording']}: {row['state']}", *_wrapped(row["note"], _WIDTH, "    ", "    "), sep="\n")
     write_result(args.json, {"recordings": rows})

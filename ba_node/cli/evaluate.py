@@ -64,15 +64,16 @@ def run(args: argparse.Namespace) -> int:
     estimate, reference = read_pair(args.estimate, args.reference, args.reference_topic)
     paired = pair(estimate, reference, args.align, args.max_difference)
     interval = relative.Interval(args.interval, args.unit, args.all_pairs)
-    absolute, moved = absolute_error_of(paired), relative.relative_error(paired, interval)
-    found = {
-        "translation_m": absolute.translation.as_dict(),
-        "rotation_deg": absolute.rotation.as_dict(),
-        "relative_translation_m": moved.translation.as_dict(),
-        "relative_rotation_deg": moved.rotation.as_dict(),
-    }
+    absolute = absolute_error_of(paired)
+    found = {"translation_m": absolute.translation.as_dict(), "rotation_deg": absolute.rotation.as_dict()}
+    over = ""
+    if len(paired.stamp_ns) > 1:
+        moved = relative.relative_error(paired, interval)
+        found["relative_translation_m"] = moved.translation.as_dict()
+        found["relative_rotation_deg"] = moved.rotation.as_dict()
+        over = f"{interval}, {len(moved.pairs)} pairs"
     print(f"{len(paired.stamp_ns)} of {len(estimate)} poses have a partner; alignment {args.align}")
-    print(_table(found, f"{interval}, {len(moved.pairs)} pairs"))
+    print(_table(found, over))
     if args.align == "sim3":
         print(f"scale {paired.alignment.scale:.9f}")
     about = {"align": args.align, "scale": paired.alignment.scale, "interval": args.interval, "unit": args.unit}
@@ -97,5 +98,5 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(found: dict[str, dict[str, float | int]], over: str) -> str:
     names = ("translation [m]", "rotation [deg]", f"translation [m] over {over}", f"rotation [deg] over {over}")
-    rows = [[name, *(f"{of[key]:.6f}" for key in _FIGURES)] for name, of in zip(names, found.values(), strict=True)]
+    rows = [[name, *(f"{of[key]:.6f}" for key in _FIGURES)] for name, of in zip(names, found.values(), strict=False)]
     return table(["", *_FIGURES], rows)

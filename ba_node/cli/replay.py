@@ -36,6 +36,7 @@ from ba_node.cli.console import (
     parameters,
     progress_bar,
     require_folder,
+    say_left_out,
     table,
     topic_choice,
     write_result,
@@ -112,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
 def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str, ...]]) -> int:
     """Replay many recordings."""
     from ba_node.offline import batch  # noqa: PLC0415
-    from ba_node.offline.fleet import Fleet, is_url  # noqa: PLC0415
+    from ba_node.offline.fleet import Fleet, delivered, is_url  # noqa: PLC0415
 
     alone = [name for name in ("load_map", "save_map", "final_optimize") if getattr(args, name)]
     if alone:
@@ -124,17 +125,18 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
         for group, name in zip(found, batch.folder_names(found), strict=True)
     ]
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("replay", "recordings") as progress:
-        rows = batch.replay_all(fleet, tasks, progress)
+        rows = batch.each(fleet, batch.replay_one, tasks, progress)
     print(table(list(batch.COLUMNS.values())[:-1], [batch.cells(row)[:-1] for row in rows]))
     for row in rows:
         if row["state"] == batch.LOOK:
             print(f"ba: warning: {_named(row)}", file=sys.stderr)
     failed = [row for row in rows if row["state"] == batch.FAILED]
-    for row in failed:
-        print(f"ba: error: {row['note'] if row['recording'] in row['note'] else _named(row)}", file=sys.stderr)
+    say_left_out({row["recording"]: row["note"] for row in failed})
+    with delivered(args.out) as folder:
+        missing = batch.write_results(folder, rows)
+    print(f"written to {args.out}: {missing or 'index.html, results.csv, results.json, a folder a recording'}")
+    write_result(args.json, {"recordings": rows})
     if not is_url(args.out):
-        missing = batch.write_results(Path(args.out), rows)
-        print(f"written to {args.out}: {missing or 'index.html, results.csv, results.json, a folder a recording'}")
         lost = [row for row in rows if row not in failed and not (Path(row["folder"]) / "report.json").is_file()]
         if lost:
             raise TargetError(

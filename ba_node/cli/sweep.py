@@ -20,6 +20,7 @@ from ba_node.cli.console import (
     say_left_out,
     table,
     topic_choice,
+    write_result,
 )
 
 SUMMARY = "try every combination of some values of parameters on recordings"
@@ -70,4 +71,5 @@ def run(args: argparse.Namespace) -> int:
     except PageError as error:
         names = f"sweep.csv, sweep.json; {error}"
     print(f"written to {args.out}: {names}")
+    write_result(args.json, tuning_page.sweep_as_dict(found))
     return say_left_out(left_out)

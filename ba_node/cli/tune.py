@@ -33,6 +33,7 @@ from ba_node.cli.console import (
     say_left_out,
     table,
     topic_choice,
+    write_result,
 )
 
 if TYPE_CHECKING:
@@ -124,6 +125,7 @@ def _tune(args: argparse.Namespace) -> int:
     except PageError as error:
         names = f"tuned.yaml, tuning.json; {error}"
     print(f"written to {args.out}: {names}")
+    write_result(args.json, tuning_page.tuned_as_dict(tuned))
     return max(say_left_out(tuned.left_out), _verdict(tuned))
 
 

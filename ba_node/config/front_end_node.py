@@ -21,7 +21,9 @@ class FrontEndNodeOptions(Checked):
     """Options of the node. A value of the wrong type or out of range raises ConfigError."""
 
     mode: str = option("auto", "What images there are.", choices=MODES)
-    rectified: bool = option(False, "Images are rectified: p of camera_info is their camera, k and d are not.")
+    rectified: bool = option(
+        False, "Images are rectified: p of camera_info is their camera; so it is for topics image_rect."
+    )
     rig_file: str = option("", "YAML of the rig, in any form of ba rig, in place of camera_info and /tf_static.")
     base_frame: str = option("", "Body frame, to which /tf_static tells the way; empty: the first camera.")
     odom_frame: str = option("odom", "Fixed frame of the keyframes, and of the odometry where it comes by TF.")

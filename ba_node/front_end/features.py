@@ -93,7 +93,7 @@ def follow(before: Grey, now: Grey, uv: FloatArray, expected: FloatArray | None)
         there,
         (there - shift).copy(),
         winSize=size,
-        maxLevel=1,
+        maxLevel=0,
         criteria=criteria,
         flags=cv2().OPTFLOW_USE_INITIAL_FLOW,
     )

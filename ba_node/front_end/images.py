@@ -9,11 +9,13 @@ and of recordings are both served.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.arrays import BoolArray
 from ba_node.front_end.opencv import cv2
 from ba_node.front_end.records import FrontEndError, Grey
 
@@ -154,3 +156,12 @@ def as_grey(pixels: NDArray[Any]) -> Grey:
 def is_encoding_of_depth(encoding: str) -> bool:
     """Return True for the encodings that depth cameras send."""
     return re.fullmatch(r"16UC1|32FC1", encoding) is not None
+
+
+def read_mask(path: Path | str) -> BoolArray:
+    """Return the mask in a picture, (h, w), False where it is black; raise FrontEndError if there is none."""
+    data = np.fromfile(path, np.uint8) if Path(path).is_file() else np.empty(0, np.uint8)
+    picture = cv2().imdecode(data, cv2().IMREAD_GRAYSCALE) if len(data) else None
+    if picture is None:
+        raise FrontEndError(f"mask {path}: no picture that can be read")
+    return np.asarray(picture > 0)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the pose of a camera from points that it sees: by consensus (PoseLib's P3P in RANSAC), then weighted.
 
-The weighted step minimises ``sum rho(|C^-1/2 (u - pi(R X + t))|^2)`` by Gauss-Newton with Huber's rho, where C is the
+The weighted step minimises ``sum rho(|C^-1/2 (u - pi(R X + t))|^2)`` by Gauss-Newton with Cauchy's rho, where C is the
 covariance of a pixel and of the point's own depth as it appears in the image: a point that is far has an uncertain
 depth, which matters for a camera that has come nearer and not for its turn.
 """
@@ -20,7 +20,7 @@ from ba_node.front_end.opencv import poselib
 from ba_node.front_end.rectify import IdealRig
 
 _STEPS = 8
-_HUBER = 2.0
+_CAUCHY = 2.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Trans
 
 def _weights(error: FloatArray) -> tuple[FloatArray, FloatArray]:
     size = np.linalg.norm(error, axis=1)
-    return np.where(size > _HUBER, _HUBER / np.maximum(size, 1e-12), 1.0), size
+    return 1.0 / (1.0 + (size / _CAUCHY) ** 2), size
 
 
 def _linear(rig: IdealRig, seen: Seen, pose: Transform) -> tuple[FloatArray, FloatArray]:

@@ -33,6 +33,8 @@ _REACH_PX = 3.0
 # Standard deviation of the slant before it is measured: that of a wall seen along it.
 _SLANT = 0.35
 _NOISE = 2.0
+# Least standard deviation of a disparity: what calibrations of real cameras leave here and there in the image, px.
+_FLOOR_PX = 0.2
 # Rows and columns apart that a first slant is taken from, px of the half-size image.
 _APART = 5
 _SIDE = 0.5
@@ -139,7 +141,7 @@ def measure(
     rows = rows[good]
     # Both ways err alike in size, and by interpolation in opposite ways: their mean is better than either.
     result.value[rows] = 0.5 * (forth[0] - back[0])[good]
-    result.sigma[rows] = np.hypot(forth[1], 0.5 * off)[good]
+    result.sigma[rows] = np.sqrt(forth[1] ** 2 + (0.5 * off) ** 2 + _FLOOR_PX**2)[good]
     result.slant[rows] = forth[2][good]
     return result
 

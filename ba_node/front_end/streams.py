@@ -23,6 +23,8 @@ MODES = {
     "mono": ("image_raw",),
 }
 MASK = "mask"
+# Part of the names of topics of rectified images (image_proc, stereo_image_proc, depth cameras).
+RECTIFIED = "image_rect"
 # Images further apart are never of one time, ns; what is nearer but not near enough, the front-end says.
 MAX_APART_NS = 50_000_000
 _KEPT_POSES = 2000

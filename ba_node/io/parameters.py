@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -91,12 +91,21 @@ def changes_yaml(config: Config) -> str:
     return "\n".join(lines if changed else ["{}  # all parameters have their defaults"]) + "\n"
 
 
-def parameters_markdown() -> str:
-    """Return a table of all parameters."""
+def parameters_markdown(parameters: Sequence[Parameter] = declarations()) -> str:
+    """Return a table of parameters, those of the node if none are given."""
     lines = ["| parameter | default | unit | allowed | change | meaning |", "|---|---|---|---|---|---|"]
-    for p in declarations():
+    for p in parameters:
         change = "next solve" if p.live else "restart"
         lines.append(f"| `{p.name}` | {_scalar(p.default)} | {p.unit} | {_allowed(p)} | {change} | {p.doc} |")
+    return "\n".join(lines) + "\n"
+
+
+def plain_yaml(parameters: Sequence[Parameter]) -> str:
+    """Return parameters without groups, with their defaults, as a file for ``--params-file``."""
+    lines = ["/**:", f"  {_ROS_KEY}:"]
+    for parameter in parameters:
+        lines += [f"    # {parameter.doc}", f"    # {_facts(parameter)}"]
+        lines.append(f"    {parameter.name}: {_scalar(parameter.default)}")
     return "\n".join(lines) + "\n"
 
 

@@ -21,7 +21,7 @@ from ba_node.io.mcap import TopicChoice
 from ba_node.io.parameters import parameters_yaml
 from ba_node.offline.check import check_recording
 from ba_node.offline.figures import COLOURS, Figure, array
-from ba_node.offline.fleet import Fleet, delivered, expand, fetched, is_url, name_of
+from ba_node.offline.fleet import Fleet, delivered, expand, fetched, is_url, name_of, words_of
 from ba_node.offline.page import PageError, write_page
 from ba_node.offline.replay import MapOptions, Watch, replay
 from ba_node.offline.report import REPORT, html_table, show
@@ -79,10 +79,15 @@ def _belongs(group: Sequence[str], place: str) -> bool:
     return not (is_url(first) or Path(first).is_dir()) and same_recording(Path(first), Path(place))
 
 
-def replay_all(fleet: Fleet, tasks: Sequence[ReplayTask], progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
-    """Replay recordings; return a row of the table for each, in their order."""
+def each(
+    fleet: Fleet,
+    function: Callable[[ReplayTask], dict[str, Any]],
+    tasks: Sequence[ReplayTask],
+    progress: Callable[[int, int], None],
+) -> list[dict[str, Any]]:
+    """Call :func:`replay_one` or :func:`check_one` with every recording; return their rows in order."""
     rows: list[dict[str, Any]] = [{}] * len(tasks)
-    for done, (number, row) in enumerate(fleet.each(replay_one, tasks, _lost), start=1):
+    for done, (number, row) in enumerate(fleet.each(function, tasks, _failed), start=1):
         rows[number] = row
         progress(done, len(tasks))
     return rows
@@ -105,7 +110,7 @@ def replay_one(task: ReplayTask) -> dict[str, Any]:
     try:
         report = (_known(task) if task.resume else None) or _replayed(task)
     except (ValueError, OSError) as error:
-        return _failed(task, " ".join(str(error).split()))
+        return _failed(task, words_of(error))
     return _row(task, report) | {"time_s": task.clock() - begun}
 
 
@@ -153,16 +158,13 @@ def _failed(task: ReplayTask, words: str) -> dict[str, Any]:
     return {"recording": task.recording[0], "folder": task.out, "state": FAILED, "note": words}
 
 
-_lost = _failed
-
-
 def check_one(task: ReplayTask) -> dict[str, Any]:
     """Check a recording and return its sessions, or why it cannot be checked."""
     try:
         with fetched(task.recording[0]) as first:
             sessions = check_recording(first, task.config)
     except (ValueError, OSError) as error:
-        return _failed(task, " ".join(str(error).split()))
+        return _failed(task, words_of(error))
     causes = [cause for one in sessions for finding in one.found.findings for cause in finding.causes]
     warnings = [text for one in sessions for text in one.warnings]
     notes = [*dict.fromkeys(causes), *warnings]
@@ -172,15 +174,6 @@ def check_one(task: ReplayTask) -> dict[str, Any]:
         "note": "; ".join(notes) or "the set-up fits the tracks",
         "sessions": [one.as_dict() for one in sessions],
     }
-
-
-def check_all(fleet: Fleet, tasks: Sequence[ReplayTask], progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
-    """Check recordings; return state and note of each, in their order."""
-    rows: list[dict[str, Any]] = [{}] * len(tasks)
-    for done, (number, row) in enumerate(fleet.each(check_one, tasks, _lost), start=1):
-        rows[number] = row
-        progress(done, len(tasks))
-    return rows
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:

@@ -142,6 +142,13 @@ class _Here(Executor):
         return future
 
 
+def words_of(error: Exception) -> str:
+    """Return in one line what is wrong."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(str(error).split())
+
+
 def _version() -> str:
     return __version__
 

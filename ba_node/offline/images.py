@@ -23,7 +23,16 @@ import numpy as np
 
 from ba_node.estimate import Transform
 from ba_node.front_end.records import FrontEndError, Images
-from ba_node.front_end.streams import MODES, Frame, OdometryBuffer, Streams, cameras_of, images_of, transform_of
+from ba_node.front_end.streams import (
+    MODES,
+    RECTIFIED,
+    Frame,
+    OdometryBuffer,
+    Streams,
+    cameras_of,
+    images_of,
+    transform_of,
+)
 from ba_node.io.bag_topics import absolute
 from ba_node.io.mcap import BagError, BagReader
 from ba_node.io.rig_file import read_rig
@@ -56,7 +65,7 @@ class ImageRequest:
 
     rig: CameraRig | None = None  # in place of what the recording or folder says
     topics: Mapping[str, str] = field(default_factory=dict)  # by left, right, rgb, depth, image, odometry
-    rectified: bool = False  # p of camera_info is the camera
+    rectified: bool = False  # p of camera_info is the camera; so it is where topics are called image_rect
     base: str = ""  # body frame in /tf_static, empty for the first camera
     rate_hz: float = 10.0  # of a folder whose pictures have no stamps
 
@@ -103,7 +112,8 @@ def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str,
     infos = [_info_of(reader, chosen[name], alone=mode != "stereo") for name in cameras_of(mode)]
     # A camera_rig tells all that camera_info would.
     known = [] if _RIG in reader.topics.values() and not set(infos) <= set(reader.topics) else infos
-    return rig_of_recording(reader, known, rectified=request.rectified, base=request.base)
+    rectified = request.rectified or any(RECTIFIED in chosen[name] for name in cameras_of(mode))
+    return rig_of_recording(reader, known, rectified=rectified, base=request.base)
 
 
 def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:

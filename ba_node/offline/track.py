@@ -18,14 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import BoolArray
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.core import geometry
 from ba_node.estimate import Poses, Transform
-from ba_node.front_end import FrontEnd, Images, State, Tracked, opencv
-from ba_node.front_end.records import FrontEndError
+from ba_node.front_end import FrontEnd, Images, State, Tracked
+from ba_node.front_end.images import read_mask
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.offline.images import ImageRequest, ImageSource, open_images
@@ -187,14 +186,6 @@ class _Run:
             "causes": front_end.counts,
             "notes": self.notes,
         }
-
-
-def read_mask(path: Path) -> BoolArray:
-    """Return the mask in a picture: (h, w), False where it is black."""
-    picture = opencv.cv2().imread(str(path), opencv.cv2().IMREAD_GRAYSCALE)
-    if picture is None:
-        raise FrontEndError(f"{path}: no picture that can be read")
-    return np.asarray(picture > 0)
 
 
 def _left_out(source: ImageSource) -> str:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations, find
-from ba_node.offline.fleet import Fleet, result_of
+from ba_node.offline.fleet import Fleet, result_of, words_of
 from ba_node.offline.measure import Measured, MeasureError, Question, measure
 from ba_node.offline.study import MAX_LOSS, MAX_SCORE, MIN_GAIN, Goal, Plan, Study, Trial, TuneError
 
@@ -103,13 +103,14 @@ def tune(
     plan = replace(plan, recordings=tuple(place for place in plan.recordings if place[0] in start))
     if plan.validation is not None and plan.validation[0] not in start:
         plan = replace(plan, validation=None)
-    everything = (*plan.recordings, *([plan.validation] if plan.validation else []))
     study = Study(plan, base, storage, {name: one.error for name, one in start.items()})
     study.begin(start)
     better(study.best())
     _search(plan, base, fleet, study, better, progress)
     best = study.best()
-    after = _measured(fleet, plan, base.with_values(best.values), everything)
+    after, useless = usable(plan, base.with_values(best.values), fleet)
+    if useless:
+        raise TuneError(f"with the best parameters: {next(iter(useless.values()))}")
     return Tuned(plan, start, best, after, study.trials(), study.failed(), study.importance(), left_out)
 
 
@@ -175,7 +176,7 @@ def usable(plan: Plan, base: Config, fleet: Fleet) -> tuple[dict[str, Measured],
             errors[place[0]] = result
     if not any(place[0] in found for place in plan.recordings):
         raise next(iter(errors.values()))
-    return found, {name: " ".join(str(error).split()) for name, error in errors.items()}
+    return found, {name: words_of(error) for name, error in errors.items()}
 
 
 def _result_or_error(future: Future[Measured]) -> Measured | Exception:
@@ -183,12 +184,6 @@ def _result_or_error(future: Future[Measured]) -> Measured | Exception:
         return result_of(future)
     except (ValueError, OSError) as error:
         return error
-
-
-def _measured(fleet: Fleet, plan: Plan, config: Config, places: Sequence[tuple[str, ...]]) -> dict[str, Measured]:
-    questions = [Question(place, config, plan.topics, plan.objective) for place in places]
-    futures = [fleet.submit(measure, question) for question in questions]
-    return {place[0]: result_of(future) for place, future in zip(places, futures, strict=True)}
 
 
 def grid(values: Mapping[str, Sequence[Value]]) -> Iterator[dict[str, Value]]:

@@ -75,6 +75,21 @@ def parameter_rows(tuned: Tuned, base: Config) -> list[list[str]]:
     ]
 
 
+def tuned_as_dict(tuned: Tuned) -> dict[str, Any]:
+    """Return the content of tuning.json."""
+    return {
+        "goal": tuned.plan.goal,
+        "improved": tuned.improved,
+        "overfitted": tuned.overfitted,
+        "recordings": {name: _both(tuned, name) for name in tuned.start},
+        "validation": tuned.plan.validation[0] if tuned.plan.validation else None,
+        "parameters": tuned.changes,
+        "importance": tuned.importance,
+        "trials": [dataclasses.asdict(trial) for trial in tuned.trials],
+        "trials_refused": tuned.failed,
+    }
+
+
 def write_tuned(out: Path, tuned: Tuned, base: Config) -> None:
     """Write tuning.json and index.html.
 
@@ -82,20 +97,7 @@ def write_tuned(out: Path, tuned: Tuned, base: Config) -> None:
         PageError: plotly is not installed; tuning.json is there.
         OSError: a file cannot be written.
     """
-    write_json(
-        out / "tuning.json",
-        {
-            "goal": tuned.plan.goal,
-            "improved": tuned.improved,
-            "overfitted": tuned.overfitted,
-            "recordings": {name: _both(tuned, name) for name in tuned.start},
-            "validation": tuned.plan.validation[0] if tuned.plan.validation else None,
-            "parameters": tuned.changes,
-            "importance": tuned.importance,
-            "trials": [dataclasses.asdict(trial) for trial in tuned.trials],
-            "trials_refused": tuned.failed,
-        },
-    )
+    write_json(out / "tuning.json", tuned_as_dict(tuned))
     verdict, kind = "Better parameters were found", "good"
     if not tuned.improved:
         verdict, kind = "Nothing better was found: the parameters of the start stand", "look"
@@ -202,6 +204,16 @@ def sweep_rows(found: Sequence[tuple[dict[str, Value], dict[str, Measured]]]) ->
     return head, rows
 
 
+def sweep_as_dict(found: Sequence[tuple[dict[str, Value], dict[str, Measured]]]) -> dict[str, Any]:
+    """Return the content of sweep.json."""
+    return {
+        "combinations": [
+            {"parameters": values, "recordings": {name: dataclasses.asdict(one) for name, one in of.items()}}
+            for values, of in found
+        ]
+    }
+
+
 def write_sweep(out: Path, found: Sequence[tuple[dict[str, Value], dict[str, Measured]]]) -> None:
     """Write sweep.csv, sweep.json and index.html.
 
@@ -214,11 +226,7 @@ def write_sweep(out: Path, found: Sequence[tuple[dict[str, Value], dict[str, Mea
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
     with whole_file(out / "sweep.csv") as stream:
         stream.write(text.getvalue().encode())
-    entries = [
-        {"parameters": values, "recordings": {name: dataclasses.asdict(one) for name, one in of.items()}}
-        for values, of in found
-    ]
-    write_json(out / "sweep.json", {"combinations": entries})
+    write_json(out / "sweep.json", sweep_as_dict(found))
     errors = np.array([[one.error for one in of.values()] for _, of in found])
     best = int(np.argmin(np.mean(np.log(np.maximum(errors, 1e-12)), axis=1)))
     names = [", ".join(f"{name}={_shown(value)}" for name, value in values.items()) for values, _ in found]

@@ -93,6 +93,7 @@ def test_results_are_one_table_and_page(broken: Path, tmp_path: Path, capsys: py
     assert "3 recordings: 2 sound, 0 to look at, 1 failed" in page
 
 
+@pytest.mark.slow
 def test_resumed_replays_are_not_done_again(tmp_path: Path) -> None:
     other = shutil.copy(MONO, tmp_path / "other.mcap")
     arguments = ["replay", str(MONO), str(other), "--out", str(tmp_path / "out"), "--no-report", "--resume"]
@@ -106,6 +107,7 @@ def test_resumed_replays_are_not_done_again(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "other" / "report.json").stat().st_mtime_ns > stamp, "other parameters, other results"
 
 
+@pytest.mark.slow
 def test_recordings_and_results_may_be_urls(tmp_path: Path) -> None:
     shutil.copy(MONO, tmp_path / "a.mcap")
     shutil.copy(MONO, tmp_path / "b.mcap")

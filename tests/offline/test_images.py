@@ -96,6 +96,14 @@ def test_depth_is_told_by_its_encoding(tmp_path: Path) -> None:
     assert frames[0][0].depth_m == pytest.approx(np.full(SIZE[::-1], 1.5))
 
 
+def test_topics_of_rectified_images_have_the_camera_of_p(tmp_path: Path) -> None:
+    messages = stereo(end="image_rect")
+    for sent in messages[:2]:
+        sent.message.d[0], sent.message.k[0] = -0.3, 60.0
+    rig = read(layouts.write(tmp_path / "bag", messages))[0].rig
+    assert (rig.intrinsics[0, 0], rig.distortion[0].tolist(), rig.position[1, 0]) == (50.0, [], pytest.approx(0.12))
+
+
 def test_odometry_comes_at_the_time_of_the_image(tmp_path: Path) -> None:
     messages = [info("/camera_info", "cam")]
     for i in range(4):

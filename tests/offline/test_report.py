@@ -163,6 +163,7 @@ def large(folder: Path, keyframes: int, points: int) -> None:
     (folder / "report.json").write_text(json.dumps(report))
 
 
+@pytest.mark.slow
 def test_several_runs_stand_side_by_side(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(folder, other)
@@ -201,6 +202,7 @@ def test_a_folder_without_results_is_named(tmp_path: Path, capsys: pytest.Captur
     assert f"{tmp_path}: no results of ba replay" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_residuals_are_drawn_on_the_image_where_there_is_one(folder: Path, tmp_path: Path) -> None:
     """A copy of the recording with an image for one keyframe: that which sees the most."""
     run = read_run(folder)

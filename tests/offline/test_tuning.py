@@ -69,6 +69,7 @@ def write(path: Path, keep: object) -> None:
 
 
 @pytest.mark.parametrize("bag", [MONO, pytest.param(STEREO, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_tracks_held_out_tell_bad_parameters_from_good_ones(bag: Path) -> None:
     good, bad = (measured(bag, "held_out", values) for values in ({}, BAD))
     assert (good.unit, bad.unit) == ("sigma", "sigma")
@@ -160,6 +161,7 @@ def test_several_processes_find_as_well_and_one_recording_is_kept(
     assert both["tuned"]["error"] < 0.5 * both["start"]["error"]
 
 
+@pytest.mark.slow
 def test_nothing_better_leaves_the_start_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tune"
     code = main(["tune", str(MONO), "--out", str(out), "--parameters", "scene.max_keyframes", "--trials", "2"])
@@ -180,6 +182,7 @@ def test_a_limit_of_latency_that_nothing_keeps_is_said(tmp_path: Path, capsys: p
     assert main([*arguments[:-1], "0"]) == 2
 
 
+@pytest.mark.slow
 def test_without_truth_tracks_that_are_held_out_decide(truthless: Path, tmp_path: Path) -> None:
     out = tmp_path / "sweep"
     arguments = ["sweep", str(truthless), "--out", str(out), "--values", "window.max_keyframes=4,20"]

@@ -11,6 +11,8 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
+from ba_node.front_end.records import FrontEndError
+from ba_node.io.rig_file import RigError
 from ba_node.ros import arguments
 from ba_node.ros.front_end.node import NODE_NAME, FrontEndNode
 from ba_node.ros.main import USAGE_ERROR, signals, spin
@@ -27,7 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
             if reason := arguments.objection(given):
                 return _refuse(reason)
             node = FrontEndNode()
-        except (*ARGUMENT_ERRORS, ConfigError) as error:
+        except (*ARGUMENT_ERRORS, ConfigError, RigError, FrontEndError) as error:
             return _refuse(str(error))
         try:
             executor = NodeExecutor()

@@ -24,18 +24,19 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import ReliabilityPolicy
 
-from ba_node.arrays import BoolArray
 from ba_node.config import declared
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.config.front_end_node import FrontEndNodeOptions
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Poses
 from ba_node.front_end.front_end import FrontEnd
+from ba_node.front_end.images import read_mask
 from ba_node.front_end.opencv import cv2, poselib
 from ba_node.front_end.records import FrontEndError, State, Tracked
 from ba_node.front_end.streams import (
     MASK,
     MODES,
+    RECTIFIED,
     Frame,
     OdometryBuffer,
     Streams,
@@ -80,6 +81,8 @@ class FrontEndNode(ManagedNode):
 
     Raises:
         ConfigError: a parameter does not exist or has a wrong value.
+        RigError: there is no rig in the file that is named.
+        FrontEndError: there is no mask in the file that is named, or a library is missing.
     """
 
     def __init__(self, **node_options: Any) -> None:
@@ -88,6 +91,11 @@ class FrontEndNode(ManagedNode):
         values: dict[str, Any] = dict(declare(self, (*own, *tracking)))
         self.options = FrontEndNodeOptions(**{parameter.name: values[parameter.name] for parameter in own})
         self._tracking = FrontEndOptions(**{parameter.name: values[parameter.name] for parameter in tracking})
+        rig_file, mask_file = self.options.rig_file, self.options.mask_file
+        self._given_rig = read_rig(rig_file, rectified=self.options.rectified) if rig_file else None
+        for load in (cv2, poselib):
+            load()  # now: it takes as long as many images
+        self._mask = read_mask(mask_file) if mask_file else None
         self.counted: Counter[str] = Counter()  # images tracked and keyframes sent, and images left out by reason
         self._throttle, self._factory = Throttle(_LOG_S), RclpyFactory()
         self._entities: list[tuple[str, Any]] = []
@@ -103,9 +111,7 @@ class FrontEndNode(ManagedNode):
         """Make publishers and subscriptions; those to images follow when somebody publishes them."""
         self.cleanup()
         options = self.options
-        for load in (cv2, poselib):
-            load()  # which takes as long as many images
-        self._rig = read_rig(options.rig_file, rectified=options.rectified) if options.rig_file else None
+        self._rig = self._given_rig
         self._mode = "" if options.mode == "auto" else options.mode
         self._streams: Streams | None = None
         self._subscribed: dict[str, str] = {}  # topic by stream
@@ -113,11 +119,10 @@ class FrontEndNode(ManagedNode):
         self._infos: dict[str, Any] = {}
         self._tree, self._odometry = StaticTree(), OdometryBuffer()
         self._front_end: FrontEnd | None = None
-        self._mask = read_mask(options.mask_file) if options.mask_file else None
         self._frames: list[Frame] = []
         self._unsent: deque[tuple[str, Any]] = deque(maxlen=_MAX_UNSENT)
         self._state: State | None = None
-        self._busy_s, self._said = 0.0, ""
+        self._busy_s, self._said, self._summary = 0.0, "", ""
         kinds = {name: INPUT_TYPES[name] for name in PUBLISHED}
         self._out = {name: self._own("publisher", message_class(kind), name, qos.profile(TOPICS[name]))
                      for name, kind in kinds.items()}  # fmt: skip
@@ -295,7 +300,8 @@ class FrontEndNode(ManagedNode):
             if any(name not in self._infos for name in cameras):
                 return None
             infos = [self._infos[name] for name in cameras]
-            rig = rig_from_infos(infos, rectified=options.rectified, tree=self._tree, base=options.base_frame)
+            rectified = options.rectified or any(RECTIFIED in self._subscribed[name] for name in cameras)
+            rig = rig_from_infos(infos, rectified=rectified, tree=self._tree, base=options.base_frame)
             if options.base_frame not in ("", rig.frame_id):
                 raise ConversionError(f"/tf_static has no way from {options.base_frame!r} to {rig.names[0]!r} (yet)")
             self._rig = rig
@@ -354,18 +360,18 @@ class FrontEndNode(ManagedNode):
     def _report(self) -> None:
         """Log what has become of the images, and what is missing."""
         wanted = [name for name in MODES.get(self._mode, MODES["stereo"]) if name not in self._subscribed]
-        words = self.summary()
+        words = summary = self.summary()
         if wanted:
             words += f"; nobody publishes {' and '.join(map(self.resolve_topic_name, wanted))}"
             words += "" if self._mode else ", nor the images of another mode"
-        elif words == self._said and self._active:
+        elif summary == self._summary and self._active:
             words += f"; no image came for {_LOG_S:g} s"
         if self._busy_s > _BUSY * _LOG_S:
             words += f"; tracking takes all the time ({self._busy_s / _LOG_S:.0%}): images get lost, lower max_features"
-        self._busy_s = 0.0
+        self._busy_s, self._summary = 0.0, summary
         if words != self._said:
-            self._log(Severity.INFO if words == self.summary() else Severity.WARNING, words)
-            self._said = self.summary()
+            self._log(Severity.INFO if words == summary else Severity.WARNING, words)
+            self._said = words
 
     def summary(self) -> str:
         """Return in words what has become of the images."""
@@ -381,11 +387,3 @@ class FrontEndNode(ManagedNode):
 
     def _log(self, severity: Severity, words: str) -> None:
         log(self, severity, words)
-
-
-def read_mask(path: str) -> BoolArray:
-    """Return the mask in a picture, (h, w), False where it is black; raise FrontEndError if there is none."""
-    picture = cv2().imread(path, cv2().IMREAD_GRAYSCALE)
-    if picture is None:
-        raise FrontEndError(f"mask_file {path!r} is no picture that can be read")
-    return np.asarray(picture > 0)

@@ -123,6 +123,8 @@ def test_wrong_parameters_are_refused_in_a_line(start_node: StartNode) -> None:
     for argument, words in (
         ("mode:=fish", "option mode = 'fish': choose one of auto, stereo, rgbd, mono"),
         ("max_feature:=5", "'max_feature' does not exist; did you mean 'max_features'?"),
+        ("rig_file:=/no/rig.yaml", "/no/rig.yaml: cannot be opened"),
+        ("mask_file:=/no/mask.png", "mask /no/mask.png: no picture"),
         ("max_features:=5", "option max_features = 5: expected a number in [50, 10000]"),
     ):
         node = start_node("--ros-args", "-p", argument, program=PROGRAM)
