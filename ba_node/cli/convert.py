@@ -93,7 +93,9 @@ def _convert_front_end(args: argparse.Namespace) -> int:
     options = AdapterOptions(args.tolerance, args.parallax, rig=rig)
     adapter = adapt(args.source, args.target, args.front_end, options, args.cameras or (len(rig) if rig else 1), topics)
     print(f"{args.target}: {adapter.summary()}")
-    write_result(args.json, {"summary": adapter.summary(), "notes": list(adapter.told())})
+    left_out = dict(sorted(adapter.counted.items()))
+    result = {"keyframes": adapter.sent, "images": adapter.images, "left_out": left_out, "notes": adapter.told()}
+    write_result(args.json, {"target": args.target.name, **result})
     for note in adapter.told():
         print(f"  {note}")
     return NEEDS_A_LOOK if any(adapter.counted[reason] for reason in _FAULTS) else 0

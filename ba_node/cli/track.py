@@ -118,7 +118,7 @@ def tell(report: Mapping[str, Any]) -> None:
         ("keyframes", f"{report['keyframes']} in {report['sessions']} session{'s' * (report['sessions'] != 1)}"),
         ("tracks", f"{report['tracks']} with {report['observations']} observations"),
     ]
-    if turn is not None:
+    if turn is not None and any(turn[:2]):
         yaw, roll = f"{turn[0]:.2f} +- {turn[2]:.2f} px of yaw", f"{turn[1]:.2f} +- {turn[3]:.2f} of roll"
         rows.append(("second camera", f"turned by {yaw}, {roll} against the rig; corrected"))
     rows += [("note", note) for note in report["notes"] if note.startswith(_HARMLESS)]

@@ -3,9 +3,10 @@
 """Search for better parameters on recordings.
 
 What counts is the error of the trajectory where a recording has ground_truth/pose, else the residuals of tracks that
-are held out of it. Of several recordings the last one is kept for validation: it takes no part in the search, and shows
-whether what was found is better on others too. The search begins with --params and --set; what it has found is kept in
-DIR/trials.log as it comes, and the same command goes on from there, with more --trials where it was done.
+are held out of it. Of several recordings the last one is kept for validation: it takes no part in the search, decides
+between the ten best trials, and shows whether what was found is better on others too. The search begins with --params
+and --set; what it has found is kept in DIR/trials.log as it comes, and the same command goes on from there, with more
+--trials where it was done.
 
 Writes into DIR: tuned.yaml, ready for --params and for the node; tuning.json; index.html, a page with all trials.
 

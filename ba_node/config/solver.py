@@ -123,7 +123,6 @@ class SolverConfig:
             "doc": "Stop when an accepted step lowers the objective by less than this share; -1: 1e-3 of local_irls"
             " (auto), 1e-5 of all others, whose first steps are small.",
         },
-        tune=Tune(1e-6, 1e-1, ("accuracy", "latency")),
     )
     gradient_tolerance: float = option(
         1e-9, "Stop when the norm of the gradient falls below this.", within=(0.0, 1e12), node={}

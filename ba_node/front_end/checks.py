@@ -11,10 +11,11 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.config.front_end import FrontEndOptions
-from ba_node.front_end import stereo
-from ba_node.front_end.records import Images
+from ba_node.front_end import features, stereo
+from ba_node.front_end.patches import Floats
+from ba_node.front_end.records import Grey, Images
 from ba_node.front_end.rectify import IdealRig
-from ba_node.front_end.tracking import Content, Frame
+from ba_node.front_end.tracking import Frame
 from ba_node.measurements import CameraRig
 
 # Spread of grey values below which there is nothing in an image.
@@ -22,6 +23,10 @@ _DARK = 2.5
 _BACK_NS = 1_000_000_000
 # A pair of which so few features have a partner is looked at with left and right exchanged.
 _FEW_PARTNERS = 0.25
+# Share of an image that is found in any other by chance.
+_STRANGERS = 0.02
+# Corners that are tried, their distance from the border and the side of their patches, px.
+_TRIED, _RIM, _SIDE = 200, 12, 15
 
 
 class ImageWatch:
@@ -97,13 +102,12 @@ class ImageWatch:
             return dataclasses.replace(images, depth_m=None)
         return images
 
-    def partners(self, content: Content, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
+    def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
         """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""
-        assert frame.right is not None
-        uv = content.uv
-        dense = stereo.dense(frame.grey, frame.right, 128, rig.baseline < 0.0)
-        swapped = stereo.dense(frame.right, frame.grey, 128, rig.baseline < 0.0)
-        ours, theirs = _share(dense), _share(swapped)
+        assert frame.right is not None and frame.right_soft is not None
+        as_given = (frame.grey, frame.right, frame.soft, frame.right_soft)
+        exchanged = (frame.right, frame.grey, frame.right_soft, frame.soft)
+        ours, theirs = (_share(*images, rig) for images in (as_given, exchanged))
         if theirs > 2.0 * ours and theirs > _FEW_PARTNERS:
             self.say(
                 "swapped",
@@ -111,7 +115,7 @@ class ImageWatch:
                 f" {100 * ours:.0f} % as given; exchange the topics, or the cameras in the rig",
                 notes,
             )
-        elif ours < 0.02 and len(uv):
+        elif ours < _STRANGERS:
             self.say(
                 "strangers",
                 f"only {100 * ours:.0f} % of the first image are found in the second: check that both are of one time"
@@ -120,9 +124,12 @@ class ImageWatch:
             )
 
 
-def _share(disparity: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
-    """Return how much of an image has a partner in the other."""
-    return float(np.mean(np.isfinite(disparity)))
+def _share(first: Grey, second: Grey, soft: Floats, other_soft: Floats, rig: IdealRig) -> float:
+    """Return which share of an image's corners has a partner in the other, and is found from there again."""
+    uv = features.corners(first, np.ones(first.shape, bool), np.empty((0, 2)), _TRIED, _RIM)
+    begin = stereo.look_up(stereo.dense(first, second, first.shape[1] // 5, rig.baseline < 0.0), uv)
+    found = stereo.measure(soft, other_soft, uv, begin, _SIDE, np.zeros(len(uv)))
+    return float(found.found.mean()) if len(uv) else 0.0
 
 
 def covariance_of(found: FloatArray, fixed_from_camera: FloatArray) -> FloatArray:

@@ -192,14 +192,14 @@ class FrontEnd:
         tracker = Tracker(self._ideal, dataclasses.replace(self.options, stereo_yaw_px=yaw, stereo_roll_px=roll))
         tracker.begin(frame, (odometry or _IDENTITY).after(self._ideal.body_from_camera).inverse())
         content, _ = tracker.keyframe(self._count + 1)
+        if frame.right is not None:
+            self._watch.partners(frame, self._ideal, self._notes)
         if len(content.track_id) < self.options.min_points:
             text = f"only {len(content.track_id)} features at {images.stamp_ns} ns: too little to begin with"
             self._watch.say("empty", text, self._notes)
             return self._told(State.STARTING, images)
         self._watch.clear("empty")
         self._tracker, self._odometry = tracker, odometry
-        if frame.right is not None and self._ideal.baseline:
-            self._watch.partners(content, frame, self._ideal, self._notes)
         if not content.depths.measures and odometry is None:
             self._watch.say("alone", _ALONE, self._notes)
             self._waiting, self._waiting_ns = content, images.stamp_ns

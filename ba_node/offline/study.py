@@ -22,6 +22,8 @@ MAX_SCORE = 1.05
 # What says that the search is worth it, and that it fits the recordings alone.
 MIN_GAIN, MAX_LOSS = 0.01, 0.02
 _RANDOM_FIRST = 10
+# Trials of which the recording for validation chooses one, none of them worse than the best by more than this.
+_FINALISTS, _NEARLY = 10, 1.1
 
 
 class TuneError(ValueError):
@@ -137,14 +139,16 @@ class Study:
 
     def best(self) -> Trial:
         """Return the best trial within the limits; if none is, that which is nearest to them."""
-        by_score = self._plan.goal == "accuracy"
+        return min(self.trials(), key=self._rank)
 
-        def key(one: Trial) -> tuple[bool, float]:
-            if not one.feasible:
-                return True, one.latency_ms if by_score else one.score
-            return False, one.score if by_score else one.latency_ms
+    def finalists(self) -> list[Trial]:
+        """Return the best trials, none of them much worse than the first."""
+        ranked = sorted((one for one in self.trials() if one.feasible), key=self._rank)[:_FINALISTS]
+        return [one for one in ranked if self._rank(one)[1] <= _NEARLY * self._rank(ranked[0])[1]]
 
-        return min(self.trials(), key=key)
+    def _rank(self, one: Trial) -> tuple[bool, float]:
+        by_score = (self._plan.goal == "accuracy") == one.feasible
+        return not one.feasible, one.score if by_score else one.latency_ms
 
     def importance(self) -> dict[str, float]:
         """Return how much each parameter decides (PED-ANOVA, Watanabe et al., IJCAI 2023), largest first."""

@@ -20,6 +20,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations, find
 from ba_node.offline.fleet import Fleet, result_of, words_of
 from ba_node.offline.measure import Measured, MeasureError, Question, measure
@@ -107,11 +109,24 @@ def tune(
     study.begin(start)
     better(study.best())
     _search(plan, base, fleet, study, better, progress)
-    best = study.best()
+    best = _validated(plan, base, fleet, study)
     after, useless = usable(plan, base.with_values(best.values), fleet)
     if useless:
         raise TuneError(f"with the best parameters: {next(iter(useless.values()))}")
     return Tuned(plan, start, best, after, study.trials(), study.failed(), study.importance(), left_out)
+
+
+def _validated(plan: Plan, base: Config, fleet: Fleet, study: Study) -> Trial:
+    """Return the best trial; of several that are nearly as good, that which is best on the recording for validation."""
+    finalists = study.finalists()
+    if plan.validation is None or len(finalists) < 2:
+        return study.best()
+    questions = [
+        Question(plan.validation, base.with_values(one.values), plan.topics, plan.objective) for one in finalists
+    ]
+    futures = [fleet.submit(measure, question) for question in questions]
+    errors = [np.inf if isinstance(found, Exception) else found.error for found in map(_result_or_error, futures)]
+    return finalists[int(np.argmin(errors))]
 
 
 def _search(

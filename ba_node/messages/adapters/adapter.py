@@ -30,6 +30,9 @@ from ba_node.messages.adapters.sources import Extrinsic, Features, LayoutError, 
 
 # Images that wait for their pose or for the rig, and poses that wait for their image.
 MAX_WAITING = 200
+_NO_RIG = "nothing tells the cameras: give them with --rig FILE"
+# Tracks and keyframes that are remembered; a guess that is sent twice does no harm.
+_MAX_KNOWN = 1_000_000
 # A pose so much older than the newest is of another session, ns.
 _BACK_NS = 1_000_000_000
 # How far a calibration may move before it is said: focal length and principal point by fx; m; rad.
@@ -114,7 +117,8 @@ class Adapter:
 
     def summary(self) -> str:
         """Return in words what came of the images so far."""
-        return f"{self.sent} keyframes of {self.images} images in {self._session + 1} sessions"
+        sessions = f"{self._session + 1} session{'s' if self._session else ''}"
+        return f"{self.sent} keyframes of {self.images} images in {sessions}"
 
     def told(self) -> list[str]:
         """Return a line for each reason why something was left out, with its count and the newest case."""
@@ -132,10 +136,9 @@ class Adapter:
 
     def finish(self) -> None:
         """Count what still waits when no more messages come."""
-        words = "nothing tells the cameras: give them with --rig FILE"
         for reason, waiting in (("no_features", self._poses), ("no_pose", self._features), ("no_rig", self._frames)):
             if waiting:
-                self.leave(reason, words if reason == "no_rig" else f"{len(waiting)} at the end", len(waiting))
+                self.leave(reason, _NO_RIG if reason == "no_rig" else f"{len(waiting)} at the end", len(waiting))
 
     def leave(self, reason: str, words: str, count: int = 1) -> None:
         """Count what is left out."""
@@ -199,7 +202,10 @@ class Adapter:
         if self._rig_sent is None:
             self._invent_lens(features)
         if self.rig is None:
-            self._frames = [*self._frames[1 - MAX_WAITING :], (pose, features)]
+            self._frames.append((pose, features))
+            if len(self._frames) > MAX_WAITING:
+                del self._frames[0]
+                self.leave("no_rig", _NO_RIG)
             return
         if not self._is_keyframe(pose, features):
             return
@@ -276,6 +282,9 @@ class Adapter:
             self._rig_sent = self.rig
             yield "camera_rig", stamp_ns, self.rig
         self._last = _Last(features.ids, pose.position, features)
+        for known in (self._keys, self._guessed):
+            if len(known) > _MAX_KNOWN:
+                known.clear()
         self._keys.add(key)
         self.sent += 1
         yield (

@@ -4,7 +4,8 @@
 
 OpenVINS (`publish_loopclosure_information` of ov_msckf) sends, for every image and only while somebody subscribes, pose
 and extrinsics of camera 0 as Odometry, its CameraInfo, and a PointCloud with one channel a point, [0, 0, u, v, id].
-Points that camera 0 does not see now have u = v = 0.
+Points that camera 0 does not see now have u = v = 0. Its quaternions are JPL's of IMU from global and of camera from
+IMU: number by number they are Hamilton's, which ROS has, of global from IMU and of IMU from camera.
 
 VINS-Fusion (`pubKeyframe`) sends pose and PointCloud of the last keyframe but two of its window, so late, with one
 channel a point, [x_n, y_n, u, v, id], and with every image the extrinsics. Stamps went through a double each on its own

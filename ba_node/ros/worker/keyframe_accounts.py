@@ -12,6 +12,8 @@ from collections.abc import Collection
 from ba_node.backend import CurrentMap
 
 Key = tuple[int, int]
+# So many keyframes that have left the map may stand in the accounts before these are gone through.
+_SPARE = 1000
 
 
 class KeyframeAccounts:
@@ -69,9 +71,9 @@ class KeyframeAccounts:
             del self._unsolved[key]
         self.solved += min(n_solved, 1)
         self.coalesced += max(n_solved - 1, 0)
-        here = {key for key in self._unrefined if key[0] == current.session_id and key not in held}
-        took_part = {key for key in here if key[1] in refined}
+        took_part = {(current.session_id, key) for key in refined if (current.session_id, key) not in held}
+        took_part &= self._unrefined
         self.refined += len(took_part)
-        self._unrefined = {
-            key for key in self._unrefined - took_part if key in held or current.is_solved(*key) is not None
-        }
+        self._unrefined -= took_part
+        if len(self._unrefined) > _SPARE + 2 * current.keyframe_count:
+            self._unrefined = {key for key in self._unrefined if key in held or current.is_solved(*key) is not None}

@@ -305,6 +305,8 @@ def test_what_waits_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> N
     made, _ = feed("openvins", clouds)
     assert made.counted["no_pose"] == 12 - 3
     assert made.notes["no_pose"].startswith("none came")
+    made, _ = feed("rtabmap", layouts.rtabmap(scene_of("rtabmap"), bundle=False))
+    assert made.counted["no_rig"] == 12 - 3 and "--rig FILE" in made.notes["no_rig"]
 
 
 @pytest.mark.parametrize("source", NAMES)

@@ -35,6 +35,10 @@ class FakeMap:
     def solved_count(self) -> int:
         return len(self._backend.window) - len(self._backend.unsolved)
 
+    @property
+    def keyframe_count(self) -> int:
+        return len(self._backend.window)
+
     def is_solved(self, session_id: int, keyframe_id: int) -> bool | None:
         known = [keyframe for keyframe in self._backend.window if keyframe.keyframe_id == keyframe_id]
         if session_id != 0 or not known:

@@ -1,0 +1,146 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""From pictures to a recording and to a map: folders, the command line, and a real car."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ba_node.cli.main import main
+from ba_node.core import geometry
+from ba_node.estimate import Transform
+from ba_node.evaluation.metrics import absolute_error
+from ba_node.io.mcap import BagReader
+from ba_node.io.rig_file import rig_yaml
+from ba_node.io.trajectory import read_tum
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
+from tests.front_end import world
+
+
+def write_pictures(folder: Path, poses: list[Transform]) -> None:
+    """Write a folder as ``ba track`` reads it, with the truth as KITTI has it."""
+    rig = world.rig()
+    for name in ("left", "right"):
+        (folder / name).mkdir(parents=True)
+    for i, pose in enumerate(poses):
+        for index, name in enumerate(("left", "right")):
+            cv2.imwrite(str(folder / name / f"{i:06d}.png"), world.render(rig, index, pose).grey)
+    (folder / "rig.yaml").write_text(rig_yaml(rig, "own")[0])
+    rows = [np.column_stack([pose.rotation, pose.translation]).reshape(-1) for pose in poses]
+    np.savetxt(folder / "poses.txt", rows)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures")
+    write_pictures(folder, world.drive(12))
+    return folder
+
+
+def test_pictures_become_a_map(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["run", str(pictures), "--out", str(out), "--no-report", "--track", "max_features=300"]) == 0
+    text, errors = capsys.readouterr()
+    assert "12, stereo" in text
+    assert "error to ground truth" in text
+    assert errors == ""
+    error = absolute_error(read_tum(out / "trajectory.tum"), read_tum(out / "ground_truth.tum"))
+    assert error.translation.rmse < 0.01, f"{error.translation.rmse:.4f} m"
+    with BagReader(out / "tracks.mcap") as reader:
+        kinds = [type(one) for _, _, one in reader.measurements()]
+    assert kinds[0] is CameraRig
+    assert kinds.count(FeatureTracks) == 2 * kinds.count(Keyframe) >= 6
+
+
+def test_the_same_pictures_give_the_same_bytes(pictures: Path, tmp_path: Path) -> None:
+    options = ["--track", "max_features=200"]
+    paths = [tmp_path / name for name in ("a.mcap", "b.mcap")]
+    for path in paths:
+        assert main(["track", str(pictures), str(path), *options]) == 0
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_mask_and_odometry_file(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = tmp_path / "one"
+    one.mkdir()
+    for file in (pictures / "left").iterdir():
+        (one / file.name).write_bytes(file.read_bytes())
+    (one / "rig.yaml").write_text(rig_yaml(world.rig(1), "own")[0])
+    mask = np.full(world.SIZE[::-1], 255, np.uint8)
+    mask[:, :100] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    lines = [
+        " ".join(map(str, [1.0 + 0.1 * i, *pose.translation, *geometry.quaternion_from_matrix(pose.rotation)]))
+        for i, pose in enumerate(world.drive(12))
+    ]
+    (tmp_path / "odometry.tum").write_text("\n".join(lines))
+    out = tmp_path / "mono.mcap"
+    words = ["track", str(one), str(out), "--mask", str(tmp_path / "mask.png")]
+    assert main([*words, "--odometry", str(tmp_path / "odometry.tum")]) == 0
+    assert "one camera without odometry" not in capsys.readouterr().out
+    with BagReader(out) as reader:
+        tracks = [one for _, _, one in reader.measurements() if isinstance(one, FeatureTracks)]
+    assert min(one.uv[:, 0].min() for one in tracks) > 99.0
+    assert main(words) in (0, 3)
+    assert "the scale is free" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--track", "max_feature=3"], "did you mean 'max_features'"),
+        (["--track", "max_features=3"], "expected a number in [50, 10000]"),
+        (["--rate", "0"], "--rate 0: expected images a second"),
+        (["--mask", "nowhere.png"], "nowhere.png: no picture that can be read"),
+    ],
+)
+def test_wrong_options(
+    pictures: Path, tmp_path: Path, extra: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["track", str(pictures), str(tmp_path / "x.mcap"), *extra]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_black_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.yaml").write_text(rig_yaml(world.rig(1), "own")[0])
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros(world.SIZE[::-1], np.uint8))
+    assert main(["track", str(tmp_path), str(tmp_path / "x.mcap")]) == 2
+    assert "no keyframe came of 3 images" in capsys.readouterr().err
+
+
+def segments(estimate: Path, truth: Path) -> tuple[float, float]:
+    """Return the mean error of segments of 10 to 40 m as a share of them (KITTI), and the scale of the whole (sim3)."""
+    ours, theirs = read_tum(estimate), read_tum(truth)
+    assert np.array_equal(ours.stamp_ns, theirs.stamp_ns)
+    a, b = (
+        [Transform(r, p) for r, p in zip(geometry.matrix_from_quaternion(one.orientation), one.position, strict=True)]
+        for one in (ours, theirs)
+    )
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(theirs.position, axis=0), axis=1))])
+    errors = []
+    for length in (10.0, 20.0, 30.0, 40.0):
+        found = []
+        for i in range(len(a)):
+            j = int(np.searchsorted(way, way[i] + length))
+            if j < len(a):
+                true, told = b[i].inverse().after(b[j]), a[i].inverse().after(a[j])
+                found.append(float(np.linalg.norm(true.inverse().after(told).translation)) / length)
+        errors.append(np.mean(found))
+    return float(np.mean(errors)), absolute_error(ours, theirs, "sim3").alignment.scale
+
+
+@pytest.mark.slow
+def test_real_car(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shared_data / "kitti-stereo-images"
+    assert main(["run", str(folder), "--out", str(tmp_path), "--no-report"]) == 0
+    assert capsys.readouterr().err == ""
+    error, scale = segments(tmp_path / "trajectory.tum", tmp_path / "ground_truth.tum")
+    assert error < 0.008, f"{100 * error:.2f} % of segments of 10 to 40 m"
+    assert abs(scale - 1.0) < 0.006, f"scale {scale:.4f}"
