@@ -26,6 +26,7 @@ from pathlib import Path
 from ba_node.cli.console import (
     TargetError,
     add_topic_options,
+    progress_bar,
     require_folder,
     require_mcap,
     topic_choice,
@@ -73,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
     require_folder(args.target)
     if form == "mcap":
         require_mcap(args.target)
-    what = convert.read(args.source, topic_choice(args))
+    with progress_bar("convert", "messages") as progress:
+        what = convert.read(args.source, topic_choice(args), progress)
     left_out = convert.write(args.target, what, form)
     print(f"{args.target}: {convert.counts(what)}{f', without {left_out}' if left_out else ''}")
     write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ba_node.cli.console import coloured, require_folder, table, write_result
+from ba_node.cli.console import coloured, progress_bar, require_folder, table, write_result
 
 SUMMARY = "replay recordings and compare with a baseline"
 EXAMPLE = "ba regress bags/regress.yaml\n  ba regress mine.yaml --new drive_1.mcap drive_2.mcap"
@@ -44,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
         write_result(args.json, {"recordings": len(cases)})
         return 0
     cases = regress.read_baseline(args.baseline)
-    rows = regress.run(args.baseline, cases, time.perf_counter, _tell)
+    with progress_bar("regress", "recordings") as progress:
+        rows = regress.run(args.baseline, cases, time.perf_counter, progress)
     print(table(_HEAD, [_cells(row) for row in rows]))
     found = [vars(row.figure) | {"recording": row.recording, "now": row.now, "verdict": row.verdict} for row in rows]
     write_result(args.json, {"figures": found})
@@ -65,8 +66,3 @@ def _cells(row: Any) -> tuple[str, ...]:
     unit = f" [{of.unit}]" if of.unit else ""
     allowed = f"{of.direction} {of.tolerance:.0%}"
     return (row.recording, f"{of.key}{unit}", f"{of.value:.6g}", now, change, allowed, coloured(row.verdict))
-
-
-def _tell(recording: str) -> None:
-    if sys.stderr.isatty():
-        print(f"replaying {recording}", file=sys.stderr)

@@ -119,8 +119,10 @@ def _solved(args: argparse.Namespace) -> Solution | ModelSolution:
             raise ConfigError("--refine is for models of COLMAP: BAL and Bundler have f, k1, k2 of each image free")
         options = solver_options(args.method, assignments)
         return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
-    options = solver_options(args.method, [*_OF_MODELS, *assignments])
     groups = [group for group in args.refine or DEFAULT_GROUPS if group != "none"]
+    # Cameras are refined without a region, which the default has; a method that is asked for by name is not changed.
+    own = [*_OF_MODELS, "trust_region=none"] if groups and args.method == "auto" else _OF_MODELS
+    options = solver_options(args.method, [*own, *assignments])
     return solve_model(args.problem, options, groups, clock=time.perf_counter, on_iteration=_show)
 
 

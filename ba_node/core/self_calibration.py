@@ -101,7 +101,7 @@ def _require(problem: Problem, options: SolverOptions) -> None:
         ("annealing", options.annealing, "none"),
     ):
         if has != needs:
-            raise ConfigError(f"{name} = {has}: cameras are refined with {name} = {needs} alone, as by method auto")
+            raise ConfigError(f"{name} = {has}: cameras are refined with {name} = {needs} alone: set it so")
     if options.linear_solver == "pcg" or options.kernels == "native":
         raise ConfigError(
             "cameras are refined by Cholesky and the numpy kernels: take linear_solver and kernels = auto"

@@ -26,6 +26,8 @@ from ba_node.io.model import ModelError
 
 _HEAD = b"# Bundle file v0.3"
 _CAMERA, _VIEW = 15, 4
+# No size, place or count is larger.
+_LARGEST = 1e15
 # A rotation in the file has six digits or so.
 _ORTHONORMAL = 1e-3
 
@@ -135,8 +137,10 @@ def _numbers(path: Path) -> FloatArray:
         values = np.array(text.split(), dtype=np.float64)
     except ValueError as error:
         raise ModelError(f"{path}: something is not a number: {error}") from None
-    if not np.isfinite(values).all():
-        raise ModelError(f"{path}: number {int(np.argmin(np.isfinite(values)))} after the first line is not finite")
+    sound = np.abs(values) < _LARGEST  # NaN is not
+    if not sound.all():
+        row = int(np.argmin(sound))
+        raise ModelError(f"{path}: number {row} after the first line is {values[row]:g}: expected a finite one")
     return values
 
 

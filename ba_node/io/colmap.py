@@ -9,6 +9,7 @@ pixel less. Rigs of several cameras stay rigs.
 from __future__ import annotations
 
 import importlib
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +20,13 @@ import numpy as np
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry
 from ba_node.core.problem import Cameras
+from ba_node.io.files import whole_file
 from ba_node.io.model import ModelError, Reconstruction, lens_values, read_lens, stamps
 
 _PARTS = ("cameras", "images", "points3D")
-# Of the binary files: bytes of a record before its list, and of an entry of that (0: only the least is known).
-_RECORDS = {"cameras": (24, 0), "images": (64, 24), "points3D": (43, 8), "rigs": (8, 0), "frames": (68, 0)}
+_FILES = (*_PARTS, "rigs", "frames")
+# What pycolmap raises, and what numbers lead to that make no sense.
+_DAMAGE = (ValueError, RuntimeError, IndexError, KeyError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -90,13 +93,19 @@ def read_colmap(path: Path) -> ColmapModel:
     if not is_model(path):
         raise ModelError(f"{path}: no model of COLMAP: expected {', '.join(_PARTS)} as .bin or .txt")
     colmap = library()
-    for part in (path / f"{name}.bin" for name in _RECORDS):
+    for part in (path / f"{name}.bin" for name in _FILES):
         if part.is_file():
             _require_whole(part)
     try:
-        world = colmap.Reconstruction(path)
-    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
+        return _converted(path, colmap.Reconstruction(path))
+    except ModelError:
+        raise
+    except _DAMAGE as error:
         raise ModelError(f"{path}: cannot be read, the model is damaged: {' '.join(str(error).split())}") from None
+
+
+def _converted(path: Path, world: Any) -> ColmapModel:
+    """Return a model in our terms too."""
     camera_ids, point_ids = sorted(world.cameras), sorted(world.points3D)
     frame_ids = sorted(id_ for id_ in world.reg_frame_ids())
     cameras = [world.cameras[id_] for id_ in camera_ids]
@@ -132,18 +141,34 @@ def read_colmap(path: Path) -> ColmapModel:
 def _require_whole(path: Path) -> None:
     """Raise ModelError if a binary file is shorter than what it claims: pycolmap goes on reading then, for hours."""
     data = path.read_bytes()
-    head, length = _RECORDS[path.stem]
     end, count = 8, int.from_bytes(data[:8], "little")
-    for number in range(count if count * head <= len(data) else 0):
-        end += head
-        if path.stem == "images":
-            end = data.find(b"\0", end) + 1 or len(data) + 1
-        if length:
-            end += 8 + length * int.from_bytes(data[end : end + 8], "little")
+    for number in range(min(count, len(data))):
+        end = _end_of_record(path.stem, data, end)
         if end > len(data):
             raise ModelError(f"{path}: cut off or damaged at record {number} of {count}")
-    if count * head > len(data) or len(data) < 8:
+    if count > len(data) or len(data) < 8:
         raise ModelError(f"{path}: cut off or damaged: {count} records in {len(data)} bytes")
+
+
+def _end_of_record(part: str, data: bytes, begin: int) -> int:
+    """Return where a record of a binary file ends; of a camera, whose parameters differ in number, the least."""
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], "little")
+
+    if part == "cameras":
+        return begin + 24
+    if part == "images":
+        name = data.find(b"\0", begin + 64) + 1 or len(data) + 1
+        return name + 8 + 24 * number(name, 8)
+    if part == "points3D":
+        return begin + 51 + 8 * number(begin + 43, 8)
+    if part == "frames":
+        return begin + 68 + 16 * number(begin + 64, 4)
+    end = begin + 8
+    for sensor in range(min(number(begin + 4, 4), len(data))):
+        end += 8 if sensor == 0 else 9 + 56 * number(end + 8, 1)
+    return end
 
 
 def _observations(
@@ -176,13 +201,15 @@ def write_colmap(path: Path, world: Any, *, text: bool = False) -> None:
     """
     if path.exists() and not is_model(path) and (not path.is_dir() or any(path.iterdir())):
         raise ModelError(f"{path}: is there already and is no model of COLMAP: name another folder")
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as made:
+    with tempfile.TemporaryDirectory(prefix="ba_colmap_") as made:
         (world.write_text if text else world.write_binary)(made)
         path.mkdir(exist_ok=True)
-        for old in (path / f"{part}{suffix}" for part in (*_PARTS, "rigs", "frames") for suffix in (".bin", ".txt")):
-            old.unlink(missing_ok=True)
-        for part in Path(made).iterdir():
-            part.replace(path / part.name)
+        for part in sorted(Path(made).iterdir()):
+            with part.open("rb") as source, whole_file(path / part.name) as stream:
+                shutil.copyfileobj(source, stream)
+    for name in _FILES:
+        # What an older model of the other form has left would be read in its place.
+        (path / f"{name}{'.bin' if text else '.txt'}").unlink(missing_ok=True)
 
 
 def to_colmap(model: Reconstruction) -> Any:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from ba_node.io.ply import write_ply
 from ba_node.io.pose_files import is_g2o, read_g2o, write_g2o, write_kitti
 from ba_node.io.reference import first_line, read_poses
 from ba_node.io.trajectory import write_tum
+from ba_node.measurements import Measurement
 from ba_node.offline.model_timeline import timeline
 from ba_node.offline.recording import record
 
@@ -43,8 +44,10 @@ FORMATS = {
 }
 
 
-def read(path: Path, choice: TopicChoice) -> Reconstruction | Poses:
-    """Read a file or folder, whichever format it has.
+def read(
+    path: Path, choice: TopicChoice, progress: Callable[[int, int], None] = lambda _done, _total: None
+) -> Reconstruction | Poses:
+    """Read a file or folder, whichever format it has; ``progress`` hears of the messages of a recording.
 
     Raises:
         ModelError: it has none that is known. Readers raise errors of their own, all of them ValueErrors.
@@ -52,7 +55,7 @@ def read(path: Path, choice: TopicChoice) -> Reconstruction | Poses:
     if path.is_dir() and colmap.is_model(path):
         return colmap.read_colmap(path).model
     if path.is_dir() or path.suffix in _BAGS:
-        return of_recording(path, choice)
+        return of_recording(path, choice, progress)
     if bundler.is_bundler(path):
         scene = bundler.read_bundler(path)
         return replace(from_bal(scene.bal), colour=scene.colour)
@@ -126,7 +129,7 @@ def poses_of(model: Reconstruction) -> Poses:
     return Poses(order.astype(np.uint64), model.stamp_ns[order], position, quaternion_from_matrix(rotation))
 
 
-def of_recording(path: Path, choice: TopicChoice) -> Reconstruction:
+def of_recording(path: Path, choice: TopicChoice, progress: Callable[[int, int], None]) -> Reconstruction:
     """Return what the back-end makes of a recording with its defaults, as `ba replay` does: the newest session.
 
     Raises:
@@ -135,7 +138,13 @@ def of_recording(path: Path, choice: TopicChoice) -> Reconstruction:
     """
     backend = Backend(Config())
     with BagReader(path, choice) as reader:
-        for _ in backend.replay(measurement for _, _, measurement in reader.measurements()):
+
+        def measurements() -> Iterator[Measurement]:
+            for done, (_, _, measurement) in enumerate(reader.measurements(), start=1):
+                yield measurement
+                progress(done, reader.message_count)
+
+        for _ in backend.replay(measurements()):
             pass
     return of_map(backend.snapshot())
 

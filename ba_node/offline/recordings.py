@@ -18,12 +18,14 @@ import numpy as np
 from ba_node.io.bag_source import BagChannel
 from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.mcap import BagError, BagReader, BagWriter
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.topics import CAMERA_TYPES, INPUT_TYPES, TF_STATIC
 
 _NS = 1e9
 # A pause between keyframes that is so many times as long as the median is told.
 _GAP = 4.0
+# Different things that are wrong with messages; the others are like them.
+_TOLD = 5
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 Progress = Callable[[int, int], None]
 
@@ -86,41 +88,75 @@ def examine(path: Path | Sequence[Path], choice: TopicChoice, progress: Progress
 
 def _use(reader: BagReader, facts: RecordingFacts) -> None:
     """Fill in what a replay would use."""
+    seen = _Seen()
     try:
-        measurements = list(reader.measurements())
+        for _, _, measurement in reader.measurements():
+            seen.add(measurement)
     except BagError as error:
         facts.refusal = str(error).removeprefix(f"{reader.path}: ")
         images = sorted(topic for topic, of in facts.topics.items() if of.type_name in _IMAGES)
         if images:
-            facts.attention.append(f"images on {', '.join(images)}: a front-end makes keyframes and tracks of them")
+            facts.attention.append(f"images on {', '.join(images)}: `ba run` makes a map of them, `ba track` keyframes")
         return
     facts.taken, facts.left = dict(reader.taken), dict(reader.left)
-    by_kind: dict[type, list[Any]] = {}
-    for _, _, measurement in measurements:
-        by_kind.setdefault(type(measurement), []).append(measurement)
-    keyframes, tracks = by_kind.get(Keyframe, []), by_kind.get(FeatureTracks, [])
-    seen = Counter(int(track) for image in tracks for track in np.unique(image.track_id))
-    tracked = {(image.session_id, image.keyframe_id) for image in tracks if len(image.track_id)}
-    bare = sum((keyframe.session_id, keyframe.keyframe_id) not in tracked for keyframe in keyframes)
-    sizes, lengths = [len(image.track_id) for image in tracks], list(seen.values())
-    rigs = by_kind.get(CameraRig, [])
-    facts.inputs = {
-        "sessions": len({keyframe.session_id for keyframe in keyframes}),
-        "keyframes": len(keyframes),
-        "keyframes_without_tracks": bare,
-        "cameras": len(rigs[0]) if rigs else 0,
-        "images": len(tracks),
-        "tracks": len(seen),
-        "observations": sum(sizes),
-        "tracks_per_image": _median(sizes),
-        "images_per_track": _median(lengths),
-        "tracks_seen_once": sum(length == 1 for length in lengths),
-        "guesses": sum(len(guess.track_id) for guess in by_kind.get(LandmarkGuesses, [])),
-        "pauses": _pauses(keyframes),
-        "depths": sum(int(np.isfinite(image.depth_m).sum()) for image in tracks),
-    }
-    if bare:
-        facts.attention.append(f"{bare} of {len(keyframes)} keyframes have no tracks")
+    facts.inputs = seen.as_dict()
+    if seen.bare:
+        facts.attention.append(f"{seen.bare} of {len(seen.keyframes)} keyframes have no tracks")
+    facts.attention += [f"{reason}: {count} times" for reason, count in seen.malformed.most_common(_TOLD)]
+
+
+class _Seen:
+    """Counts of what the inputs hold; no observation is kept."""
+
+    def __init__(self) -> None:
+        self.keyframes: list[Keyframe] = []
+        self.malformed: Counter[str] = Counter()
+        self._tracked: set[tuple[int, int]] = set()
+        self._views: Counter[int] = Counter()
+        self._sizes: list[int] = []
+        self._cameras = self._guesses = self._depths = 0
+
+    def add(self, measurement: Measurement) -> None:
+        """Count one."""
+        malformed = getattr(measurement, "malformed", "")
+        if malformed:
+            self.malformed[malformed] += 1
+        elif isinstance(measurement, Keyframe):
+            self.keyframes.append(measurement)
+        elif isinstance(measurement, FeatureTracks):
+            if len(measurement.track_id):
+                self._tracked.add((measurement.session_id, measurement.keyframe_id))
+            self._views.update(np.unique(measurement.track_id).tolist())
+            self._sizes.append(len(measurement.track_id))
+            self._depths += int(np.isfinite(measurement.depth_m).sum())
+        elif isinstance(measurement, LandmarkGuesses):
+            self._guesses += len(measurement.track_id)
+        elif isinstance(measurement, CameraRig):
+            self._cameras = len(measurement)
+
+    @property
+    def bare(self) -> int:
+        """Return the number of keyframes without tracks."""
+        return sum((keyframe.session_id, keyframe.keyframe_id) not in self._tracked for keyframe in self.keyframes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all counts."""
+        lengths = list(self._views.values())
+        return {
+            "sessions": len({keyframe.session_id for keyframe in self.keyframes}),
+            "keyframes": len(self.keyframes),
+            "keyframes_without_tracks": self.bare,
+            "cameras": self._cameras,
+            "images": len(self._sizes),
+            "tracks": len(lengths),
+            "observations": sum(self._sizes),
+            "tracks_per_image": _median(self._sizes),
+            "images_per_track": _median(lengths),
+            "tracks_seen_once": sum(length == 1 for length in lengths),
+            "guesses": self._guesses,
+            "pauses": _pauses(self.keyframes),
+            "depths": self._depths,
+        }
 
 
 def _pauses(keyframes: Sequence[Keyframe]) -> str:

@@ -116,15 +116,17 @@ def write_baseline(path: Path, cases: Sequence[Case]) -> None:
         stream.write((_HEAD + text).encode())
 
 
-def run(path: Path, cases: Sequence[Case], clock: Callable[[], float], told: Callable[[str], None]) -> list[Row]:
-    """Replay the recordings of a baseline and compare; ``told`` hears of each when its turn comes.
+def run(
+    path: Path, cases: Sequence[Case], clock: Callable[[], float], progress: Callable[[int, int], None]
+) -> list[Row]:
+    """Replay the recordings of a baseline and compare.
 
     Raises:
         BagError: a recording cannot be read. ConfigError: a setting does not exist.
     """
     rows = []
-    for case in cases:
-        told(case.recording)
+    for done, case in enumerate(cases):
+        progress(done, len(cases))
         report = _report(path, case, clock)
         for figure in case.figures:
             now = value_of(report, figure.key)

@@ -24,7 +24,9 @@ from ba_node.core.self_calibration import (
 )
 from ba_node.core.solver import solve
 
-AUTO = dataclasses.replace(options("auto"), function_tolerance=1e-12, max_iterations=100, damping_policy="nielsen")
+AUTO = dataclasses.replace(
+    options("auto"), trust_region="none", function_tolerance=1e-12, max_iterations=100, damping_policy="nielsen"
+)
 LENS = {
     Model.RATIONAL: [600.0, 610.0, 320.0, 240.0, -0.1, 0.02, 1e-3, -2e-3, 3e-3, 0.01, 0.005, 0.001],
     Model.EQUIDISTANT: [300.0, 310.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, 0.0, 0.0, 0.0, 0.0],

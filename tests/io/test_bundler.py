@@ -85,7 +85,7 @@ def test_a_scene_reads_back_as_it_was(tmp_path: Path) -> None:
         ("1 2 8 -100.0 0.25\n", "", "truncated or damaged at point 1 of 2"),
         ("2 0 5", "2 9 5", "a view of point 0 is of camera 9, of 3"),
         ("500 -0.1 0.01\n1 0 0", "500 -0.1 0.01\n1 0.5 0", "camera 0: its rotation is off an orthonormal one by"),
-        ("-1 0 -8", "-1 nan -8", "is not finite"),
+        ("-1 0 -8", "-1 nan -8", "expected a finite one"),
         ("3 2\n", "3000 2\n", "truncated: 3000 cameras make"),
     ],
 )
