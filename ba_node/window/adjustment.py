@@ -67,8 +67,8 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
     if final and (known.absolute or known.landmarks) and known.map_from_world is None:
         scene.log.warn(
             "unaligned",
-            f"{len(known.absolute) + len(known.landmarks)} priors in frame {known.world_frame!r} were not used: the path is"
-            " too short, or they are too few or too noisy, to tell where the map lies in it (factors.align_m)",
+            f"{len(known.absolute) + len(known.landmarks)} priors in frame {known.world_frame!r} were not used: the path"
+            " is too short, or they are too few or too noisy, to tell where the map lies in it (factors.align_m)",
         )
     found = _merged(scene, config, final) if known.merges else None
     found = found or (_measured(scene, config) if known.unchecked else None)
