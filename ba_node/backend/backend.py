@@ -223,6 +223,8 @@ class Backend:
             why = self.refusal or ("" if merged else "nothing came of a solve of everything")
         if why:
             self.scene.restore(before)
+            if what.key is not None:
+                self.scene.constraints.refused.add(what.key)
             self.scene.log.warn("not_adjusted", f"{what.cause}; the map stays as it is: {why}")
             return None
         assert merged is not None

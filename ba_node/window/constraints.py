@@ -279,7 +279,7 @@ def _keys(scene: Scene, number: IntArray) -> list[tuple[int, int]]:
     """Return the relative poses of keyframes of a problem, in the order of these."""
     known = scene.constraints
     ids = scene.keyframes.keyframe_id[np.flatnonzero(number >= 0)].tolist()
-    return list(dict.fromkeys(key for one in ids for key in known.relative_of.get(one, ())))
+    return list(dict.fromkeys(key for one in ids for key in known.relative_of.get(one, ()) if key not in known.refused))
 
 
 def in_place(steps: tuple[RelativePoses, ...], others: list[KeyframeFactors]) -> tuple[KeyframeFactors, ...]:

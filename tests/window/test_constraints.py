@@ -310,3 +310,31 @@ def test_priors_without_keyframes_or_a_path_to_align_by_are_said(street: Synthet
     backend, _ = replayed(first(street, 3), fixes(street, 0.0))
     (text,) = backend.report.warnings
     assert text.startswith("3 priors in frame 'enu' were not used: the path is too short")
+
+
+@pytest.mark.parametrize(("off_m", "closes"), [(0.0, True), (300.0, False)])
+def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None:
+    """A relative pose of the first and the last keyframe; one that is 300 m off leaves the map as it is, and is said."""
+    data = first(round_trip(0.5), 60)
+    rotation = geometry.matrix_from_quaternion(data.truth.orientation)
+    back = geometry.inverse(rotation[0], data.truth.position[0])
+    turn, move = geometry.compose(*back, rotation[59], data.truth.position[59])
+    loop = RelativePose(
+        0,
+        int(data.truth.keyframe_id[0]),
+        int(data.truth.keyframe_id[59]),
+        True,
+        move + np.array([off_m, 0.0, 0.0]),
+        geometry.quaternion_from_matrix(turn),
+        np.diag([1e-4] * 3 + [1e-6] * 3).ravel(),
+    )
+    _, plain = replayed(data)
+    backend, estimate = replayed(data, lambda k, _: [loop] if k == 30 else [])
+    ends = [float(np.linalg.norm(e.trajectory.position[-1] - data.truth.position[59])) for e in (plain, estimate)]
+    assert ends[0] > 0.5
+    if closes:
+        assert ends[1] < 0.2 * ends[0]
+        assert not any("the map stays as it is" in text for text in backend.report.warnings)
+    else:
+        assert ends[1] < 1.1 * ends[0]
+        assert any("the map stays as it is" in text for text in backend.report.warnings)
