@@ -24,7 +24,7 @@ from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config, OdometryConfig, SolverOptions
 from ba_node.core import geometry, native_kernels, solver
 from ba_node.core.factors import RelativePoses
-from ba_node.core.priors import PosePriors, root_information
+from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, full
@@ -38,6 +38,8 @@ _WORTH, _BENT = 1.0 / 3.0, 10.0
 _UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
 _RECENT, _TELLING = 50, 4.0
+# Map and world are tried to be aligned again once the map has grown by this share.
+_TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
 _ITERATIONS = 30
@@ -62,7 +64,7 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
     if not config.factors.enabled or n < 2 or scene.cameras is None:
         return None
     unaligned = bool(known.absolute or known.landmarks) and known.map_from_world is None
-    if unaligned and (final or n - known.adjusted_at >= _GROWN * n):
+    if unaligned and (final or n - known.adjusted_at >= _TRY_AGAIN * n):
         known.adjusted_at = n
         constraints.align(scene, config)
     if final and (known.absolute or known.landmarks) and known.map_from_world is None:
@@ -162,11 +164,10 @@ def _loops(scene: Scene) -> tuple[RelativePoses, ...]:
     for key, one in scene.constraints.relative.items():
         ends = [scene.find_keyframe(end) for end in key]
         if None not in ends and key not in scene.constraints.refused:
-            found.append((ends, one.rotation, one.position, one.covariance))
+            found.append((ends, one.rotation, one.position, one.root))
     if not found:
         return ()
-    ends_of, rotation, position, covariance = (np.array(values) for values in zip(*found, strict=True))
-    root = root_information(covariance)
+    ends_of, rotation, position, root = (np.array(values) for values in zip(*found, strict=True))
     return (RelativePoses(ends_of, rotation, position, root, "cauchy", 3.0),)
 
 
