@@ -314,7 +314,7 @@ def test_priors_without_keyframes_or_a_path_to_align_by_are_said(street: Synthet
 
 @pytest.mark.parametrize(("off_m", "closes"), [(0.0, True), (300.0, False)])
 def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None:
-    """A relative pose of the first and the last keyframe; one that is 300 m off leaves the map as it is, and is said."""
+    """A relative pose of the first and last keyframe; one that is 300 m off leaves the map as it is, and is said."""
     data = first(round_trip(0.5), 60)
     rotation = geometry.matrix_from_quaternion(data.truth.orientation)
     back = geometry.inverse(rotation[0], data.truth.position[0])
