@@ -40,6 +40,14 @@ FINDINGS: tuple[Claim, ...] = (
         ),
     ),
     Claim(
+        "both are so from a first damping of 1e-4 as well",
+        "preconditioner",
+        (
+            Below(_M, "pcg_per_solve", "diag block of S, mu 1e-4", ("I, mu 1e-4",), 4.0),
+            Below(_M, "pcg_per_solve", "I, mu 1e-4", tuple(f"{name}, mu 1e-4" for name in _STANDING), 1.5),
+        ),
+    ),
+    Claim(
         "Huber's loss leaves the conditions of C, B and S near those of squared loss",
         "reweighting",
         tuple(
