@@ -62,7 +62,7 @@ FINDINGS: tuple[Claim, ...] = (
         (
             Within(_C, "lone_points", "squared, PCG", high=0.0),
             Within(_C, "lone_points", "TQ", low=500.0),
-            Within(_S, "lone_points", "TQ, annealed", low=100.0),
+            Within(_S, "lone_points", "TQ, annealed", low=1.0),
             Below(_C, "condition_c", "squared, PCG", ("TQ",), 1e6),
             Below(_C, "condition_c", "squared, PCG", ("TQ, annealed",), 1e4),
             Below(_S, "condition_c", "squared, PCG", ("TQ, annealed",), 1e6),
