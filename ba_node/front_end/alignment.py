@@ -37,6 +37,8 @@ _KEPT, _KEPT_ROWS = 0.97, 0.9
 # Fewest points of a pair, and least median shift between the keyframes, px.
 _LEAST_POINTS, _LEAST_SHIFT_PX = 60, 3.0
 _STEPS = 10
+# Keyframes at the start that rows are learned from, and how often later.
+_FIRST, _EVERY = 10, 4
 _FLOOR_PX = 0.1
 # A turn is applied once it is this many standard deviations from none.
 _SURE = 3.0
@@ -64,6 +66,7 @@ class StereoAlignment:
         self._vector = self._information @ self.turn
         self._rows_information = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
         self._rows_vector = np.zeros(6)
+        self._images = 0
         self._rows: FloatArray = np.zeros(6)
 
     @property
@@ -87,6 +90,12 @@ class StereoAlignment:
     def rows_off(self, uv: FloatArray) -> FloatArray:
         """Return how many rows below its own a point is in the second image, (n,) px."""
         return np.asarray(self._powers(uv) @ self._rows)
+
+    @property
+    def wants_rows(self) -> bool:
+        """Return whether rows are to be learned from the next image: of the first ones, then now and then."""
+        self._images += 1
+        return self._images <= _FIRST or self._images % _EVERY == 0
 
     def _powers(self, uv: FloatArray) -> FloatArray:
         x, y = self._flat(uv)

@@ -127,7 +127,8 @@ class ImageWatch:
 def _share(first: Grey, second: Grey, soft: Floats, other_soft: Floats, rig: IdealRig) -> float:
     """Return which share of an image's corners has a partner in the other, and is found from there again."""
     uv = features.corners(first, np.ones(first.shape, bool), np.empty((0, 2)), _TRIED, _RIM)
-    begin = stereo.look_up(stereo.dense(first, second, first.shape[1] // 5, rig.baseline < 0.0), uv)
+    size = stereo.smaller(first.shape[1])
+    begin = stereo.look_up(stereo.dense(first, second, first.shape[1] // 5, rig.baseline < 0.0), uv, size)
     found = stereo.measure(soft, other_soft, uv, begin, _SIDE, np.zeros(len(uv)))
     return float(found.found.mean()) if len(uv) else 0.0
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # Standard deviation of a depth camera, as a share of the depth.
 _DEPTH_SHARE = 0.02
-_LARGEST_SHARE = 0.2
+_LARGEST_SHARE = 0.1
 # Points at an image that rows are learned from, and which of them count.
-_FOR_ROWS, _SAME, _SURE_PX, _MOST_OFF_PX = 200, 0.9, 0.15, 2.5
+_FOR_ROWS, _SAME, _SURE_PX, _MOST_OFF_PX = 120, 0.9, 0.15, 2.5
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,13 @@ def _stereo(
     assert frame.right is not None and frame.right_soft is not None
     fb = rig.focal * rig.baseline
     dense = stereo.dense(frame.grey, frame.right, int(_LARGEST_SHARE * frame.grey.shape[1]), rig.baseline < 0.0)
-    start, slant = stereo.look_up(dense, uv)
+    start, slant = stereo.look_up(dense, uv, stereo.smaller(frame.grey.shape[1]))
     added = alignment.disparity(uv)
     start = np.where(np.isfinite(first), first * fb - added, start)
     off = alignment.rows_off(uv)
     found = stereo.measure(frame.soft, frame.right_soft, uv, (start, slant), side, off)
-    _learn_rows(frame, uv, found, side, alignment)
+    if alignment.wants_rows:
+        _learn_rows(frame, uv, found, side, alignment)
     value = found.value + added
     return Depths(True, value / fb, found.sigma / abs(fb), found.slant / fb, value, found.sigma)
 

@@ -15,7 +15,7 @@ _BLOCK = 5
 # Least such eigenvalue, in units of OpenCV's (grey values in 0 to 1): a weak corner on a road, above noise.
 _WEAKEST = 4e-6
 # Windows of Lucas-Kanade, and levels of its pyramid where a first place is known, and where none is.
-_WINDOW, _LEVELS, _LEVELS_BLIND = 21, 2, 4
+_WINDOW, _LEVELS, _LEVELS_BLIND = 17, 2, 4
 # There and back again a feature must end where it began.
 _BACK_PX = 0.7
 
@@ -62,10 +62,13 @@ def _apart(found: FloatArray, taken: FloatArray, distance: float) -> FloatArray:
     if not len(found):
         return found
     limit = distance * distance
-    near_taken = (((found[:, None] - taken[None]) ** 2).sum(axis=2) < limit).any(axis=1)
-    found = found[~near_taken]
-    near = ((found[:, None] - found[None]) ** 2).sum(axis=2) < limit
-    return np.asarray(found[~np.tril(near, -1).any(axis=1)])
+    found = found[_squares(found, taken).min(axis=1, initial=np.inf) > limit]
+    return np.asarray(found[~np.tril(_squares(found, found) < limit, -1).any(axis=1)])
+
+
+def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return squared distances: (n, m)."""
+    return np.asarray((a[:, None, 0] - b[None, :, 0]) ** 2 + (a[:, None, 1] - b[None, :, 1]) ** 2)
 
 
 def follow(before: Grey, now: Grey, uv: FloatArray, expected: FloatArray | None) -> tuple[FloatArray, BoolArray]:
@@ -81,7 +84,7 @@ def follow(before: Grey, now: Grey, uv: FloatArray, expected: FloatArray | None)
     if expected is not None:
         first = np.where(np.isfinite(expected), expected, uv).astype(np.float32).reshape(-1, 1, 2)
         flags, levels = cv2().OPTFLOW_USE_INITIAL_FLOW, _LEVELS
-    criteria = (3, 12, 0.02)
+    criteria = (3, 10, 0.03)
     size = (_WINDOW, _WINDOW)
     there, ok, _ = cv2().calcOpticalFlowPyrLK(
         before, now, one, first, winSize=size, maxLevel=levels, criteria=criteria, flags=flags

@@ -24,7 +24,7 @@ from ba_node.front_end.rectify import IdealRig
 
 # Inverse depths below this are as good as zero, 1/m.
 _FAR = 1e-4
-_MOST = 12_000
+_MOST = 6_000
 
 
 @dataclass

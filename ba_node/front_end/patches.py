@@ -34,6 +34,7 @@ Floats = NDArray[np.float32]
 _STEP_PX = 0.005
 _LEAST_STD = 0.5
 _STRIDE = 2
+_MANY = 0.6
 
 
 @cache
@@ -97,7 +98,7 @@ class Templates:
         side = patches.shape[1] - 2
         w = window(side)
         k = _STRIDE
-        values = patches[:, 1:-1:k, 1:-1:k].reshape(len(patches), -1)
+        values = patches[:, 1:-1:k, 1:-1:k].reshape(len(patches), len(w))
         dx = (0.5 * (patches[:, 1:-1:k, 2::k] - patches[:, 1:-1:k, :-2:k])).reshape(values.shape)
         values = values - (values @ w)[:, None]
         weighted = values * w
@@ -138,7 +139,7 @@ def align(
     uv: FloatArray,
     affine: FloatArray,
     bend: FloatArray | None = None,
-    iterations: int = 10,
+    iterations: int = 8,
 ) -> Aligned:
     """Find templates in an image, from a first place each.
 
@@ -154,27 +155,29 @@ def align(
     p, w = grid(templates.side), window(templates.side)
     place, a = uv.astype(np.float64).copy(), affine.astype(np.float64).copy()
     inverse = np.linalg.pinv(templates.hessian, hermitian=True)
-    step = np.full(n, np.inf)
-    correlation, left = np.zeros(n), np.full(n, np.inf)
-    active = np.arange(n)
+    step, correlation, left = np.full(n, np.inf), np.zeros(n), np.full(n, np.inf)
     depth = None if bend is None else 1.0 / (1.0 + bend.astype(np.float32) @ p.T)
-    for _ in range(iterations):
-        s = _at(image, place[active], a[active], p, None if depth is None else depth[active])
+    rows = np.arange(n)
+    jacobian, weighted, std, back = templates.jacobian, templates.weighted, templates.std, inverse
+    for _ in range(iterations if n else 0):
+        s = _at(image, place[rows], a[rows], p, depth)
         s -= (s @ w)[:, None]
-        variance = np.maximum(np.einsum("np,np->n", s * w, s), 1e-6)
-        std = templates.std[active]
-        correlation[active] = (
-            np.einsum("np,np->n", s, templates.weighted[active]) / np.sqrt(variance) / np.maximum(std, 1e-6)
-        )
-        gain = std / np.sqrt(variance)
-        right = np.matmul(templates.jacobian[active], s[:, :, None])[:, :, 0].astype(np.float64) * gain[:, None]
-        e = np.einsum("nij,nj->ni", inverse[active], right)
-        left[active] = 2.0 * std**2 * np.maximum(1.0 - correlation[active], 0.0)
-        _move(place, a, active, e)
-        step[active] = np.linalg.norm(e[:, :2] if k == 2 else e[:, :1], axis=1)
-        active = active[(step[active] > _STEP_PX) & np.isfinite(step[active])]
-        if not len(active):
+        spread = np.sqrt(np.maximum((s * s) @ w, 1e-6))
+        agree = np.matmul(weighted[:, None], s[:, :, None])[:, 0, 0] / spread / np.maximum(std, 1e-6)
+        right = np.matmul(jacobian, s[:, :, None])[:, :, 0].astype(np.float64) * (std / spread)[:, None]
+        e = np.matmul(back, right[:, :, None])[:, :, 0]
+        correlation[rows] = agree
+        left[rows] = 2.0 * std**2 * np.maximum(1.0 - agree, 0.0)
+        _move(place, a, rows, e)
+        length = np.linalg.norm(e[:, :2] if k == 2 else e[:, :1], axis=1)
+        step[rows] = length
+        going = (length > _STEP_PX) & np.isfinite(length)
+        if not going.any():
             break
+        # Those that have arrived are left out once they are many: to copy the others takes time too.
+        if going.mean() < _MANY:
+            rows, jacobian, weighted, std, back = (one[going] for one in (rows, jacobian, weighted, std, back))
+            depth = None if depth is None else depth[going]
     # As many independent values as pixels under the window.
     independent = 1.0 / float((w * w).sum())
     covariance = inverse * (left / independent)[:, None, None]

@@ -77,20 +77,26 @@ def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Trans
     for _ in range(_STEPS):
         error, jacobian = _linear(rig, seen, pose)
         weighted, _ = _weights(error)
-        H = np.einsum("nik,nil,n->kl", jacobian, jacobian, weighted)
-        H += (1e-9 * np.trace(H) + 1e-300) * np.eye(6)
-        step = np.linalg.solve(H, np.einsum("nik,ni,n->k", jacobian, error, weighted))
+        H, b = _normal(error, jacobian, weighted)
+        step = np.linalg.solve(H + (1e-9 * np.trace(H) + 1e-300) * np.eye(6), b)
         if not np.isfinite(step).all():
             return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
         pose = Transform(geometry.so3_exp(step[:3]), step[3:]).after(pose)
-        if np.linalg.norm(step) < 1e-8:
+        if np.linalg.norm(step) < 1e-6:
             break
     error, jacobian = _linear(rig, seen, pose)
     weighted, size = _weights(error)
-    H = np.einsum("nik,nil,n->kl", jacobian, jacobian, weighted)
+    H, _ = _normal(error, jacobian, weighted)
     if not (np.isfinite(H).all() and np.isfinite(size).all()):
         return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
     return pose, np.linalg.inv(H + (1e-12 * np.trace(H) + 1e-300) * np.eye(6)), size
+
+
+def _normal(error: FloatArray, jacobian: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return J' w J and J' w e."""
+    J = jacobian.reshape(-1, 6)
+    weighted = J.T * np.repeat(weight, 2)
+    return weighted @ J, weighted @ error.reshape(-1)
 
 
 def _weights(error: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -106,7 +112,7 @@ def _linear(rig: IdealRig, seen: Seen, pose: Transform) -> tuple[FloatArray, Flo
     by_point = np.zeros((len(x), 2, 3))
     by_point[:, 0, 0] = by_point[:, 1, 1] = f / z
     by_point[:, :, 2] = -f * x[:, :2] / (z * z)[:, None]
-    smear = np.einsum("nij,nj->ni", by_point, seen.along @ pose.rotation.T)
+    smear = np.matmul(by_point, (seen.along @ pose.rotation.T)[:, :, None])[:, :, 0]
     # C = s^2 I + m m':  C^-1/2 = (I - m m' k) / s with k as below.
     m2 = (smear * smear).sum(axis=1)
     s = seen.sigma
@@ -114,7 +120,7 @@ def _linear(rig: IdealRig, seen: Seen, pose: Transform) -> tuple[FloatArray, Flo
     whiten = (np.eye(2) - k[:, None, None] * smear[:, :, None] * smear[:, None]) / s[:, None, None]
     error = seen.uv - (f * x[:, :2] / z[:, None] + rig.centre)
     jacobian = np.concatenate([-by_point @ geometry.hat(x), by_point], axis=2)
-    return np.einsum("nij,nj->ni", whiten, error), whiten @ jacobian
+    return np.matmul(whiten, error[:, :, None])[:, :, 0], whiten @ jacobian
 
 
 def errors(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> FloatArray:

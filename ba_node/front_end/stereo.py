@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure disparities along rows, to hundredths of a pixel and without bias.
 
-A first disparity comes from semi-global matching (Hirschmueller, 2008) at half the resolution, or from what the map
+A first disparity comes from semi-global matching (Hirschmueller, 2008) in smaller images, or from what the map
 knows. Then a patch of the first image is aligned along the row of the second, as it appears on a slanted surface:
 
     x' = x - (d + a p_x + b p_y),   y' = y
@@ -35,9 +35,10 @@ _SLANT = 0.35
 _NOISE = 2.0
 # Least standard deviation of a disparity: what calibrations of real cameras leave here and there in the image, px.
 _FLOOR_PX = 0.2
-# Rows and columns apart that a first slant is taken from, px of the half-size image.
-_APART = 5
-_SIDE = 0.5
+# Rows and columns on either side that a first slant is taken from, px of the smaller image.
+_APART = 4
+# Images are made smaller before first disparities are looked for: to a half, wide ones to a quarter.
+_WIDE = 1000
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,15 @@ class Disparities:
 
 
 def dense(left: Grey, right: Grey, largest_px: int, negative: bool) -> Floats:
-    """Return a first disparity for every second pixel of every second row, px of the whole image; NaN for none."""
+    """Return first disparities in a smaller image, px of the whole one; NaN for none."""
     if negative:
         return -dense(left[:, ::-1], right[:, ::-1], largest_px, False)[:, ::-1]
+    size = smaller(left.shape[1])
     small = [
-        cv2().resize(np.ascontiguousarray(i), None, fx=_SIDE, fy=_SIDE, interpolation=cv2().INTER_AREA)
+        cv2().resize(np.ascontiguousarray(i), None, fx=size, fy=size, interpolation=cv2().INTER_AREA)
         for i in (left, right)
     ]
-    steps = 16 * max(1, -(-largest_px // 32))
+    steps = 16 * max(1, -(-int(largest_px * size) // 16))
     matcher = cv2().StereoSGBM_create(
         0,
         steps,
@@ -75,16 +77,21 @@ def dense(left: Grey, right: Grey, largest_px: int, negative: bool) -> Floats:
         mode=cv2().STEREO_SGBM_MODE_SGBM_3WAY,
     )
     found = matcher.compute(*small)
-    result: Floats = np.where(found >= 0, found.astype(np.float32) / np.float32(16.0 * _SIDE), np.float32(np.nan))
+    result: Floats = np.where(found >= 0, found.astype(np.float32) / np.float32(16.0 * size), np.float32(np.nan))
     return result
 
 
-def look_up(disparity: Floats, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return first disparities (n,) and slants (n, 2) at uv (n, 2) from a dense image."""
+def smaller(width: int) -> float:
+    """Return the size, as a share, at which first disparities are looked for in images of a width, px."""
+    return 0.25 if width >= _WIDE else 0.5
+
+
+def look_up(disparity: Floats, uv: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return first disparities (n,) and slants (n, 2) at uv (n, 2) from a dense image of a size."""
     height, width = disparity.shape
-    x = np.clip(np.round(uv[:, 0] * _SIDE - 0.25).astype(int), _APART, width - 1 - _APART)
-    y = np.clip(np.round(uv[:, 1] * _SIDE - 0.25).astype(int), _APART, height - 1 - _APART)
-    span = 2.0 * _APART / _SIDE
+    x = np.clip(np.round((uv[:, 0] + 0.5) * size - 0.5).astype(int), _APART, width - 1 - _APART)
+    y = np.clip(np.round((uv[:, 1] + 0.5) * size - 0.5).astype(int), _APART, height - 1 - _APART)
+    span = 2.0 * _APART / size
     with np.errstate(invalid="ignore"):
         slant = (
             np.stack(
@@ -135,9 +142,10 @@ def measure(
     good = (np.abs(forth[0] - start) < _REACH_PX) & (forth[3] > _LEAST_CORRELATION)
     width = left.shape[1]
     good &= (at[:, 0] > side // 3) & (at[:, 0] < width - side // 3)
+    rows, at, down, forth = rows[good], at[good], down[good], tuple(one[good] for one in forth)
     back = _along(right, left, at, np.column_stack([forth[0], -down]), -forth[2], side, prior)
     off = forth[0] + back[0]
-    good &= (np.abs(off) < _BACK_PX) & (back[3] > _LEAST_CORRELATION)
+    good = (np.abs(off) < _BACK_PX) & (back[3] > _LEAST_CORRELATION)
     rows = rows[good]
     # Both ways err alike in size, and by interpolation in opposite ways: their mean is better than either.
     result.value[rows] = 0.5 * (forth[0] - back[0])[good]
@@ -148,7 +156,7 @@ def measure(
 
 def _along(
     left: Floats, right: Floats, uv: FloatArray, shift: FloatArray, slant: FloatArray, side: int, prior: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, ...]:
     """Return disparity, its sigma, slant and correlation of patches of one image in the rows of another."""
     templates = patches.Templates.of(patches.cut(left, uv, side), "row", prior)
     affine = np.tile(np.eye(2), (len(uv), 1, 1))

@@ -68,14 +68,14 @@ def test_disparities_have_no_bias(
 
 def test_first_disparities_are_near() -> None:
     left, right, uv, truth = pair(17.3, (0.0, 0.2), 30.0)
-    value, slant = stereo.look_up(stereo.dense(left, right, 64, False), uv)
+    value, slant = stereo.look_up(stereo.dense(left, right, 64, False), uv, 0.5)
     assert np.nanmedian(np.abs(value - truth)) < 0.5
     assert np.median(slant[:, 1]) == pytest.approx(0.2, abs=0.06)
 
 
 def test_second_camera_on_the_left() -> None:
     left, right, uv, truth = pair(9.4, (0.0, 0.0), 30.0)
-    value, _ = stereo.look_up(stereo.dense(right, left, 64, True), uv)
+    value, _ = stereo.look_up(stereo.dense(right, left, 64, True), uv, 0.5)
     assert np.nanmedian(value + truth) == pytest.approx(0.0, abs=0.6)
 
 
