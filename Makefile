@@ -13,7 +13,7 @@ CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 STYLED := $(CHECKED) examples docs/conf.py
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
 
-.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness regress docs lint format clean
+.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness regress consistency docs lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
@@ -53,6 +53,9 @@ thesis: setup ## repeat experiments of the thesis (ARGS="3.8 5.1", ARGS="--all",
 
 robustness: setup ## replay recordings gone wrong, and see that no harm is done (ARGS="--only camera_turned")
 	@$(RUN) -m ba_node.cli.main robustness $(ARGS)
+
+consistency: setup ## compare errors with covariances in 200 runs of each of 27 cases (about 20 minutes; ARGS="--only stereo")
+	@OPENBLAS_NUM_THREADS=1 $(RUN) -m experiments.consistency $(ARGS)
 
 regress: setup ## replay the shipped recordings and see that no figure is worse than in bags/regress.yaml
 	@$(RUN) -m ba_node.cli.main regress bags/regress.yaml $(ARGS)

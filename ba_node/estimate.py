@@ -173,7 +173,11 @@ class Extras:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is published after a solve."""
+    """What is published after a solve.
+
+    That of a map shares with the one before what has not changed; path and cloud are put together when somebody looks
+    at them (``backend/whole_map.py``), and stay as they were, whatever becomes of the map.
+    """
 
     stamp_ns: int  # stamp of the newest keyframe, ns
     frame_id: str  # name of the map's frame

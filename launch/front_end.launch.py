@@ -3,7 +3,7 @@
 """Track images and refine what comes of them: `ros2 launch ba_node front_end.launch.py mode:=stereo namespace:=robot`.
 
 Images come from left/image_raw and right/image_raw, rgb/image_raw and depth/image_raw, or image_raw, with camera_info
-beside them; `left:=/camera/infra1/image_raw left_info:=/camera/infra1/camera_info` and so on name others.
+beside them; `left:=/camera/infra1/image_raw` and so on name others, with the camera_info beside those.
 """
 
 from launch import LaunchDescription

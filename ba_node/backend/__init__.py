@@ -7,6 +7,7 @@ from ba_node.backend.backend import FINISHED_KEPT, Admitted, Backend, Check
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
+from ba_node.core.calibration import Calibration
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.window.full import Optimization
 from ba_node.window.quality import Residuals
@@ -15,6 +16,7 @@ __all__ = [
     "FINISHED_KEPT",
     "Admitted",
     "Backend",
+    "Calibration",
     "Check",
     "CurrentMap",
     "Diagnosis",

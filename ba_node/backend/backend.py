@@ -195,7 +195,7 @@ class Backend:
         """
         if len(self.scene.keyframes) == 0:
             return None
-        wrong = self.setup.look(self.scene) if self.config.guard.check_setup else ""
+        wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
         estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
         return estimate if wrong else self.adjust() or estimate
@@ -263,7 +263,7 @@ class Backend:
 
     def take_check(self, check: Check) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
-        if check.scene is not self.scene or not self.setup.take(check):
+        if not self.config.checks_setup or check.scene is not self.scene or not self.setup.take(check):
             return None
         self.map.hold_all(self.solve_count, self.setup.reason(self.scene))
         return self.estimate()
@@ -306,11 +306,14 @@ class Backend:
             return None
         found = taken.outcome(result.state, self.config)
         verdict = guard.decide(self.config, taken.selection, found)
-        self.refusal = self.setup.reason(self.scene) or ("" if verdict.odd else verdict.reason)
+        wrong = self.setup.reason(self.scene) if self.config.checks_setup else ""
+        self.refusal = wrong or ("" if verdict.odd else verdict.reason)
         if self.refusal:
             self.map.hold(f"a solve of everything: {self.refusal}")
             return None
         assert found.state is not None
+        if taken.calibration is not None:
+            self.map.calibrate(taken.calibration)
         followed = full.merge_snapshot(self.scene, self.config, taken, found.state)
         if followed is None:
             return None

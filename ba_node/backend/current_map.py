@@ -21,11 +21,12 @@ from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
+from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
 from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import full, quality, view
+from ba_node.window import full, old_keyframes, quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -90,6 +91,7 @@ class CurrentMap:
         completion: which keyframes are complete.
         report: of the last solve.
         correction: map from odom.
+        calibration: what solves of everything found of the cameras, against those that came; None if not asked for.
         adjustments: how often a solve of everything went into it.
     """
 
@@ -98,6 +100,7 @@ class CurrentMap:
         self.completion = Completion()
         self.report = SolveReport(reason="not solved yet")
         self.correction = MapCorrection()
+        self.calibration: Calibration | None = None
         self.adjustments = 0
         self._trust = Trust()
 
@@ -236,6 +239,8 @@ class CurrentMap:
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             self.scene.keyframes.refined[list(tried.without)] = False
             self.scene.moved(np.array(tried.without, np.intp))
+            rows = selection.keyframes, selection.landmarks, selection.origin
+            old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}
@@ -311,6 +316,12 @@ class CurrentMap:
             world=self.world(),
             map_index=self.index,
         )
+
+    def calibrate(self, found: Calibration) -> None:
+        """Take refined cameras for all that follows."""
+        self.scene.refine_cameras(found.cameras)
+        assert self.scene.given_cameras is not None
+        self.calibration = found.since(self.scene.given_cameras)
 
     def with_covariances(self, estimate: Estimate, taken: full.Optimization) -> Estimate:
         """Return an estimate of everything with the covariances of a solve of everything that was merged."""

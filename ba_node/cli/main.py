@@ -33,6 +33,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "tune",
         "sweep",
         "solve",
+        "calibrate",
         "map",
     ),
     "look": (

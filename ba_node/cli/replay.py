@@ -41,6 +41,7 @@ from ba_node.cli.console import (
     topic_choice,
     write_result,
 )
+from ba_node.config import ConfigError
 from ba_node.offline.attention import HARMLESS
 
 if TYPE_CHECKING:
@@ -79,6 +80,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-report", action="store_true", help="leave out the page and the picture of the results")
     parser.add_argument(
+        "--covariance", action="store_true", help="with --final-optimize: write how precise all is to covariance.npz"
+    )
+    parser.add_argument(
         "--save-map", type=Path, metavar="FILE", help="write the map at the end, NAME.npz; see docs/map_format.md"
     )
 
@@ -90,13 +94,18 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
 
     require_folder(args.save_map)
+    if args.covariance and not args.final_optimize:
+        raise ConfigError("--covariance is worked out by a solve of everything: add --final-optimize")
     config = parameters(args)
+    if config.calibration.wanted and not args.final_optimize:
+        raise ConfigError("calibration.* = refined is for a solve of everything: add --final-optimize")
     found = recordings(args.bag, each=args.each)
     if len(found) > 1 or args.scheduler or any(map(is_url, (args.bag[0], args.out))):
         return _replay_all(args, config, found)
     args.bag, args.out = list(map(Path, found[0])), Path(args.out)
     with progress_bar("replay", "messages") as progress:
-        options = MapOptions(args.load_map, args.final_optimize, args.save_map, topic_choice(args))
+        wanted = args.final_optimize, args.final_optimize and args.covariance
+        options = MapOptions(args.load_map, *wanted, args.save_map, topic_choice(args))
         report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
     print(facts(_rows(report)))
     _tell(report)
@@ -178,6 +187,7 @@ def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     error = report.get("trajectory_error_m")
     if error:
         rows.insert(-4, ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)"))
+    rows += [(f"camera {i}", text) for i, text in enumerate(report.get("cameras_refined", []))]
     if report["older_sessions"]:
         rows.append(
             (

@@ -27,6 +27,7 @@ from ba_node.config.declaration import (
     unknown,
 )
 from ba_node.config.estimation import (
+    CalibrationConfig,
     FactorsConfig,
     GuardConfig,
     OdometryConfig,
@@ -40,6 +41,7 @@ from ba_node.config.solver import METHOD_LOSSES, PLATEAUS, SolverConfig, SolverO
 __all__ = [
     "METHOD_LOSSES",
     "PLATEAUS",
+    "CalibrationConfig",
     "Checked",
     "Choice",
     "Config",
@@ -87,10 +89,16 @@ class Config:
     factors: FactorsConfig = field(default_factory=FactorsConfig)
     solver: SolverConfig = field(default_factory=lambda: _defaults(SolverConfig))
     guard: GuardConfig = field(default_factory=GuardConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     node: NodeConfig = field(default_factory=NodeConfig)
     diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
+
+    @property
+    def checks_setup(self) -> bool:
+        """Return True if a set-up that contradicts the tracks holds solves: not if it is what is to be refined."""
+        return self.guard.check_setup and not self.calibration.wanted
 
     def values(self) -> dict[str, Value]:
         """Return every parameter by its full name, in declaration order."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ba_node.config.declaration import Tune, option
+from ba_node.config.declaration import Choice, Tune, option
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,15 @@ class WindowConfig:
         "Older keyframes that see the window's points and take part with fixed poses; most shared tracks first.",
         within=(0, 100_000),
         tune=Tune(0, 40, ("accuracy", "latency"), log=False),
+    )
+    old_keyframes: str = option(
+        "fix",
+        "What becomes of keyframes that leave the window. See docs/concepts.md.",
+        choices=(
+            Choice("fix", "those that see the window's points take part with fixed poses"),
+            Choice("marginalise", "what they tell of those that stay becomes a prior"),
+            Choice("drop", "they take no part"),
+        ),
     )
     max_landmarks: int = option(
         5000,
@@ -167,6 +176,41 @@ class FactorsConfig:
         unit="m",
         within=(0.0, 1e6),
     )
+
+
+_KEPT_OR_NOT = (
+    Choice("fixed", "as given"),
+    Choice("refined", "refined over the whole map by a solve of everything, as far as the data tell"),
+)
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """What of the cameras a solve of everything refines. See docs/calibration.md."""
+
+    intrinsics: str = option("fixed", "fx, fy, cx, cy and two coefficients of distortion.", choices=_KEPT_OR_NOT)
+    extrinsics: str = option("fixed", "Where the cameras sit on the body.", choices=_KEPT_OR_NOT)
+    time_offset: str = option("fixed", "How much later than stamped the images were taken.", choices=_KEPT_OR_NOT)
+    intrinsics_sigma: float = option(
+        0.03, "Standard deviation of the given fx, fy, cx and cy, as a share of fx.", within=(1e-6, 1.0)
+    )
+    distortion_sigma: float = option(
+        0.05, "Standard deviation of the given coefficients of distortion.", within=(1e-6, 10.0)
+    )
+    rotation_sigma_rad: float = option(
+        0.03, "Standard deviation of the given rotation of a camera on the body.", unit="rad", within=(1e-6, 1.0)
+    )
+    position_sigma_m: float = option(
+        0.03, "Standard deviation of the given position of a camera on the body.", unit="m", within=(1e-6, 10.0)
+    )
+    time_sigma_s: float = option(
+        0.05, "Standard deviation of an offset of the stamps of the images.", unit="s", within=(1e-6, 10.0)
+    )
+
+    @property
+    def wanted(self) -> bool:
+        """Return True if anything is to be refined."""
+        return "refined" in (self.intrinsics, self.extrinsics, self.time_offset)
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,20 @@ Residuals at the solution are smaller than the errors that they come from, by th
 of few views take a third of it and more. With the residual's slope that makes, for each group of rows (pixels, depths,
 each kind of factor):
 
-- for the square, and for factors, which are few: one variance of unit weight, ``sum psi^2 / sum (1 - h d)``, r' r /
-  (m - n) in the case of pixels alone; the sigma that a factor states counts as ten rows more;
-- for pixels and depths with a robust loss: the jackknife's, row by row, less the variance of the prediction that it
+- for the square, and for depths: one variance of unit weight, ``sum psi^2 / sum (1 - h d)``, r' r / (m - n) in the case
+  of pixels alone;
+- for pixels with a robust loss: the jackknife's, row by row, less the variance of the prediction that it
   takes in (Efron and Stein, *The Jackknife Estimate of Variance*, 1981)::
 
     v = psi^2 / (1 - h d)^2 - kappa d^2 h,    kappa = sum psi^2/(1 - h d)^2 / sum d/(1 - h d)
+
+- for a marginal prior, which is made of pixels: that of the pixels;
+- for factors, which are few and may have another weight than they deserve: a component of variance for each kind
+  (Helmert's, as in Foerstner, 1979), v_i = v d_i, so that the scores have the size that is expected of them::
+
+    sum psi^2 = sum v d (1 - 2 h d) + sum d^2 J Sigma J'
+
+  with Sigma of all components together; the sigma that a factor states counts as two rows more.
 
 The keyframes' part needs S = B - E C^-1 E' of A alone (3.64-3.67): with C the points' blocks, and ``u = J_c - J_p C^-1
 E'`` of a row, the error of the keyframes is ``delta_c = -S^-1 sum u' psi``, and that of a point ``-C^-1 (sum J_p' psi +
@@ -53,7 +61,7 @@ from ba_node.config import SolverOptions
 from ba_node.core import geometry
 from ba_node.core.kernels import DENSE_LIMIT, Kernels
 from ba_node.core.problem import Problem, State
-from ba_node.core.rows import DEPTHS, Rows, rows_of
+from ba_node.core.rows import DEPTHS, GIVEN, MARGINAL, PIXELS, Rows, rows_of
 
 # Eigenvalues of S, scaled to a unit diagonal, that are rounding.
 _ROUNDING = 1e-11
@@ -64,7 +72,9 @@ _NEWEST = 5
 # Rows with more leverage are taken to have this: they tell next to nothing about the noise.
 _MOST_LEVERAGE = 0.9
 # What the sigma that a factor states counts, in rows.
-_STATED = 10.0
+_STATED = 2.0
+# Its variance is at least this share of what it states.
+_LEAST = 0.1
 # Rows at a time whose leverage is worked out, and points whose covariance is.
 _CHUNK = 2000
 
@@ -113,21 +123,55 @@ def uncertainty_of_rows(rows: Rows, squared: bool, conditions: FloatArray) -> Un
     slope = np.maximum(rows.slope, 0.0)
     leverage = reduced.leverages(roots) * slope
     variance = np.zeros(len(rows))
-    for group in np.unique(rows.group):
+    for group in np.unique(rows.group[(rows.group <= DEPTHS) & (rows.group > MARGINAL)]):
         of = rows.group == group
         score = rows.weight[of] * rows.residual[of]
-        make = _pooled if squared or group > DEPTHS else _jackknifed
-        variance[of] = make(score, slope[of], leverage[of], _STATED if group > DEPTHS else 0.0)
+        make = _pooled if squared or group > PIXELS else _jackknifed
+        variance[of] = slope[of] if group == GIVEN else make(score, slope[of], leverage[of])
+    pixels = rows.group == PIXELS
+    unit = float(variance[pixels].sum()) / max(float(slope[pixels].sum()), 1e-300)
+    variance = np.where(rows.group == MARGINAL, unit * slope, variance)
+    _add_factors(reduced, roots, leverage, variance)
     return Uncertainty(reduced, variance, roots, loose)
 
 
-def _pooled(score: FloatArray, slope: FloatArray, leverage: FloatArray, stated: float) -> FloatArray:
-    mean = slope.mean()
-    unit = (np.sum(score * score) + stated * mean) / (np.sum(1.0 - leverage) + stated)
-    return np.asarray(unit * slope / mean if mean > 0.0 else 0.0 * slope)
+def _pooled(score: FloatArray, slope: FloatArray, leverage: FloatArray) -> FloatArray:
+    unit = np.sum(score * score) / np.sum(1.0 - leverage)
+    return np.asarray(unit * slope / max(float(slope.mean()), 1e-300))
 
 
-def _jackknifed(score: FloatArray, slope: FloatArray, leverage: FloatArray, _stated: float) -> FloatArray:
+def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, variance: FloatArray) -> None:
+    """Write the variances of the scores of factors over: the components v of ``v d`` by kinds, see above."""
+    rows = reduced.rows
+    groups = np.unique(rows.group[rows.group > DEPTHS])
+    if not len(groups):
+        return
+    seen = reduced.influence.T @ sparse.diags(variance) @ reduced.influence
+    of_seen = roots.T @ (seen @ roots)
+    members = [np.flatnonzero(rows.group == group) for group in groups]
+    slopes = [np.maximum(rows.slope[of], 0.0) for of in members]
+    moved = [np.asarray(rows.keyframes[of] @ roots) for of in members]
+    n = len(groups)
+    matrix, total = np.zeros((n, n)), np.zeros(n)
+    for g, (of, d, j) in enumerate(zip(members, slopes, moved, strict=True)):
+        mean = float(d.mean())
+        matrix[g, g] = np.sum(d * (1.0 - 2.0 * leverage[of])) + _STATED * mean
+        for other in range(n):
+            matrix[g, other] += np.sum(
+                (j * d[:, None] @ (moved[other].T * slopes[other]) @ moved[other]) * j * d[:, None]
+            )
+        score = rows.weight[of] * rows.residual[of]
+        total[g] = np.sum(score * score) + _STATED * mean * mean - _sum_of_forms(j * d[:, None], of_seen)
+    found = np.linalg.lstsq(matrix, total, rcond=None)[0]
+    for of, d, v in zip(members, slopes, found, strict=True):
+        variance[of] = max(float(v), _LEAST * float(d.mean())) * d
+
+
+def _sum_of_forms(x: FloatArray, matrix: FloatArray) -> float:
+    return float(np.sum((x @ matrix) * x))
+
+
+def _jackknifed(score: FloatArray, slope: FloatArray, leverage: FloatArray) -> FloatArray:
     left = 1.0 - np.minimum(leverage, _MOST_LEVERAGE)
     square = (score / left) ** 2
     kappa = np.sum(square) / max(float(np.sum(slope / left)), 1e-300)

@@ -24,10 +24,13 @@ from scipy import sparse
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import loss
+from ba_node.core.marginal import MarginalPrior
 from ba_node.core.objective import Objective
-from ba_node.core.problem import KeyframeFactors, Problem, State
+from ba_node.core.problem import KeyframeFactors, PointPriors, Problem, State
 
-PIXELS, DEPTHS = 0, 1  # groups of rows; each kind of factor is one more
+# Groups of rows; each kind of factor is one more. GIVEN are rows whose standard deviation is taken as it is stated,
+# MARGINAL those of a prior that is made of pixels, in their units.
+MARGINAL, GIVEN, PIXELS, DEPTHS = -2, -1, 0, 1
 # The slope of a loss is taken over this share of its scale.
 _STEP = 1e-6
 
@@ -41,7 +44,7 @@ class Rows:
     points: sparse.csr_matrix  # (m, 3 n_pt) by the points, m^-1
     weight: FloatArray  # (m,) w
     slope: FloatArray  # (m,) d
-    group: IntArray  # (m,) PIXELS, DEPTHS, or 2 and up: factors of each kind
+    group: IntArray  # (m,) as above; 2 and up are factors of each kind
     source: IntArray  # (m,) observation, or factor of its kind
 
     def __len__(self) -> int:
@@ -61,7 +64,10 @@ def rows_of(problem: Problem, state: State, options: SolverOptions) -> Rows:
     pixels = _weighed(options.loss, options.loss_scale_px, at.residual[:, :2])
     parts = [np.repeat(pixels[:, :, None], 2, axis=2)]
     if n == 3:
-        parts.append(_weighed(options.loss, options.loss_scale_px, at.residual[:, 2:])[:, :, None])
+        depths = _weighed(options.loss, options.loss_scale_px, at.residual[:, 2:])
+        # A single row has no other directions that keep its slope from falling below zero.
+        depths[1] = depths[0] * (depths[1].sum() / max(float(depths[0].sum()), 1e-300))
+        parts.append(depths[:, :, None])
     weights = np.concatenate(parts, axis=2)
     index = np.arange(len(obs))
     found = Rows(
@@ -74,9 +80,31 @@ def rows_of(problem: Problem, state: State, options: SolverOptions) -> Rows:
         np.repeat(index, n),
     )
     kinds = [_factor_rows(kind, 2 + i, state, column, problem.n_points) for i, kind in enumerate(problem.factors)]
-    found = _joined([found, *kinds]) if kinds else found
+    slope = float(pixels[1].sum()) / max(float(pixels[0].sum()), 1e-300)
+    for i, kind in enumerate(problem.factors):
+        if isinstance(kind, MarginalPrior):
+            own = kinds[i]
+            kinds[i] = dataclasses.replace(own, slope=slope * own.weight, group=np.full(len(own), MARGINAL))
+    kinds += [] if problem.point_priors is None else [_prior_rows(problem, problem.point_priors, state, found)]
+    found = joined([found, *kinds]) if kinds else found
     counts = np.any(at.d_point != 0.0, axis=2).ravel()
     return found.take(np.concatenate([counts, np.ones(len(found) - len(counts), bool)]))
+
+
+def _prior_rows(problem: Problem, priors: PointPriors, state: State, beside: Rows) -> Rows:
+    """Return the rows of priors of points, whose covariances are taken as stated."""
+    n = len(priors.point)
+    root = np.linalg.inv(np.linalg.cholesky(priors.covariance))
+    residual = (root @ (state.points[priors.point] - priors.position)[:, :, None])[..., 0]
+    return Rows(
+        residual.ravel(),
+        sparse.csr_matrix((3 * n, beside.keyframes.shape[1])),
+        _blocks(root, priors.point, problem.n_points),
+        np.ones(3 * n),
+        np.ones(3 * n),
+        np.full(3 * n, GIVEN),
+        np.repeat(np.arange(n), 3),
+    )
 
 
 def _factor_rows(kind: KeyframeFactors, group: int, state: State, column: IntArray, n_points: int) -> Rows:
@@ -101,7 +129,7 @@ def _factor_rows(kind: KeyframeFactors, group: int, state: State, column: IntArr
     return rows.take(counts.ravel())
 
 
-def _joined(parts: list[Rows]) -> Rows:
+def joined(parts: list[Rows]) -> Rows:
     """Return the rows of several, one after another."""
     columns = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(Rows)}
     stacked = {

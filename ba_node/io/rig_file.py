@@ -78,14 +78,17 @@ def read_rig(*paths: Path | str, rectified: bool = False) -> CameraRig:
     )
 
 
-def rig_yaml(rig: CameraRig, form: str = "own") -> list[str]:
+def rig_yaml(rig: CameraRig, form: str = "own", beside: Sequence[Mapping[str, Any]] = ()) -> list[str]:
     """Return the text of each file that holds a rig in one of :data:`FORMS`: one, or one a camera for camera_info.
+
+    ``beside`` holds more entries of each camera, for our own form alone; they are not read again.
 
     Raises:
         RigError: the form cannot say what the rig is.
     """
     if form == "own":
-        return [_dump({"frame_id": rig.frame_id, "cameras": [_own_row(rig, i) for i in range(len(rig))]})]
+        rows = [{**_own_row(rig, i), **(beside[i] if beside else {})} for i in range(len(rig))]
+        return [_dump({"frame_id": rig.frame_id, "cameras": rows})]
     if form == "kalibr":
         return [_dump({f"cam{i}": _kalibr_row(rig, i) for i in range(len(rig))})]
     return [_dump(row) for row in _info_rows(rig)]

@@ -325,6 +325,30 @@ def side_message(factory: MessageFactory, what: Measurement, stamp_ns: int = 0, 
     raise ConversionError(f"{type(what).__name__} is not known beside pixels")
 
 
+class InputMessages:
+    """Makes the messages of a stream: tracks name the cameras of the rig before them, guesses the fixed frame."""
+
+    def __init__(self, factory: MessageFactory) -> None:
+        self._factory = factory
+        self._names: tuple[str, ...] = ()
+        self._fixed_frame = ""
+
+    def of(self, measurement: Measurement, stamp_ns: int) -> tuple[str, Any]:
+        """Return the input and the message of a measurement."""
+        if isinstance(measurement, CameraRig):
+            self._names = measurement.names
+            return "camera_rig", rig_message(self._factory, measurement, stamp_ns)
+        if isinstance(measurement, Keyframe):
+            self._fixed_frame = measurement.frame_id
+            return "keyframes", keyframe_message(self._factory, measurement)
+        if isinstance(measurement, LandmarkGuesses):
+            return "landmark_guesses", guesses_message(self._factory, measurement, stamp_ns, self._fixed_frame)
+        if isinstance(measurement, FeatureTracks):
+            name = self._names[measurement.camera_index]
+            return "feature_tracks", tracks_message(self._factory, measurement, stamp_ns, name)
+        return side_message(self._factory, measurement, stamp_ns)
+
+
 def _made(factory: MessageFactory, name: str, fields: dict[str, Any]) -> tuple[str, Any]:
     return name, factory.make(INPUT_TYPES[name], **fields)
 

@@ -146,8 +146,8 @@ _ALL = (
     Topic(
         "pose_with_covariance",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "As `~/pose`, with a covariance against what the solve held fixed; with a robust loss its standard"
-        " deviations are 1.2 to 1.5 times too small, see docs/frames.md. Only while subscribed.",
+        "As `~/pose`, with a covariance against what the solve held fixed; after `~/optimize` of the whole path"
+        " against the map's first keyframe. See docs/frames.md. Only while subscribed.",
         _SIDE,
     ),
     Topic(

@@ -24,7 +24,7 @@ from ba_node.io.ply import write_ply
 from ba_node.io.pose_files import is_g2o, read_g2o, write_g2o, write_kitti
 from ba_node.io.reference import first_line, read_poses
 from ba_node.io.trajectory import write_tum
-from ba_node.measurements import Measurement
+from ba_node.measurements import CameraRig, Measurement
 from ba_node.offline.model_timeline import timeline
 from ba_node.offline.recording import record
 
@@ -137,16 +137,22 @@ def of_recording(path: Path, choice: TopicChoice, progress: Callable[[int, int],
         ModelError: nothing in it can be used.
     """
     backend = Backend(Config())
+    sizes = np.zeros((0, 2), np.intp)
     with BagReader(path, choice) as reader:
 
         def measurements() -> Iterator[Measurement]:
+            nonlocal sizes
             for done, (_, _, measurement) in enumerate(reader.measurements(), start=1):
+                if isinstance(measurement, CameraRig) and not measurement.malformed:
+                    sizes = measurement.image_size.astype(np.intp)
                 yield measurement
                 progress(done, reader.message_count)
 
         for _ in backend.replay(measurements()):
             pass
-    return of_map(backend.snapshot())
+    model = of_map(backend.snapshot())
+    # A map does not hold how large images are.
+    return replace(model, size=sizes) if len(sizes) == len(model.lens) else model
 
 
 def of_map(content: MapContent) -> Reconstruction:

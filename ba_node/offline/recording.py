@@ -15,8 +15,8 @@ import numpy as np
 from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, side_message, tracks_message
+from ba_node.measurements import CameraRig, Keyframe, Measurement
+from ba_node.messages.conversion import InputMessages
 from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message
 from ba_node.messages.topics import INPUT_TYPES, TF_STATIC
 from ba_node.messages.transforms import StaticTree
@@ -44,29 +44,17 @@ def record(
         ConversionError: a stamp does not fit into a message.
     """
     rows = {} if truth is None else {int(keyframe): row for row, keyframe in enumerate(truth.keyframe_id)}
-    names: tuple[str, ...] = ()
-    fixed_frame = ""
-    count = 0
+    messages, count = InputMessages(ROSBAGS_FACTORY), 0
     with BagWriter(path) as writer:
         for topic, stamp_ns, measurement in timeline:
+            _, message = messages.of(measurement, stamp_ns)
             if isinstance(measurement, CameraRig):
-                names = measurement.names
-                message = rig_message(ROSBAGS_FACTORY, measurement, stamp_ns)
                 for info in message.cameras:
                     _set(info, camera_info)
-            elif isinstance(measurement, Keyframe):
-                fixed_frame = measurement.frame_id
-                message = keyframe_message(ROSBAGS_FACTORY, measurement)
-                if truth is not None:
-                    pose = _true_pose(truth, rows[measurement.keyframe_id], fixed_frame)
-                    writer.write(TRUTH_TOPIC, TRUTH_TYPE, pose, stamp_ns)
-                    count += 1
-            elif isinstance(measurement, LandmarkGuesses):
-                message = guesses_message(ROSBAGS_FACTORY, measurement, stamp_ns, fixed_frame)
-            elif isinstance(measurement, FeatureTracks):
-                message = tracks_message(ROSBAGS_FACTORY, measurement, stamp_ns, names[measurement.camera_index])
-            else:
-                _, message = side_message(ROSBAGS_FACTORY, measurement, stamp_ns)
+            elif isinstance(measurement, Keyframe) and truth is not None:
+                pose = _true_pose(truth, rows[measurement.keyframe_id], measurement.frame_id)
+                writer.write(TRUTH_TOPIC, TRUTH_TYPE, pose, stamp_ns)
+                count += 1
             writer.write(topic, INPUT_TYPES[topic], message, stamp_ns, latched=isinstance(measurement, CameraRig))
             count += 1
     return count

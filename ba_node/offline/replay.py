@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.backend import Backend, MapEnded, MapSummary
 from ba_node.config import Config
-from ba_node.estimate import Estimate, Poses
+from ba_node.estimate import Estimate, Extras, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.io.files import locked_folder, whole_file, write_json
@@ -64,6 +64,7 @@ class MapOptions:
 
     load: Path | None = None  # map to begin with; the recording must go on in its session
     optimize: bool = False  # refine everything of the newest session at the end
+    covariance: bool = False  # and work out how precise all poses and points are then
     save: Path | None = None  # file for the map of the newest session
     # which topics of the recording are taken, where several are possible
     topics: TopicChoice = field(default_factory=TopicChoice)
@@ -100,6 +101,7 @@ def replay(
             if options.load is not None:
                 run.load(options.load)
             run.read(measurements, reader.message_count)
+            run.backend.extras = Extras(covariance=options.covariance, points=options.covariance)
             run.end(options.optimize)
             if not run.sessions:
                 raise ReplayError(f"{reader.path}: {_nothing_to_use(run)}{_why(reader, run)}")
@@ -117,9 +119,14 @@ def replay(
         report["bag_rejected"] = dict(sorted(reader.rejected.items()))
         report["bag_notes"] = list(reader.rejection_notes)
         report["known_already"] = len(run.known_already)
+        if run.backend.map.calibration is not None:
+            report["calibration"] = run.backend.map.calibration.as_dicts()
+            report["cameras_refined"] = run.backend.map.calibration.lines()
         report["recording"] = recording_facts(reader.paths)
         report["versions"] = versions(report["kernels"])
         report["attention"] = attention(report)
+        if options.covariance:
+            _write_covariances(out / "covariance.npz", run.sessions[-1].last)
         if options.save is not None:
             write_map(map_name(options.save), run.backend.snapshot())
         with whole_file(out / "effective.yaml") as file:
@@ -254,6 +261,20 @@ def _write(
     if truth is not None:
         write_tum(out / "ground_truth.tum", truth)
     return {**summaries[-1], "older_sessions": summaries[:-1]}
+
+
+def _write_covariances(path: Path, last: Estimate) -> None:
+    """Write the covariances of all poses (x, y, z, rotation about X, Y, Z) and points (x, y, z) of the map by id."""
+    found = (last.covariance, last.point_covariance)
+    poses, points = (np.empty((0, n, n)) if one is None else one for one, n in zip(found, (6, 3), strict=True))
+    with whole_file(path) as file:
+        np.savez_compressed(
+            file,
+            keyframe_id=last.refined.keyframe_id[: len(poses)],
+            pose=poses,
+            track_id=last.cloud.track_id[: len(points)],
+            point=points,
+        )
 
 
 def _against(truth: Poses | None, record: SessionRecord) -> dict[str, Any]:

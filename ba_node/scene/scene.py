@@ -45,9 +45,11 @@ class Scene(MapTables):
         self.session_id = session_id  # the session, None before the first message that names one
         self.frame_id = ""  # name of the fixed frame
         self.cameras: Cameras | None = None  # the rig, None before it came
+        self.given_cameras: Cameras | None = None  # the rig as it came, where it was refined since
         self.next_cameras: Cameras | None = None
         self.refused_rig = ""  # why the last rig that was refused was, empty if none was
         self.log = RejectionLog()  # what was turned away
+        self.memory: object | None = None  # what windows know of keyframes that left them, see window/old_keyframes.py
         self.pending: list[FeatureTracks] = []
         self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()
@@ -145,12 +147,17 @@ class Scene(MapTables):
         span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
         self.constraints.end(self.keyframes.keyframe_id, span, self.log)
 
+    def refine_cameras(self, cameras: Cameras) -> None:
+        """Take refined cameras in the place of the rig that came, which stays known as the same one."""
+        self.given_cameras = self.given_cameras or self.cameras
+        self.cameras = cameras
+
     def _set_rig(self, rig: CameraRig) -> None:
         cameras = ingest.rig_cameras(rig, self.log)
         if cameras is None:
             self.refused_rig = self.log.notes[-1].rpartition("; dropped")[0]
             return
-        if self.cameras is not None and _same(cameras, self.cameras):
+        if any(known is not None and _same(cameras, known) for known in (self.cameras, self.given_cameras)):
             return
         if len(self.observations):
             # The rig has no session of its own: it may belong to a session that is about to begin.

@@ -27,15 +27,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
-from ba_node.config import METHOD_LOSSES, Config, SolverConfig, SolverOptions
+from ba_node.config import METHOD_LOSSES, CalibrationConfig, Config, SolverConfig, SolverOptions
 from ba_node.core import geometry, methods, native_kernels, solver
+from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
+from ba_node.window.calibration import calibrated
 from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
@@ -88,10 +91,14 @@ class Optimization:
     track_id: IdArray  # (n_pt,) uint64
     placed: BoolArray  # (n_pt,) True where the point had a position
     position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
+    held: BoolArray  # (n_kf,) keyframes that are fixed but for the one that holds a floating scale
+    stamp_ns: NDArray[np.int64]  # (n_kf,) ns
+    refine: CalibrationConfig  # what of the cameras is refined too
     wanted: Extras = NOTHING  # what is to be worked out beside the solution
     # result and (n_all,) sizes of the residuals after it, as ``Selection.norms``; None before :meth:`solve`
     solved: tuple[Result, FloatArray] | None = None
     covariances: Covariances | None = None  # None likewise, and if they were not asked for
+    calibration: Calibration | None = None  # None likewise
 
     def solve(
         self,
@@ -104,11 +111,16 @@ class Optimization:
     ) -> None:
         """Solve, on any thread; the map is not touched. Arguments as of :func:`options` and ``solver.solve``."""
         chosen = options(config, method, max_iterations)
+        if self.refine.wanted:
+            self.selection, self.calibration = calibrated(self.selection, self.held, self.stamp_ns, chosen, self.refine)
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
+            # After it the front-end's steps set the scale, be they factors or not.
+            problem = dataclasses.replace(self.selection.problem, fixed=self.held)
             state = scaled(self.selection, self.position, result.state)
-            self.covariances = covariances(self.selection, state, self.position, chosen, points=self.wanted.points)
+            selection = dataclasses.replace(self.selection, problem=problem)
+            self.covariances = covariances(selection, state, self.position, chosen, points=self.wanted.points)
 
     @property
     def result(self) -> Result:
@@ -155,7 +167,8 @@ def take_snapshot(
     ``origin`` is the scene that the result is for where this one is a clone of it.
     """
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
-    selection = select(scene, dataclasses.replace(config, window=dataclasses.replace(config.window, **sizes)))
+    window = dataclasses.replace(config.window, old_keyframes="fix", **sizes)
+    selection = select(scene, dataclasses.replace(config, window=window))
     if isinstance(selection, str):
         return selection
     problem = selection.problem
@@ -168,6 +181,9 @@ def take_snapshot(
         scene.landmarks.track_id[selection.landmarks],
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
+        problem.fixed,
+        scene.keyframes.stamp_ns[selection.keyframes],
+        config.calibration,
         wanted,
     )
 
@@ -234,7 +250,9 @@ def _join(scene: Scene, config: Config, later: int) -> None:
     if later == 0:
         return
     size = min(later + config.window.max_keyframes, _MAX_JOINED)
-    wide = dataclasses.replace(config.window, max_keyframes=size, max_fixed_keyframes=len(scene.keyframes))
+    wide = dataclasses.replace(
+        config.window, old_keyframes="fix", max_keyframes=size, max_fixed_keyframes=len(scene.keyframes)
+    )
     selection = select(scene, dataclasses.replace(config, window=wide))
     if not isinstance(selection, str):
         result = solver.solve(selection.problem, options(config.solver, max_iterations=config.solver.max_iterations))

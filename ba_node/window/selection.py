@@ -26,7 +26,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import KeyframeFactors, Observations, Problem
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, constraints, gauge, moving, odometry, trial, turns
+from ba_node.window import arrival, constraints, gauge, moving, odometry, old_keyframes, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
@@ -113,6 +113,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     if reason:
         return reason
     scene.propagate_corrections()
+    known = old_keyframes.memory(scene, config, window)
     part, norms, strays = _arrived(scene, window, config, without)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
@@ -134,10 +135,14 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     inlier = usable & ~held_out.take(obs.point)
     active = some_observations(part.problem, np.flatnonzero(inlier))
     held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
+    prior = None if known is None else known.factor(table.keyframe_id[part.keyframes], part.origin)
+    if prior is not None:
+        held = gauge.Gauge(is_old, np.full(len(is_old), -1))
     active = dataclasses.replace(active, fixed=held.fixed)
     steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
     beside = constraints.factors(scene, config, active, part.keyframes, part.origin)
     factors = constraints.in_place(steps, beside)
+    factors += () if prior is None else (prior,)
     priors = constraints.point_priors(scene, config, part.landmarks, part.origin)
     return Selection(
         problem=dataclasses.replace(active, factors=factors, point_priors=priors),
@@ -248,7 +253,12 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     landmarks = scene.distinct(table.landmark[own])
     rows = scene.views_of(landmarks, _views_needed(scene, window, config.window.max_fixed_keyframes))
     keyframe = table.keyframe.take(rows)
-    older = _older(scene, window, keyframe[~table.outlier.take(rows)])[: config.window.max_fixed_keyframes]
+    known = old_keyframes.memory(scene, config, window)
+    if known is not None:
+        rows = rows[known.takes_part(scene, rows, window)]
+        keyframe = table.keyframe.take(rows)
+    older = _older(scene, window, keyframe[~table.outlier.take(rows)])
+    older = older[: 0 if config.window.old_keyframes == "drop" else config.window.max_fixed_keyframes]
     keyframes = scene.by_time(np.concatenate([taking_part, older]))
     rows = rows[scene.numbers(keyframe, keyframes) >= 0]
     landmarks = landmarks[np.argsort(scene.landmarks.track_id[landmarks])]

@@ -10,6 +10,7 @@ first keyframe, which is held: the errors of the others are against it, and so i
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,3 +128,39 @@ def _nees(error: FloatArray, covariance: FloatArray) -> float:
     if not np.isfinite(covariance).all() or not covariance.any():
         return np.nan
     return float(error @ np.linalg.solve(covariance, error))
+
+
+OLD_KEYFRAMES = ("fix", "marginalise", "drop")
+# Three windows of ten on a way that comes back to nothing.
+_SLIDING = {**_COMMON, "keyframes": 40, "length_m": 30.0, "landmarks": 1500, "outlier_share": 0.02}
+
+
+@dataclass(frozen=True)
+class Slid:
+    """What a window that slides to the end gives, with each choice for keyframes that leave it."""
+
+    rmse_m: float  # of the path
+    batch_m: float  # of the path after a solve of everything
+    nees: float  # of the newest keyframe, against the first one of the map
+    solver_s: float  # time in the solver, for all windows, s
+
+
+def slide(sensor: str, old_keyframes: str, seed: int, clock: Callable[[], float]) -> Slid:
+    """Replay one recording with a window of ten keyframes; ``clock`` returns seconds."""
+    data = generate(SyntheticOptions(seed=seed, **{**_SLIDING, **_OF_SENSOR[sensor]}))  # type: ignore[arg-type]
+    window = {"window.max_keyframes": 10, "window.old_keyframes": old_keyframes}
+    backend = Backend(Config().with_values({**window, "guard.check_setup": False}), clock=clock)
+    last, spent = None, 0.0
+    for event in backend.replay(measurement for _, _, measurement in data.timeline()):
+        if isinstance(event, Estimate):
+            last, spent = event, spent + event.report.solve_time_s
+        if isinstance(event, Keyframe) and event.keyframe_id == data.keyframes[-1].keyframe_id:
+            backend.extras = Extras(covariance=True)
+    assert last is not None
+    path = backend.estimate().trajectory.position
+    backend.extras = Extras()
+    batch = backend.optimize()
+    assert batch is not None and last.covariance is not None
+    off = [np.sum((found - data.truth.position) ** 2, axis=1) for found in (path, batch.trajectory.position)]
+    rmse = [float(np.sqrt(np.mean(squares))) for squares in off]
+    return Slid(rmse[0], rmse[1], _of_poses(last, data)[-1], spent)

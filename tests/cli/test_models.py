@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,7 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
     assert main(["convert", str(bag), str(tmp_path / "model")]) == 0
     world = pycolmap.Reconstruction(tmp_path / "model")
     assert (world.num_rigs(), world.num_reg_frames(), world.num_reg_images()) == (1, 8, 16)
+    assert {(camera.width, camera.height) for camera in world.cameras.values()} == {(640, 480)}
     assert objective(world) / (2.0 * world.compute_num_observations()) < 1.0, "half a px^2 each coordinate, or so"
     assert main(["convert", str(tmp_path / "model"), str(tmp_path / "again.mcap")]) == 0
     assert main(["replay", str(tmp_path / "again.mcap"), "--out", str(tmp_path / "out")]) == 0
@@ -154,3 +156,21 @@ def test_what_the_formats_do_not_have_is_refused(
     assert "camera 0 (OPENCV): BAL and Bundler have cameras of f, k1 and k2 alone" in capsys.readouterr().err
     assert main(["solve", str(model), "--method", "local_dinm"]) == 2
     assert "trust_region = inc: cameras are refined with trust_region = none alone" in capsys.readouterr().err
+
+
+def test_a_missing_library_is_named(
+    bal_file: Path, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = written(make_model("PINHOLE"), tmp_path / "model")
+    for name in ("pycolmap", "foxglove"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for arguments, extra in (
+        (["solve", str(model)], "colmap"),
+        (["convert", str(model), str(tmp_path / "a.mcap")], "colmap"),
+        (["convert", str(bal_file), str(tmp_path / "other")], "colmap"),
+        (["view", str(bag)], "view"),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert error.endswith(f"pip install ba_node[{extra}]\n") and error.count("\n") == 1, error
+    assert main(["convert", str(bal_file), str(tmp_path / "a.out")]) == 0, "other formats need none of them"

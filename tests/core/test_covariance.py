@@ -54,7 +54,7 @@ def by_dense_jacobian(problem: Problem, state: State, chosen: SolverOptions) -> 
         if d == 3:
             size = np.abs(lin.residual[:, 2])
             weight[:, 2] = np.minimum(1.0, chosen.loss_scale_px / np.maximum(size, 1e-300))
-            slope[:, 2] = size <= chosen.loss_scale_px
+            slope[:, 2] = weight[:, 2] * np.sum(size <= chosen.loss_scale_px) / np.sum(weight[:, 2])
     flat, score = jacobian.reshape(n_obs * d, -1), (weight * lin.residual).ravel()
     steep = slope.ravel()
     inverse = np.linalg.inv(flat.T @ (steep[:, None] * flat))
@@ -63,8 +63,8 @@ def by_dense_jacobian(problem: Problem, state: State, chosen: SolverOptions) -> 
     variance = np.zeros(n_obs * d)
     for rows in (np.arange(n_obs * d) % d < 2, np.arange(n_obs * d) % d == 2):
         of = rows & counts
-        if of.any() and chosen.loss == "squared":
-            variance[of] = np.sum(score[of] ** 2) / np.sum(1.0 - leverage[of])
+        if of.any() and (chosen.loss == "squared" or not rows[0]):
+            variance[of] = steep[of] / steep[of].mean() * np.sum(score[of] ** 2) / np.sum(1.0 - leverage[of])
         elif of.any():
             left = 1.0 - np.minimum(leverage[of], 0.9)
             kappa = np.sum((score[of] / left) ** 2) / np.sum(steep[of] / left)

@@ -23,15 +23,19 @@ from rosbags.rosbag2 import Writer as Rosbag2
 
 from ba_node.backend import Backend
 from ba_node.config import Config
-from ba_node.io import ros_types
+from ba_node.io import model, ros_types
 from ba_node.io.bal import BalProblem, read_bal, write_bal
+from ba_node.io.bundler import from_bal, read_bundler, write_bundler
+from ba_node.io.colmap import read_colmap, to_colmap, write_colmap
 from ba_node.io.map_file import load_map, write_map
 from ba_node.io.mcap import BagReader
 from ba_node.io.parameters import configure, parameters_yaml
+from ba_node.io.pose_files import read_g2o, write_g2o
 from ba_node.io.trajectory import read_tum, write_tum
 from ba_node.offline.recording import read_truth, record
 from experiments.robustness.faults import MONO, SOUND, spoiled
 
+COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
 Reader = Callable[[Path], object]
 _TINY: dict[str, Any] = {"keyframes": 3, "length_m": 10.0, "landmarks": 200, "tracks": 12}
 _MEMBER = struct.Struct("<HI")
@@ -74,6 +78,20 @@ def read_plain_map(path: Path) -> None:
     load_map(path, Config().scene)
 
 
+def _colmap(part: str) -> Reader:
+    """Return a reader of a model of COLMAP of which one file is the input."""
+
+    def read(path: Path) -> None:
+        folder = path.with_suffix(".model")
+        folder.mkdir()
+        for name in COLMAP:
+            content = path.read_bytes() if name == part else seeds()[f"colmap_{name}"][0]
+            (folder / f"{name}.bin").write_bytes(content)
+        read_colmap(folder)
+
+    return read
+
+
 def _packed(suffix: str, pack: Callable[[bytes], bytes]) -> Reader:
     def read(path: Path) -> None:
         packed = path.with_suffix(suffix)
@@ -94,6 +112,9 @@ READERS: dict[str, Reader] = {
     "bal_bz2": _packed(".bz2", bz2.compress),
     "bal_gz": _packed(".gz", gzip.compress),
     "bal_bz2_raw": lambda path: read_bal(path.rename(path.with_suffix(".bz2"))),
+    "bundler": read_bundler,
+    "g2o": read_g2o,
+    **{f"colmap_{part}": _colmap(part) for part in COLMAP},
     "yaml": lambda path: configure(path, {}),
     "map": lambda path: load_map(path, Config().scene),
     "map_members": read_plain_map,
@@ -120,7 +141,11 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
     write_map(folder / "a.npz", backend.snapshot())
     _write_sqlite(folder / "a.mcap", folder / "b")
     rng = np.random.default_rng(0)
-    write_bal(folder / "a.txt", _bal(rng))
+    bal = _bal(rng)
+    write_bal(folder / "a.txt", bal)
+    write_bundler(folder / "a.out", from_bal(bal, np.full(bal.points.shape, 255)))
+    write_g2o(folder / "a.g2o", estimate.trajectory)
+    write_colmap(folder / "model", to_colmap(model.from_bal(bal)))
     read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "npz", "txt")}
     yaml = parameters_yaml(Config()).encode()
     metadata = (folder / "b" / "metadata.yaml").read_bytes()
@@ -134,6 +159,9 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
         "bal_bz2": [read["txt"]],
         "bal_gz": [read["txt"]],
         "bal_bz2_raw": [bz2.compress(read["txt"])],
+        "bundler": [(folder / "a.out").read_bytes()],
+        "g2o": [(folder / "a.g2o").read_bytes()],
+        **{f"colmap_{part}": [(folder / "model" / f"{part}.bin").read_bytes()] for part in COLMAP},
         "yaml": [yaml, b"a: &a [1, 2]\nb: *a\nsolver: {max_iterations: 3}\n"],
         "map": [read["npz"]],
         "map_members": [_members(folder / "a.npz")],

@@ -5,7 +5,7 @@
 Ids of ``odom_info`` are words of the local map (F2M odometry). A feature that matched none has an id too, which the
 next image gives to another one; so a row counts only if its word is in the local map (if that is told), and if it was
 matched, as an inlier. Its lists are there only with ``Odom/FillInfoData``, cameras only with local bundle adjustment.
-After a reset the covariance of ``odom`` is 9999, and words begin anew.
+After a reset the covariance of ``odom`` is 9999, and words begin anew; while it is lost, its pose is null.
 
 Ids of ``mapData`` are words of the vocabulary: two features of one image may have the same one, and are left out.
 Poses of its nodes are the odometry's. A node comes again when somebody subscribes, and may come without its words.
@@ -65,6 +65,8 @@ class Rtabmap(Source):
     def read(self, name: str, message: Any) -> Iterator[Piece]:
         """Yield what a message says."""
         if name == "odom":
+            if not xyzw(message.pose.pose.orientation).any():  # publish_null_when_lost
+                raise LayoutError("the odometry is lost", "lost")
             bad = message.pose.covariance[0] >= BAD_COVARIANCE
             self._session += bool(bad and self._begun)
             self._begun = self._begun or not bad

@@ -163,7 +163,9 @@ class Optimize(Component):
                 goal.end(Status.HELD if held else Status.SKIPPED if lost else taken.result.status, reason)
                 return None
             estimate, goal.result["followed_keyframes"] = merged
-            goal.end(taken.result.status, taken.result.reason)
+            cameras = [] if taken.calibration is None else taken.calibration.lines()
+            words = [taken.result.reason, *(f"camera {i}: {text}" for i, text in enumerate(cameras))]
+            goal.end(taken.result.status, "; ".join(words))
             return estimate
 
     def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:

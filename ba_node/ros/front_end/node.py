@@ -45,8 +45,8 @@ from ba_node.front_end.streams import (
     transform_of,
 )
 from ba_node.io.rig_file import read_rig
-from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages import conversion
+from ba_node.measurements import Keyframe, Measurement
+from ba_node.messages.conversion import InputMessages
 from ba_node.messages.factory import ConversionError, header_message, pose_message, stamp_ns_from_message
 from ba_node.messages.rig import rig_from_infos
 from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
@@ -70,8 +70,8 @@ _MAX_AHEAD_S = 1.0
 _MAX_UNSENT = 300
 # A publisher that began anew counts anew.
 _MAX_GAP = 10_000
-# Share of the time that tracking may take before images get lost.
-_BUSY = 0.95
+# Images that have waited so long, s, are more than can be tracked.
+_LATE_S = 1.0
 # A number of the first session that no run before has had, as long as clocks go on: seconds since 2020.
 _EPOCH_S = 1_577_836_800
 
@@ -98,6 +98,7 @@ class FrontEndNode(ManagedNode):
         self._mask = read_mask(mask_file) if mask_file else None
         self.counted: Counter[str] = Counter()  # images tracked and keyframes sent, and images left out by reason
         self._throttle, self._factory = Throttle(_LOG_S), RclpyFactory()
+        self._messages = InputMessages(self._factory)
         self._entities: list[tuple[str, Any]] = []
         self._active = False
         self._session_id = max(1, int(self.get_clock().now().nanoseconds // 10**9) - _EPOCH_S)
@@ -122,7 +123,7 @@ class FrontEndNode(ManagedNode):
         self._frames: list[Frame] = []
         self._unsent: deque[tuple[str, Any]] = deque(maxlen=_MAX_UNSENT)
         self._state: State | None = None
-        self._busy_s, self._said, self._summary = 0.0, "", ""
+        self._late_s, self._said, self._summary = 0.0, "", ""
         kinds = {name: INPUT_TYPES[name] for name in PUBLISHED}
         self._out = {name: self._own("publisher", message_class(kind), name, qos.profile(TOPICS[name]))
                      for name, kind in kinds.items()}  # fmt: skip
@@ -192,7 +193,10 @@ class FrontEndNode(ManagedNode):
         self._subscribed[name] = topic
         self._log(Severity.INFO, f"{topic} ({kind}) is taken as {name}, mode {self._mode}")
         if self._rig is None and name in cameras_of(self._mode):
-            beside, take = name.replace("image_raw", "camera_info"), functools.partial(self._on_info, name)
+            info, take = name.replace("image_raw", "camera_info"), functools.partial(self._on_info, name)
+            beside = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+            # Who remaps the image alone means the camera beside it.
+            beside = beside if self.count_publishers(beside) > self.count_publishers(info) else info
             # As with the cameras of ba_node: drivers publish them volatile, players latched.
             self._listen(INPUT_TYPES["camera_info"], beside, take, qos.latched(), **qos.at_peace())
             self._listen(INPUT_TYPES["camera_info"], beside, take, qos.SENSOR_DATA, **qos.at_peace())
@@ -229,6 +233,8 @@ class FrontEndNode(ManagedNode):
 
     def _on_image(self, name: str, message: Any, info: Mapping[str, Any]) -> None:
         self._notice_losses(name, info["publication_sequence_number"])
+        received_ns = info["received_timestamp"]  # 0 where the middleware does not tell
+        self._late_s = (time.time_ns() - received_ns) / 1e9 if received_ns else 0.0
         if not self._active or self._streams is None:
             return
         before, stamp_ns = self._streams.counted.copy(), stamp_ns_from_message(message.header.stamp)
@@ -259,13 +265,11 @@ class FrontEndNode(ManagedNode):
         while self._frames and self._active:
             if len(self._frames) <= _MAX_WAITING and not self._is_known(self._frames[0].stamp_ns):
                 return
-            began = time.perf_counter()
             try:
                 self._track(self._frames.pop(0))
             except (FrontEndError, ConversionError) as error:
                 self.counted["unusable"] += 1
                 self._warn("unusable", f"{error} (images left out: {self.counted['unusable']})")
-            self._busy_s += time.perf_counter() - began
 
     def _is_known(self, stamp_ns: int) -> bool:
         """Return True if the cameras are known, and the odometry of a time."""
@@ -308,25 +312,15 @@ class FrontEndNode(ManagedNode):
         self._front_end = FrontEnd(
             self._rig, self._tracking, mask=self._mask, session_id=self._session_id, fixed_frame=options.odom_frame
         )
-        self._out["camera_rig"].publish(conversion.rig_message(self._factory, self._rig, 0))
+        self._out["camera_rig"].publish(self._messages.of(self._rig, 0)[1])
         return self._front_end
 
     def _send(self, measurement: Measurement, stamp_ns: int) -> None:
         """Publish a measurement once the back-end listens; until then the newest of them wait."""
-        assert self._rig is not None
-        if isinstance(measurement, Keyframe):
-            self.counted["keyframes"] += 1
-            message = "keyframes", conversion.keyframe_message(self._factory, measurement)
-        elif isinstance(measurement, LandmarkGuesses):
-            frame = self.options.odom_frame
-            message = "landmark_guesses", conversion.guesses_message(self._factory, measurement, stamp_ns, frame)
-        else:
-            assert isinstance(measurement, FeatureTracks)
-            name = self._rig.names[measurement.camera_index]
-            message = "feature_tracks", conversion.tracks_message(self._factory, measurement, stamp_ns, name)
+        self.counted["keyframes"] += isinstance(measurement, Keyframe)
         if len(self._unsent) == self._unsent.maxlen:
             self._warn("nobody", f"nobody listens to {self.resolve_topic_name('keyframes')}: keyframes are lost")
-        self._unsent.append(message)
+        self._unsent.append(self._messages.of(measurement, stamp_ns))
         self._publish_unsent()
 
     def _publish_unsent(self) -> None:
@@ -366,9 +360,9 @@ class FrontEndNode(ManagedNode):
             words += "" if self._mode else ", nor the images of another mode"
         elif summary == self._summary and self._active:
             words += f"; no image came for {_LOG_S:g} s"
-        if self._busy_s > _BUSY * _LOG_S:
-            words += f"; tracking takes all the time ({self._busy_s / _LOG_S:.0%}): images get lost, lower max_features"
-        self._busy_s, self._summary = 0.0, summary
+        if self._late_s > _LATE_S:
+            words += f"; images wait {self._late_s:.1f} s before they are tracked: lower max_features, or their rate"
+        self._late_s, self._summary = 0.0, summary
         if words != self._said:
             self._log(Severity.INFO if words == summary else Severity.WARNING, words)
             self._said = words

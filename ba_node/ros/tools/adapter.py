@@ -24,9 +24,8 @@ from rclpy.qos import ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 
 from ba_node.io.rig_file import RigError, read_rig
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages import conversion
 from ba_node.messages.adapters import SOURCES, Adapter, AdapterOptions, Input
+from ba_node.messages.conversion import InputMessages
 from ba_node.messages.topics import INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -56,9 +55,7 @@ class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
         for one in self._inputs:
             message_class(one.type_name)
         self._subscribed: dict[str, Input] = {}
-        self._factory = RclpyFactory()
-        self._frames: tuple[str, ...] = ()
-        self._fixed_frame = ""
+        self._messages = InputMessages(RclpyFactory())
         self._said = self._ambiguous = ""
         self._out = {
             name: self.create_publisher(message_class(kind), name, qos.profile(TOPICS[name], _DEPTH))
@@ -103,19 +100,7 @@ class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
         for topic, stamp_ns, measurement in self.adapter.take(name, message):
             if topic == "keyframes" and not self._out[topic].get_subscription_count():
                 self.adapter.leave("nobody_listens", f"{self.resolve_topic_name(topic)} has no subscriber")
-            self._out[topic].publish(self._message(stamp_ns, measurement))
-
-    def _message(self, stamp_ns: int, measurement: Measurement) -> Any:
-        if isinstance(measurement, CameraRig):
-            self._frames = measurement.names
-            return conversion.rig_message(self._factory, measurement, stamp_ns)
-        if isinstance(measurement, Keyframe):
-            self._fixed_frame = measurement.frame_id
-            return conversion.keyframe_message(self._factory, measurement)
-        if isinstance(measurement, LandmarkGuesses):
-            return conversion.guesses_message(self._factory, measurement, stamp_ns, self._fixed_frame)
-        assert isinstance(measurement, FeatureTracks)
-        return conversion.tracks_message(self._factory, measurement, stamp_ns, self._frames[measurement.camera_index])
+            self._out[topic].publish(self._messages.of(measurement, stamp_ns)[1])
 
     def _on_restart(self, restart: Any) -> None:
         if restart.data:

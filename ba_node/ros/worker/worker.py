@@ -25,7 +25,7 @@ from ba_node.ros.worker.inbox import Arrival, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
 from ba_node.ros.worker.latency import Budget, Lag
 
-# Estimates that wait for a busy executor. Each holds the whole map, and the next one replaces it.
+# Estimates that wait for a busy executor; the next one replaces it.
 _MAX_OUTPUTS = 20
 # A report on what was turned away goes out without a solve, but not more often.
 _REPORT_PERIOD_S = 1.0

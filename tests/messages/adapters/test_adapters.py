@@ -254,6 +254,20 @@ def test_a_reset_of_rtabmap_begins_a_session() -> None:
     assert [one.session_id for one in of(Keyframe, out)] == [0] * 12 + [1] * 12
 
 
+def test_odometry_that_was_lost_for_a_while_goes_on_with_its_session() -> None:
+    messages = list(layouts.rtabmap(scene_of("rtabmap")))
+    for sent in messages[8:12]:
+        if sent.type_name == layouts.ODOMETRY:
+            sent.message.pose.pose.orientation.w = sent.message.pose.pose.orientation.x = 0.0
+            sent.message.pose.pose.orientation.y = sent.message.pose.pose.orientation.z = 0.0
+            sent.message.pose.covariance[0] = 9999.0
+        else:
+            sent.message.lost = True
+    made, out = feed("rtabmap", messages)
+    assert {one.session_id for one in of(Keyframe, out)} == {0} and made.sent == 10
+    assert made.counted["lost"] == 4
+
+
 def test_images_of_several_cameras_side_by_side_are_told_apart() -> None:
     messages = list(layouts.rtabmap(scene_of("rtabmap")))[:2]
     info = messages[1].message

@@ -210,10 +210,9 @@ def stamp_of(message: Any) -> int:
 
 
 def test_other_modes_and_compressed_images(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
-    """One compressed camera with odometry by TF from a base that /tf_static places."""
-    node = start_node(
-        "--ros-args", "-p", "odometry:=tf", "-p", "base_frame:=base_link", program=PROGRAM
-    )  # fmt: skip
+    """One compressed camera under another name, with odometry by TF from a base that /tf_static places."""
+    arguments = ("-p", "odometry:=tf", "-p", "base_frame:=base_link", "-r", "image_raw:=cam/image_raw")
+    node = start_node("--ros-args", *arguments, program=PROGRAM)
     peer = make_peer()
     sent = peer.received["keyframes"]
     as_back_end(peer)
@@ -224,11 +223,11 @@ def test_other_modes_and_compressed_images(start_node: StartNode, make_peer: Mak
     moving = peer.publishers["/tf"] = peer.node.create_publisher(tf, "/tf", qos.reliable(100))
     static.publish(tf_message(FACTORY, Correction("camera", np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0])),
                               "base_link", 0))  # fmt: skip
-    camera = begin(peer, "", compressed=True)
+    camera = begin(peer, "cam", compressed=True)
     for i in range(15):
         image = kitti.image("left", i)
         stamp = BEGIN_NS + i * STEP_NS
-        camera.publish("", stamp, image, kitti.p[0], frame="camera")
+        camera.publish("cam", stamp, image, kitti.p[0], frame="camera")
         place = Correction("base_link", kitti.truth[i, :, 3], np.array([0.0, 0.0, 0.0, 1.0]))
         moving.publish(tf_message(FACTORY, place, "odom", stamp))
     peer.until(lambda: len(sent) >= 3, "keyframes")
