@@ -14,9 +14,10 @@ from ba_node.core import geometry
 from ba_node.estimate import Cloud, Poses, Transform
 from ba_node.front_end import opencv
 from ba_node.front_end.checks import ImageWatch, covariance_of
+from ba_node.front_end.frame import Frame
 from ba_node.front_end.records import FrontEndError, Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig, ideal_rig
-from ba_node.front_end.tracking import Content, Found, Frame, Tracker
+from ba_node.front_end.tracking import Content, Found, Tracker
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
