@@ -212,8 +212,10 @@ class Backend:
         why = adjustment.bend(self.scene, self.config, what)
         merged = None
         if not why:
-            begun = self.begin_optimization()
-            if isinstance(begun, str):
+            large = len(self.scene.keyframes) > self.config.factors.adjust_max_keyframes
+            begun = "" if large else self.begin_optimization()
+            if isinstance(begun, str) or large:
+                self.map.adjustments += 1
                 self.map.correct(int(self.scene.order[-1]))
                 return self.estimate()  # no images to refine it by
             begun.solve(self.config.solver)
@@ -221,6 +223,8 @@ class Backend:
             why = self.refusal or ("" if merged else "nothing came of a solve of everything")
         if why:
             self.scene.restore(before)
+            if what.key is not None:
+                self.scene.constraints.refused.add(what.key)
             self.scene.log.warn("not_adjusted", f"{what.cause}; the map stays as it is: {why}")
             return None
         assert merged is not None

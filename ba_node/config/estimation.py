@@ -170,6 +170,11 @@ class FactorsConfig:
         unit="m",
         within=(0.0, 1e6),
     )
+    adjust_max_keyframes: int = option(
+        3000,
+        "Maps of more keyframes are bent alone then: to refine all of it would keep windows waiting (~/optimize does).",
+        within=(0, 10_000_000),
+    )
     adjust_m: float = option(
         0.3,
         "A loop or priors that move a keyframe further begin a solve of everything; 0: never.",

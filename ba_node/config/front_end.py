@@ -65,7 +65,9 @@ class FrontEndOptions(Checked):
         unit="px",
         within=(-20.0, 20.0),
     )
-    min_depth_m: float = option(0.2, "Points nearer than this are not taken.", unit="m", within=(1e-3, 1e3))
+    min_depth_m: float = option(
+        0.2, "Depths of a depth camera nearer than this are not taken.", unit="m", within=(1e-3, 1e3)
+    )
     max_depth_m: float = option(
         0.0, "Depths of a depth camera beyond this are not taken; 0 takes all.", unit="m", within=(0.0, 1e4)
     )

@@ -218,6 +218,9 @@ class SolverOptions(SolverConfig):
             Choice("cameras", "S = C - E' B^-1 E", "3.70-3.73", ("B",)),
             Choice("none", "nothing: H as a whole", "3.61", ("H",)),
             Choice("adaptive", "points where cond(C) < cond(B), else cameras with radius 3m/9n", "Alg. 10"),
+            Choice(
+                "adaptive_scaled", "the same, with the conditions that the blocks have in the scaled space", "Alg. 10"
+            ),
         ),
     )
     preconditioner: str = option(

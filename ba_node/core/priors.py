@@ -99,7 +99,10 @@ class PosePriors:
         at = self.keyframes[:, 0]
         back = np.swapaxes(state.rotation[at], 1, 2)
         point = (back @ (self.lever_arm - state.translation[at])[:, :, None])[..., 0]
-        return geometry.so3_log(np.swapaxes(self.rotation, 1, 2) @ back), point - self.position, point
+        # Most measure positions alone, and a logarithm costs more than all else.
+        turned = bool(self.root_information[:, :, :3].any())
+        turn = geometry.so3_log(np.swapaxes(self.rotation, 1, 2) @ back) if turned else np.zeros((len(self), 3))
+        return turn, point - self.position, point
 
 
 @dataclass(frozen=True)

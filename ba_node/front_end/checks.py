@@ -12,10 +12,10 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.front_end import features, stereo
+from ba_node.front_end.frame import Frame
 from ba_node.front_end.patches import Floats
 from ba_node.front_end.records import Grey, Images
 from ba_node.front_end.rectify import IdealRig
-from ba_node.front_end.tracking import Frame
 from ba_node.measurements import CameraRig
 
 # Spread of grey values below which there is nothing in an image.

@@ -5,17 +5,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.front_end import patches, stereo
 from ba_node.front_end.alignment import StereoAlignment
+from ba_node.front_end.frame import Frame
 from ba_node.front_end.rectify import IdealRig
-
-if TYPE_CHECKING:
-    from ba_node.front_end.tracking import Frame
 
 # Standard deviation of a depth camera, as a share of the depth.
 _DEPTH_SHARE = 0.02

@@ -14,9 +14,10 @@ from ba_node.core import geometry
 from ba_node.estimate import Cloud, Poses, Transform
 from ba_node.front_end import opencv
 from ba_node.front_end.checks import ImageWatch, covariance_of
+from ba_node.front_end.frame import Frame
 from ba_node.front_end.records import FrontEndError, Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig, ideal_rig
-from ba_node.front_end.tracking import Content, Found, Frame, Tracker
+from ba_node.front_end.tracking import Content, Found, Tracker
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
@@ -24,6 +25,8 @@ _IDENTITY = Transform(np.eye(3), np.zeros(3))
 _STANDS_PX = 0.5
 # While lost, the pose is off by at least so much with each image: m, rad.
 _LOST_M, _LOST_RAD = 0.1, 0.05
+# Depth cameras tell nothing beyond this, m.
+_FARTHEST_M = 1e4
 # One camera alone begins once features have moved this far by its motion (median), px.
 _START_PX = 20.0
 _ALONE = "one camera without odometry: the scale is free, lengths are in units of the first step"
@@ -179,8 +182,10 @@ class FrontEnd:
         ideal = self._ideal
         grey = [ideal.image(index, image) for index, image in enumerate(images.grey)]
         depth, allowed = images.depth_m, self._allowed
-        if depth is not None and ideal.cameras[0].maps is not None:
+        if depth is not None:
             depth = ideal.image(0, depth, linear=False)
+            farthest = self.options.max_depth_m or _FARTHEST_M
+            depth = np.where((depth >= self.options.min_depth_m) & (depth <= farthest), depth, np.float32(0.0))
         if images.mask is not None and images.mask.shape == images.grey[0].shape:
             allowed = allowed & (ideal.image(0, images.mask.astype(np.uint8), linear=False) > 0)
         return Frame.of(grey[0], grey[1] if len(grey) > 1 else None, depth, allowed)

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config.front_end import FrontEndOptions
@@ -21,14 +20,10 @@ from ba_node.estimate import Transform
 from ba_node.front_end import features, patches, pose
 from ba_node.front_end.alignment import Pair, StereoAlignment
 from ba_node.front_end.depths import Depths, measure_depths
+from ba_node.front_end.frame import Frame
 from ba_node.front_end.local_map import LocalMap, Warp
-from ba_node.front_end.opencv import cv2
-from ba_node.front_end.patches import Floats
-from ba_node.front_end.records import Grey
 from ba_node.front_end.rectify import IdealRig
 
-# Images are smoothed by this before patches are compared, px.
-SMOOTHING_PX = 1.0
 # Correlation of a patch and what is found for it, below which it is another thing; of one that was lost, and of one
 # that is to be cut anew.
 _SAME, _SAME_AGAIN, _RENEW = 0.7, 0.85, 0.8
@@ -43,29 +38,6 @@ _ZOOM = 1.5
 # Lost points that are looked for at once, newest first.
 _LOOKED_FOR = 200
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Images of one time, as ideal cameras see them."""
-
-    grey: Grey
-    soft: Floats  # smoothed
-    right: Grey | None
-    right_soft: Floats | None
-    depth: NDArray[np.float32] | None
-    allowed: BoolArray  # (h, w) where features may be
-
-    @classmethod
-    def of(cls, grey: Grey, right: Grey | None, depth: NDArray[np.float32] | None, allowed: BoolArray) -> Frame:
-        """Prepare images."""
-        return cls(grey, soften(grey), right, None if right is None else soften(right), depth, allowed)
-
-
-def soften(image: Grey) -> Floats:
-    """Return a smoothed image as float32."""
-    soft: Floats = cv2().GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
-    return soft
 
 
 @dataclass(frozen=True)
@@ -119,8 +91,7 @@ class Tracker:
     @property
     def scene_inverse_depth(self) -> float:
         """Return the median inverse depth of what is known, 1/m; 0 if nothing is."""
-        w = self.map.inverse_depth[self.rows]
-        w = w[np.isfinite(w)]
+        w = self.map.inverse_depth[self.rows[self.map.known[self.rows]]]
         return float(np.median(w)) if len(w) else 0.0
 
     def follow(self, frame: Frame, expected: Transform | None) -> BoolArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ba_node.arrays import BoolArray
 from ba_node.backend import CurrentMap, MapSummary
-from ba_node.estimate import Estimate, Poses, SolveReport
+from ba_node.estimate import Estimate, Poses, SolveReport, World
 from ba_node.measurements import Keyframe
 
 _IDS_SHOWN = 6
@@ -101,6 +101,7 @@ class SessionRecord:
         return {
             "session_id": self.session_id,
             "frame_id": self.last.frame_id,
+            "world": _world(self.last.world),
             "keyframes": len(self.last.trajectory) + sum(map(len, self.forgotten)),
             "keyframes_refined": len(self.refined),
             "unrefined": self.unrefined,
@@ -114,6 +115,13 @@ class SessionRecord:
             "slowest_solve_keyframe_id": slowest[1],
             "solve_times_s": [one.solve_time_s for one in reports],
         }
+
+
+def _world(world: World | None) -> dict[str, Any] | None:
+    """Return where the map lies in the world, None if that is not known."""
+    return (
+        None if world is None else {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(world).items()}
+    )
 
 
 def _figures(summary: MapSummary) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ba_node.arrays import FloatArray, IdArray
 from ba_node.core import geometry
+from ba_node.core.priors import root_information
 from ba_node.measurements import GlobalFix, GravityDirection, LandmarkPriors, PosePrior, RelativePose, TrackMerge
 from ba_node.scene import ingest
 from ba_node.scene.rejections import RejectionLog
@@ -29,6 +30,8 @@ ENU = "enu"
 _TANGENT = np.array([3, 4, 5, 0, 1, 2])
 _SYMMETRIC = 1e-6
 _STRANGE_M = 1e7
+# Absolute measurements that are kept, the newest: keyframes may never come.
+_MOST = 200_000
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ class RelativeMeasure:
 
     rotation: FloatArray  # (3, 3) body at the first from body at the second
     position: FloatArray  # (3,) the same, m
-    covariance: FloatArray  # (6, 6) rotation about the axes of the second body, translation along those of the first
+    # (6, 6) square root of the information on rotation about the axes of the second body, translation along the first's
+    root: FloatArray
     is_loop: bool
 
 
@@ -113,7 +117,8 @@ class Constraints:
         turn = np.eye(6)
         turn[:3, :3] = pose.rotation.T
         covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
-        self.relative[key] = RelativeMeasure(pose.rotation, pose.position, covariance, measured.is_loop)
+        root = root_information(covariance)
+        self.relative[key] = RelativeMeasure(pose.rotation, pose.position, root, measured.is_loop)
         self.unchecked.append(key)
         for one in key:
             self.relative_of.setdefault(one, []).append(key)
@@ -250,6 +255,7 @@ class Constraints:
 
     def _insert(self, one: Absolute) -> None:
         bisect.insort(self.absolute, one, key=lambda known: known.stamp_ns)
+        del self.absolute[:-_MOST]
 
     def _same_world(self, name: str, frame_id: str, log: RejectionLog) -> bool:
         frame = ingest.plain_name(frame_id)

@@ -207,14 +207,14 @@ class MapTables:
     def poses_and_points(self) -> tuple[FloatArray | BoolArray, ...]:
         """Return a copy of where keyframes and points are, to be restored as long as none comes or goes."""
         table, points = self.keyframes, self.landmarks
-        return tuple(a.copy() for a in (table.rotation, table.position, points.position, points.has_position))
+        columns = table.rotation, table.position, table.refined, points.position, points.has_position
+        return tuple(column.copy() for column in columns)
 
     def restore(self, known: tuple[FloatArray | BoolArray, ...]) -> None:
         """Put keyframes and points back to where :meth:`poses_and_points` had them."""
         table, points = self.keyframes, self.landmarks
-        for column, was in zip(
-            (table.rotation, table.position, points.position, points.has_position), known, strict=True
-        ):
+        columns = table.rotation, table.position, table.refined, points.position, points.has_position
+        for column, was in zip(columns, known, strict=True):
             column[:] = was
         self.moved()
         points.changed()

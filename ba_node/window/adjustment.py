@@ -24,7 +24,7 @@ from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config, OdometryConfig, SolverOptions
 from ba_node.core import geometry, native_kernels, solver
 from ba_node.core.factors import RelativePoses
-from ba_node.core.priors import PosePriors, root_information
+from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, full
@@ -33,11 +33,13 @@ from ba_node.window.problems import problem_of
 # So many tracks place a keyframe; a view agrees within so many outlier gates, as the map has drifted apart.
 _LEAST, _WIDE = 6, 3.0
 # What a step of the map is worth, by what one of the front-end's is; how far (rms, in sigmas) steps may be bent.
-_WORTH, _BENT = 1.0 / 3.0, 4.0
+_WORTH, _BENT = 1.0 / 3.0, 10.0
 # How far the first keyframe may be turned where nothing else tells.
 _UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
 _RECENT, _TELLING = 50, 4.0
+# Map and world are tried to be aligned again once the map has grown by this share.
+_TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
 _ITERATIONS = 30
@@ -50,6 +52,7 @@ class Due:
     cause: str  # in words
     loops: tuple[RelativePoses, ...] = ()  # by rows of the scene
     joined: tuple[tuple[int, int], ...] = ()  # tracks that go on under the id of another
+    key: tuple[int, int] | None = None  # keyframes of the relative pose that the map does not meet
 
 
 def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
@@ -57,17 +60,19 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
 
     ``final``: nothing more will come.
     """
-    known = scene.constraints
-    if not config.factors.enabled:
+    known, n = scene.constraints, len(scene.keyframes)
+    if not config.factors.enabled or n < 2 or scene.cameras is None:
         return None
-    if (known.absolute or known.landmarks) and known.map_from_world is None and constraints.align(scene, config):
-        known.adjusted_at = len(scene.keyframes)
+    unaligned = bool(known.absolute or known.landmarks) and known.map_from_world is None
+    if unaligned and (final or n - known.adjusted_at >= _TRY_AGAIN * n):
+        known.adjusted_at = n
+        constraints.align(scene, config)
     if final and (known.absolute or known.landmarks) and known.map_from_world is None:
-        n = len(known.absolute) + len(known.landmarks)
+        count = len(known.absolute) + len(known.landmarks)
         scene.log.warn(
             "unaligned",
-            f"{n} priors in frame {known.world_frame!r} were not used: the path is too short, or they are too few or"
-            " too noisy, to tell where the map lies in it (factors.align_m)",
+            f"{count} priors in frame {known.world_frame!r} were not used: the path is too short, or they are too few"
+            " or too noisy, to tell where the map lies in it (factors.align_m)",
         )
     found = _merged(scene, config, final) if known.merges else None
     found = found or (_measured(scene, config) if known.unchecked else None)
@@ -78,19 +83,9 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
     """Bend the map, join tracks; return why not, in words, in which case nothing was changed."""
     known, table, order = scene.constraints, scene.keyframes, scene.order
     scene.propagate_corrections()
-    if known.absolute or known.landmarks:
-        constraints.align(scene, config)
-    place = scene.places()
-    steps = _steps(scene, config.odometry)
-    rows = np.arange(len(table))
-    origin = table.position[order[0]]
-    others = tuple(kind.take(np.arange(len(kind)), place) for kind in what.loops)
-    others += tuple(kind.take(np.arange(len(kind)), place) for kind in _loops(scene))
-    world: tuple[KeyframeFactors, ...] = ()
-    if known.map_from_world is not None:
-        pairs = constraints.every_pair(scene, config.factors)
-        if len(pairs):
-            world = constraints.absolute(scene, config, pairs, place[pairs.row], origin), _upright(scene)
+    steps, place, origin = _steps(scene, config.odometry), scene.places(), table.position[order[0]]
+    others = tuple(kind.take(np.arange(len(kind)), place) for kind in (*what.loops, *_loops(scene)))
+    world = _world(scene, config, origin)
     fixed = np.zeros(len(order), bool)
     fixed[0] = not world
     start = State(*geometry.inverse(table.rotation[order], table.position[order] - origin), *2 * (np.empty((0, 3)),))
@@ -106,17 +101,27 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
         if not result.status.usable:
             return f"the poses cannot be bent: {result.reason}"
         state = result.state
-    residual = steps.residuals(state)
-    bent = float(np.sqrt(np.mean(residual**2)))
+    bent = float(np.sqrt(np.mean(steps.residuals(state) ** 2)))
     if bent > _BENT:
         return f"steps would have to be bent by {bent:.1f} of their standard deviations"
     rotation, position = geometry.inverse(state.rotation, state.translation)
-    _move(scene, geometry.nearest_rotation(rotation)[place[rows]], (position + origin)[place[rows]])
+    _move(scene, geometry.nearest_rotation(rotation)[place], (position + origin)[place])
     # Where the world holds them they need no images.
     table.refined[:] |= bool(world)
     join(scene, what.joined)
     known.adjusted_at = len(table)
     return ""
+
+
+def _world(scene: Scene, config: Config, origin: FloatArray) -> tuple[KeyframeFactors, ...]:
+    """Return the factors of all that is absolute, by places in the order of time; none without an alignment."""
+    known = scene.constraints
+    if not (known.absolute or known.landmarks) or not constraints.align(scene, config):
+        return ()
+    pairs = constraints.every_pair(scene, config.factors)
+    if not len(pairs):
+        return ()
+    return constraints.absolute(scene, config, pairs, scene.places()[pairs.row], origin), _upright(scene)
 
 
 def _upright(scene: Scene) -> PosePriors:
@@ -159,11 +164,10 @@ def _loops(scene: Scene) -> tuple[RelativePoses, ...]:
     for key, one in scene.constraints.relative.items():
         ends = [scene.find_keyframe(end) for end in key]
         if None not in ends and key not in scene.constraints.refused:
-            found.append((ends, one.rotation, one.position, one.covariance))
+            found.append((ends, one.rotation, one.position, one.root))
     if not found:
         return ()
-    ends_of, rotation, position, covariance = (np.array(values) for values in zip(*found, strict=True))
-    root = root_information(covariance)
+    ends_of, rotation, position, root = (np.array(values) for values in zip(*found, strict=True))
     return (RelativePoses(ends_of, rotation, position, root, "cauchy", 3.0),)
 
 
@@ -180,7 +184,7 @@ def _measured(scene: Scene, config: Config) -> Due | None:
         _, there = geometry.compose(*back, table.rotation[second], table.position[second])
         off = float(np.linalg.norm(there - known.relative[key].position))
         if 0.0 < config.factors.adjust_m < off and known.relative[key].is_loop:
-            return Due(f"the relative pose of keyframe {key[1]} in {key[0]} is {off:.2f} m off the map")
+            return Due(f"the relative pose of keyframe {key[1]} in {key[0]} is {off:.2f} m off the map", key=key)
     return None
 
 

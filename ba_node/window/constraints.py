@@ -34,6 +34,8 @@ _LOSS = "cauchy"
 # Standard deviation of the vertical of one frame in the other, rad; and of an orientation that was not measured.
 _LEVEL_RAD = 0.05
 _UNKNOWN = 1e6
+# Pairs that map and world are aligned by, spread over all.
+_ALIGNED = 2000
 # Minimal sets that are tried, pairs in each, pairs that judge them, rounds of weighting.
 _SETS, _IN_SET, _JUDGES, _ROUNDS = 60, 5, 300, 10
 # The path has to spread so many times the noise of positions, and the heading to be known to so much (rad).
@@ -154,9 +156,13 @@ def _aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatAr
     """Return map from world, None where too little is known."""
     if not len(pairs):
         return None
+    pairs = pairs.take(np.unique(np.linspace(0, len(pairs) - 1, _ALIGNED).astype(int)))
     there = pairs.points(scene)
     sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     turn_rad = np.sqrt(np.trace(pairs.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0)
+    told = float(1.0 / np.sqrt(np.sum(1.0 / turn_rad**2)))
+    if told > _HEADING_RAD and float(np.sqrt(np.sum(np.var(there, axis=0)))) < config.align_m:
+        return None
     turned = scene.keyframes.rotation[pairs.row] @ np.swapaxes(pairs.rotation, 1, 2)
     best, lowest = None, np.inf
     rng = np.random.default_rng(0)
@@ -178,7 +184,6 @@ def _aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatAr
     spread = float(np.sqrt(np.sum(share[:, None] * (there - share @ there) ** 2)))
     sigma_m = float(1.0 / np.sqrt(np.mean(1.0 / sigma**2)))
     heading = sigma_m / (max(spread, 1e-9) * np.sqrt(len(pairs)))
-    told = float(1.0 / np.sqrt(np.sum(1.0 / turn_rad**2)))
     enough = spread >= max(config.align_m, _SPREAD * sigma_m) and heading <= _HEADING_RAD
     return best if enough or told <= _HEADING_RAD else None
 
@@ -251,7 +256,7 @@ def _relative(scene: Scene, config: Config, number: IntArray, free: BoolArray) -
         if None not in ends:
             pair_of = number[np.array(ends, np.intp)]
             if (pair_of >= 0).all() and free[pair_of].any():
-                found.append((pair_of, one.rotation, one.position, one.covariance))
+                found.append((pair_of, one.rotation, one.position, one.root))
     if known.steps:
         # Keyframes that follow each other in the problem and in time.
         here = np.flatnonzero(number[scene.order] >= 0)
@@ -264,11 +269,10 @@ def _relative(scene: Scene, config: Config, number: IntArray, free: BoolArray) -
                 turn, move = geometry.compose(*back, table.input_rotation[second], table.input_position[second])
                 turned = np.eye(6)
                 turned[:3, :3] = turn.T
-                found.append((ends_of, turn, move, turned @ covariance @ turned.T))
+                found.append((ends_of, turn, move, root_information(turned @ covariance @ turned.T)))
     if not found:
         return []
-    pairs, rotation, position, covariance = (np.array(values) for values in zip(*found, strict=True))
-    root = root_information(covariance)
+    pairs, rotation, position, root = (np.array(values) for values in zip(*found, strict=True))
     return [RelativePoses(pairs, rotation, position, root, _LOSS, config.factors.loss_scale)]
 
 
@@ -276,7 +280,7 @@ def _keys(scene: Scene, number: IntArray) -> list[tuple[int, int]]:
     """Return the relative poses of keyframes of a problem, in the order of these."""
     known = scene.constraints
     ids = scene.keyframes.keyframe_id[np.flatnonzero(number >= 0)].tolist()
-    return list(dict.fromkeys(key for one in ids for key in known.relative_of.get(one, ())))
+    return list(dict.fromkeys(key for one in ids for key in known.relative_of.get(one, ()) if key not in known.refused))
 
 
 def in_place(steps: tuple[RelativePoses, ...], others: list[KeyframeFactors]) -> tuple[KeyframeFactors, ...]:

@@ -7,14 +7,33 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from experiments.thesis.beside import BESIDE
 from experiments.thesis.chapter3 import CHAPTER_3
 from experiments.thesis.chapter45 import CHAPTER_4, CHAPTER_5
 from experiments.thesis.experiments import Experiment
 from experiments.thesis.open_problems import OPEN
 
-EXPERIMENTS: tuple[Experiment, ...] = (*CHAPTER_3, *CHAPTER_4, *CHAPTER_5, *OPEN)
+# Of the thesis, each with its seeds.
+REPEATED: tuple[Experiment, ...] = (*CHAPTER_3, *BESIDE, *CHAPTER_4, *CHAPTER_5)
+EXPERIMENTS: tuple[Experiment, ...] = (*REPEATED, *OPEN)
+
+
+def _is_number(value: float | str) -> bool:
+    return not isinstance(value, str) or re.fullmatch(r"> \d+", value) is not None
+
+
 _FIGURE = re.compile(r"(?:fig(?:ure)?)[-. ]?(\d+\.\d+)")
 _TABLE = re.compile(r"(?:table[-. ]?)?(\d+\.\d+)")
+
+
+# The thesis's own figures, by experiment, label and metric; "> 5000" is 5000.
+PRINTED: dict[str, dict[str, dict[str, float]]] = {
+    experiment.name: {
+        case.label: {name: float(str(value).lstrip("> ")) for name, value in case.thesis.items() if _is_number(value)}
+        for case in experiment.cases
+    }
+    for experiment in EXPERIMENTS
+}
 
 
 class ExperimentError(ValueError):

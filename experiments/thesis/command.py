@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Repeat experiments of the thesis behind the methods: its tables and figures, with ours beside the thesis's.
 
-Say which by table (3.8), figure (fig-3.16) or name, see --list; --all for all, in about half an hour of an idle core;
+Say which by table (3.8), figure (fig-3.16) or name, see --list; --all for all, in about an hour of an idle core;
 open-... are experiments on what the thesis leaves open. Every run is recorded in OUT/runs as JSON: what was
 interrupted goes on where it stopped, what has been run is not run again, and an option that has changed makes a new
 run. Written to OUT: report.html with everything in it, report.md and images/, results.json with all figures.

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node.core import scaling
 from ba_node.core.numpy_kernels import NumpyKernels, NumpySystem
 from ba_node.core.schur import block_diagonal
 from ba_node.core.solver import solve
@@ -26,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 # What stands for a condition that is infinite, or lost in rounding.
 WORST = 1e20
-_WORST_OF = ("condition_c", "condition_b", "condition_s", "lone_points")
+_WORST_OF = ("condition_c", "condition_b", "condition_b_scaled", "condition_s", "lone_points")
 
 
 class Watched(NumpyKernels):
@@ -40,11 +41,13 @@ class Watched(NumpyKernels):
         (d_c, d_p), equations = self._damping, self._equations
         b = equations.b + d_c[:, :, None] * np.eye(self.size)
         c = equations.c + d_p[:, :, None] * np.eye(3)
+        d = scaling.diagonals("inc", self.diagonals())[0]
         rows = np.any(self._linearisation.d_point != 0.0, axis=(1, 2))
         self.rows.append(
             {
                 "condition_c": worst(c),
                 "condition_b": worst(b),
+                "condition_b_scaled": worst(b / (d[:, :, None] * d[:, None, :])),
                 "condition_s": worst(system.dense()[None]),
                 "lone_points": float(lone(self._objective.problem, self._linearisation).sum()),
                 "active": float(np.mean(rows)),
@@ -95,6 +98,9 @@ def conditions(posed: Posed, settings: Sequence[str], _clock: Callable[[], float
     broken = [index for index, row in enumerate(rows, start=1) if not row["plain"]]
     # A solve that ends where it begins has no system to look at.
     found: dict[str, Any] = {name: max((row[name] for row in rows), default=None) for name in _WORST_OF}
+    if rows:
+        # The thesis tells what it is, not what it is at its worst.
+        found["condition_b_scaled"] = float(np.median([row["condition_b_scaled"] for row in rows]))
     found |= {
         "first_break": float(broken[0]) if broken else None,
         "breaks": float(len(broken)),

@@ -4,10 +4,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from experiments.thesis.tasks import Task
+from experiments.thesis.tasks import Measure, Task
+
+# Starts of every solve: the file's, and others that differ from it by 1e-13.
+SEEDS = 3
 
 
 @dataclass(frozen=True)
@@ -19,6 +23,13 @@ class Case:
     thesis: Mapping[str, float | str] = field(default_factory=dict)  # its figures, by metric (metrics.py)
     note: str = ""  # what departs from the thesis
     versus: str = ""  # label of the case that its times are compared with; empty for the first
+    seeds: int = SEEDS  # how many starts it is run from; what is measured beside the loop is measured once
+
+    def tasks(self) -> tuple[Task, ...]:
+        """Return what is run: the task, and the same from starts moved by rounding alone."""
+        if isinstance(self.task, Measure):
+            return (self.task,)
+        return tuple(dataclasses.replace(self.task, seed=seed) for seed in range(self.seeds))
 
 
 @dataclass(frozen=True)
@@ -32,6 +43,7 @@ class Experiment:
     figures: tuple[str, ...] = ()  # of the thesis that it repeats
     plots: tuple[str, ...] = ()  # names in plots.PLOTS
     note: str = ""  # what is to be known
+    clock: str = ""  # label of the case at whose end the others are looked at too, by time; empty for none
 
     def case(self, label: str) -> Case:
         """Return the case of a label, the first one for an empty label."""

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,8 +30,12 @@ def truth_errors(state: State, truth: State) -> dict[str, float]:
     images see may lie anywhere, and rule the RMSE and its alignment; medians are those after the cameras' alignment.
     """
     centres, true_centres = _centres(state), _centres(truth)
-    by_cameras = align(centres, true_centres, "sim3")
-    by_points = align(state.points, truth.points, "sim3")
+    try:
+        by_cameras = align(centres, true_centres, "sim3")
+        by_points = align(state.points, truth.points, "sim3")
+    except (ValueError, np.linalg.LinAlgError):
+        # One that ran away beyond what numbers hold leaves nothing to align by.
+        return dict.fromkeys(("rmse_cameras", "rmse_points", "median_points"), math.inf)
     errors = {
         "rmse_cameras": by_cameras.apply(centres) - true_centres,
         "rmse_points": by_points.apply(state.points) - truth.points,

@@ -40,6 +40,14 @@ FINDINGS: tuple[Claim, ...] = (
         ),
     ),
     Claim(
+        "both are so from a first damping of 1e-4 as well",
+        "preconditioner",
+        (
+            Below(_M, "pcg_per_solve", "diag block of S, mu 1e-4", ("I, mu 1e-4",), 4.0),
+            Below(_M, "pcg_per_solve", "I, mu 1e-4", tuple(f"{name}, mu 1e-4" for name in _STANDING), 1.5),
+        ),
+    ),
+    Claim(
         "Huber's loss leaves the conditions of C, B and S near those of squared loss",
         "reweighting",
         tuple(
@@ -54,7 +62,7 @@ FINDINGS: tuple[Claim, ...] = (
         (
             Within(_C, "lone_points", "squared, PCG", high=0.0),
             Within(_C, "lone_points", "TQ", low=500.0),
-            Within(_S, "lone_points", "TQ, annealed", low=100.0),
+            Within(_S, "lone_points", "TQ, annealed", low=1.0),
             Below(_C, "condition_c", "squared, PCG", ("TQ",), 1e6),
             Below(_C, "condition_c", "squared, PCG", ("TQ, annealed",), 1e4),
             Below(_S, "condition_c", "squared, PCG", ("TQ, annealed",), 1e6),

@@ -21,6 +21,9 @@ from ba_node.core.numpy_kernels import NumpyKernels, preconditioner
 from ba_node.core.objective import Objective
 from ba_node.core.problem import State
 from ba_node.core.schur import Structure, normal_equations
+from ba_node.core.solver import solve
+from ba_node.offline.solver_settings import solver_options
+from experiments.thesis import sketches
 from experiments.thesis.conditioning import conditions
 from experiments.thesis.final_state import truth_errors
 from experiments.thesis.matrix_forms import FORMS
@@ -168,6 +171,17 @@ def _fastest(work: Callable[[], object], clock: Clock, repeats: int) -> float:
     return min(times)
 
 
+def memory(posed: Posed, settings: Sequence[str], _clock: Clock) -> Measured:
+    """Return the most memory that steps of a method had in use, MB; settings: method, steps, options."""
+    method, steps, *assignments = settings
+    options = solver_options(method, [*assignments, f"max_iterations={steps}", "backend=numpy"])
+    tracemalloc.start()
+    solve(posed.problem, options)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return {"figures": {"megabytes": peak / 2**20}}
+
+
 MEASURES: dict[str, Callable[[Posed, Sequence[str], Clock], Measured]] = {
     "taylor": taylor,
     "matrix_form": matrix_form,
@@ -177,4 +191,7 @@ MEASURES: dict[str, Callable[[Posed, Sequence[str], Clock], Measured]] = {
     "layout": layout,
     "linearisation": linearisation,
     "conditions": conditions,
+    "memory": memory,
+    "blocks": sketches.blocks,
+    "cap": sketches.cap,
 }

@@ -34,7 +34,8 @@ B, diagonals; its solves end near the cap of 1000.
         """\
 ![PCG steps of each solve with five preconditioners, made of the scaled matrix and as it stands](images/open_pcg.png)
 
-`auto`, `adinm` and `ba solve --set preconditioner=schur_block` use blocks of the scaled S.
+It does not hang on the start values: the rows "mu 1e-4" begin as the experiments of chapter 3 do. `auto`, `adinm`,
+`irls_tq` and `ba solve --set preconditioner=schur_block` use blocks of the scaled S.
 """,
         ("open-preconditioner",),
     ),
@@ -62,8 +63,8 @@ on, but on what such a matrix gives.
 The cure has three parts: first-order weights, which are never negative (all of these use them); points that fewer than
 two observations hold leave the equations; D = diag(H) with a floor on its entries and on mu. With it no condition goes
 beyond what float64 holds, and nothing breaks. It does not make a truncated quadratic start well: from the plateau of
-the sphere all points leave at once, hence the annealing of `irls_tq`. Where a cured curve falls to a low, level line,
-steps are rejected and mu rises: the run has arrived.
+the sphere all points leave at once, hence Huber's loss before the annealing of `irls_tq`. Where a cured curve falls to
+a low, level line, steps are rejected and mu rises: the run has arrived.
 
 `auto` damps with diag(H) and the floor on its entries; any method does with `--set damping=diag`. Blocks that are
 singular all the same are inverted as pseudo-inverses.

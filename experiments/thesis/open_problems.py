@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from experiments.thesis.chapter3 import CAP, CURVES, NUMPY, SOLVE_COLUMNS, dinm, ladybug
-from experiments.thesis.chapter45 import MU
+import dataclasses
+
+from experiments.thesis.chapter3 import CAP, CURVES, NUMPY, SOLVE_COLUMNS, ladybug
 from experiments.thesis.data_sets import KITTI, LADYBUG
 from experiments.thesis.experiments import Case, Experiment
 from experiments.thesis.problems import (
@@ -13,13 +14,16 @@ from experiments.thesis.problems import (
     LADYBUG_PART,
     ONE_CAMERA,
     ONE_CAMERA_KNOWN,
+    OPEN_SMALL,
     SHARES,
     outliers,
 )
+from experiments.thesis.starts import START
 from experiments.thesis.tasks import Measure, Run
 
 _NATIVE = "backend=native"
 # To the end: what a step gains is lost in rounding.
+MU = "initial_damping=10"
 _TO_THE_END = "function_tolerance=1e-10"
 _BLOCKS = "preconditioner=schur_block"
 _HUBER, _TRUNCATED = "gamma=0.5", "gamma=0.7"
@@ -33,9 +37,24 @@ _PRECONDITIONERS = (
 )
 
 
+def _dinm(*settings: str) -> Run:
+    """Return DINM with its own start values."""
+    return ladybug("dinm", CAP, *settings)
+
+
 def _unscaled(name: str) -> Run:
     """Return DINM with M made of the matrix that is not scaled."""
     return Run(LADYBUG, "dinm", (NUMPY, CAP, f"preconditioner={name}"), 50, (), "unscaled M")
+
+
+def _from_small(name: str) -> Run:
+    """Return the same from the first damping and radius of the experiments of chapter 3."""
+    return Run(LADYBUG, "dinm", (NUMPY, CAP, *START, f"preconditioner={name}"), 50)
+
+
+def _unscaled_from_small(name: str) -> Run:
+    """Return DINM with M made of the matrix that is not scaled, from these."""
+    return Run(LADYBUG, "dinm", (NUMPY, CAP, *START, f"preconditioner={name}"), 50, (), "unscaled M")
 
 
 def _conditions(problem: str, gammas: tuple[str, str], steps: int = 50) -> tuple[Case, ...]:
@@ -83,7 +102,7 @@ _CONDITIONS = tuple(
     )
     for name, where, problem, gammas, about in (
         ("", "ten frames of Ladybug-49", LADYBUG_PART, ("gamma=1", "gamma=3"), "Real data."),
-        ("-sphere", "a sphere of 10 images", "10-289", ("gamma=0.5", "gamma=1"), "2 % outliers."),
+        ("-sphere", "a sphere of 10 images", OPEN_SMALL, ("gamma=0.5", "gamma=1"), "2 % outliers."),
     )
 )
 
@@ -103,11 +122,18 @@ _DATA = (
     ("KITTI", KITTI),
     ("Ladybug-49", LADYBUG),
 )
+# Every named method, with its own start values.
 _DATA_METHODS = (
     ("LMA-CD", "lma_cd", (NUMPY,)),
+    ("BAL", "bal", (NUMPY, CAP)),
+    ("BAL, scaled", "bal_scaled", (NUMPY, CAP)),
+    ("INM", "inm", (NUMPY, CAP)),
+    ("TNM", "tnm", (NUMPY, CAP)),
     ("DINM", "dinm", (NUMPY, CAP)),
+    ("ADINM", "adinm", (NUMPY, CAP)),
     ("local DINM", "local_dinm", (NUMPY, CAP, MU)),
     ("IRLS", "irls_huber", (NUMPY, CAP)),
+    ("IRLS, TQ", "irls_tq", (NUMPY, CAP)),
     ("auto, C++", "auto", (_NATIVE, _TO_THE_END)),
 )
 _LARGE = (
@@ -116,15 +142,21 @@ _LARGE = (
     ("auto, Huber", "auto", ("loss=huber", _HUBER, "q_eps=0", "function_tolerance=1e-8")),
 )
 
-OPEN = (
+_OPEN = (
     Experiment(
         "open-preconditioner",
         "preconditioners made of the scaled matrix and of the matrix as it stands",
         (
-            Case("I", dinm("preconditioner=none"), {"pcg_per_solve": 256.0}),
+            Case("I", _dinm("preconditioner=none"), {"pcg_per_solve": 256.0}),
+            Case("I, mu 1e-4", _from_small("none")),
             *(
-                Case(f"{label}{how}", task, {"pcg_per_solve": steps} if how else {})
-                for how, make in (("", lambda name: dinm(f"preconditioner={name}")), (", as it stands", _unscaled))
+                Case(f"{label}{how}", task, {"pcg_per_solve": steps} if how == ", as it stands" else {})
+                for how, make in (
+                    ("", lambda name: _dinm(f"preconditioner={name}")),
+                    (", as it stands", _unscaled),
+                    (", mu 1e-4", _from_small),
+                    (", as it stands, mu 1e-4", _unscaled_from_small),
+                )
                 for label, name, steps in _PRECONDITIONERS
                 for task in (make(name),)
             ),
@@ -214,4 +246,9 @@ OPEN = (
         "A sphere of 50 images that one camera took, without outliers; errors in units in which the radius is 500."
         " Shared is an experiment of this command alone: the solver has intrinsics for each image, or known ones.",
     ),
+)
+# One start each: what they say is a matter of factors, not of digits.
+OPEN = tuple(
+    dataclasses.replace(experiment, cases=tuple(dataclasses.replace(case, seeds=1) for case in experiment.cases))
+    for experiment in _OPEN
 )

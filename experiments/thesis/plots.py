@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.figures import COLOURS, curve, new_figure, spread
+from experiments.thesis import sketches
 from experiments.thesis.experiments import Experiment
 
 Record = Mapping[str, Any]
@@ -177,7 +178,11 @@ def growth(experiment: Experiment, records: Records) -> Figure:
 
 
 def pcg(experiment: Experiment, records: Records) -> Figure:
-    """Draw the PCG steps of every linear solve: labels without a comma on the left, with one on the right."""
+    """Draw the PCG steps of every linear solve: labels without a comma on the left, with one on the right.
+
+    Those from other start values are left out.
+    """
+    records = {label: record for label, record in records.items() if not label.endswith(", mu 1e-4")}
     figure = new_figure(12.0, 5.0)
     axes = figure.subplots(1, 2, sharey=True)
     kinds = list(dict.fromkeys(label.split(",")[0] for label in records))
@@ -276,4 +281,6 @@ PLOTS: dict[str, Plot] = {
     "conditions": conditions,
     "shares": shares,
     "bars": bars,
+    "blocks": sketches.draw_blocks,
+    "cap": sketches.draw_cap,
 }

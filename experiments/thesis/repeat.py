@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ba_node.io.files import write_json
+from experiments.thesis.catalogue import PRINTED
 from experiments.thesis.claims import CLAIMS
 from experiments.thesis.experiments import Experiment
 from experiments.thesis.findings import FINDINGS
@@ -56,7 +57,9 @@ class Repetition:
         for task in runner.missing(self._tasks()):
             runner.record(task)
         return [
-            Section(experiment, {case.label: runner.record(case.task) for case in experiment.cases})
+            Section(
+                experiment, {case.label: [runner.record(task) for task in case.tasks()] for case in experiment.cases}
+            )
             for experiment in self._experiments
             if experiment.cases
         ]
@@ -65,29 +68,38 @@ class Repetition:
         """Write the pages and results.json; return the page that holds all."""
         found = results(sections)
         write_json(self._out / "results.json", found)
-        verdicts = [] if self._quick else verdicts_on((*CLAIMS, *FINDINGS), found)
+        verdicts = [] if self._quick else verdicts_on((*CLAIMS, *FINDINGS), found, PRINTED)
         return write_report(self._out, sections, verdicts)
 
     def _tasks(self) -> list[Task]:
-        return [case.task for experiment in self._experiments for case in experiment.cases]
+        return [task for experiment in self._experiments for case in experiment.cases for task in case.tasks()]
 
     def _runner(self, clock: Clock, progress: Progress | None) -> Runner:
         return Runner(self._library, self._out / "runs", clock, progress)
 
 
 def results(sections: Sequence[Section]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return the metrics of all cases by experiment and label, with the key of the record; five digits are enough."""
+    """Return the metrics of all cases by experiment and label, with the key of the record; seven digits are enough."""
     return {
         section.experiment.name: {
-            label: {"key": section.records[label]["key"], **{name: _short(value) for name, value in metrics.items()}}
+            label: {
+                "key": section.records[label]["key"],
+                "seeds": len(section.runs[label]),
+                **{name: _short(value) for name, value in metrics.items()},
+            }
             for label, metrics in section.metrics.items()
         }
         for section in sections
     }
 
 
-def _short(value: float | str | None) -> float | str | None:
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+def _short(value: Any) -> Any:
+    """Return a value with seven digits, and what holds values with those in it."""
+    if isinstance(value, Mapping):
+        return {name: _short(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_short(item) for item in value]
+    return float(f"{value:.7g}") if isinstance(value, float) else value
 
 
 def _quick(experiment: Experiment) -> Experiment:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import base64
 import html
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 from ba_node.io.files import whole_file
 from experiments.figures import png
 from experiments.thesis.experiments import Experiment
-from experiments.thesis.metrics import metrics_of
+from experiments.thesis.metrics import in_time, metrics_of, over_seeds
 from experiments.thesis.page import grounds, verdict_table
 from experiments.thesis.plots import PLOTS
 from experiments.thesis.tables import Table, table
@@ -42,12 +43,24 @@ class Section:
     """An experiment that has been run."""
 
     experiment: Experiment  # what it is
-    records: Mapping[str, Record]  # of its cases, by label
+    runs: Mapping[str, Sequence[Record]]  # of its cases, by label: one for each start
 
     @property
-    def metrics(self) -> dict[str, dict[str, float | str | None]]:
-        """Return the metrics of each case."""
-        return {label: metrics_of(record) for label, record in self.records.items()}
+    def records(self) -> dict[str, Record]:
+        """Return the record of the first start of each case."""
+        return {label: runs[0] for label, runs in self.runs.items()}
+
+    @property
+    def metrics(self) -> dict[str, dict[str, Any]]:
+        """Return the metrics of each case: medians over its starts, and their spread."""
+        found = {label: [metrics_of(run) for run in runs] for label, runs in self.runs.items()}
+        clock = self.experiment.clock
+        if clock and clock in found:
+            seconds = statistics.median(float(row["seconds"] or 0.0) for row in found[clock])
+            for label, runs in self.runs.items():
+                for run, row in zip(runs, found[label], strict=True):
+                    row.update(in_time(run, seconds) if run.get("trace") else {})
+        return {label: over_seeds(rows) for label, rows in found.items()}
 
     def table(self) -> Table:
         """Return its table."""
@@ -105,8 +118,10 @@ def _grounds(verdicts: Sequence[Verdict]) -> str:
     """Return what the verdicts rest on, to be unfolded."""
     parts = []
     for number, verdict in enumerate(verdicts, start=1):
-        lines = "".join(f"<li>{'yes' if so else '<b>no</b>'}: {html.escape(text)}</li>" for so, text in verdict.found)
-        head = html.escape(f"{number}. {verdict.claim.text}: {verdict.word}")
+        lines = "".join(
+            f"<li>{'yes' if one.good else '<b>no</b>'}: {html.escape(one.words)}</li>" for one in verdict.found
+        )
+        head = html.escape(f"{number}. {verdict.claim.text}: {verdict.said}")
         parts.append(f"<p><b>{head}</b></p><ul>{lines}</ul><p>{html.escape(verdict.claim.remark)}</p>")
     return f"<details><summary>What the verdicts rest on</summary>{''.join(parts)}</details>\n"
 

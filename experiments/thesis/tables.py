@@ -7,11 +7,13 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from experiments.thesis.experiments import Case, Experiment
 from experiments.thesis.metrics import METRICS, shown
 
-Metrics = Mapping[str, float | str | None]
+# Of one case; ``spread`` among them holds the least and the largest over its starts by name.
+Metrics = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,10 @@ def _cell(name: str, case: Case, experiment: Experiment, metrics: Mapping[str, M
     if name not in metrics.get(case.label, {}):
         return ""
     text = shown(name, value)
+    spread = metrics.get(case.label, {}).get("spread")
+    low_high = spread.get(name) if isinstance(spread, Mapping) else None
+    if low_high is not None:
+        text = f"{text} [{shown(name, low_high[0])}, {shown(name, low_high[1])}]"
     if not METRICS[name].is_time or not isinstance(value, float) or len(experiment.cases) == 1:
         return text
     for label in (case.versus, ""):

@@ -23,6 +23,8 @@ _QUICK = 3
 # Options that change no digit of a result.
 _WITHOUT_EFFECT = ("threads",)
 # Names of options when the records in docs/thesis_results.json were made: their keys stay.
+# Options that came later: they are left out of keys while they change nothing.
+_LATER: dict[str, Value] = {"loss_per": "observation"}
 _NAMES_IN_KEYS = {"loss_scale_px": "loss_scale", "kernels": "backend", "inner_iterations": "polish_steps"}
 
 
@@ -36,6 +38,7 @@ class Run:
     iterations: int = 50  # steps that are taken, as the thesis counts; rejected ones come on top, up to as many again
     images: tuple[int, ...] = ()  # of these the reprojections before and after are kept
     kernels: str = ""  # name in variants.VARIANTS, empty for the solver's own
+    seed: int = 0  # of what moves the start by 1e-13 of it; 0: not moved
 
     def options(self) -> SolverOptions:
         """Return the method with its changes."""
@@ -44,11 +47,15 @@ class Run:
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""
         options: dict[str, Value] = {
-            _NAMES_IN_KEYS.get(k, k): v for k, v in describe(self.options()).items() if k not in _WITHOUT_EFFECT
+            _NAMES_IN_KEYS.get(k, k): v
+            for k, v in describe(self.options()).items()
+            if k not in _WITHOUT_EFFECT and _LATER.get(k) != v
         }
         content: dict[str, object] = {"run": options, "inc": INC_STEPS}
         content |= {"iterations": self.iterations, "images": self.images}
-        return content | {"kernels": self.kernels} if self.kernels else content
+        content |= {"kernels": self.kernels} if self.kernels else {}
+        content |= _led_up(self.options())
+        return content | {"seed": self.seed} if self.seed else content
 
     @property
     def weight(self) -> int:
@@ -70,7 +77,11 @@ class Measure:
 
     def content(self) -> dict[str, object]:
         """Return all that was chosen."""
-        return {"measure": self.what, "settings": self.settings}
+        content: dict[str, object] = {"measure": self.what, "settings": self.settings}
+        if self.what == "conditions":
+            method, _, _, *assignments = self.settings
+            content |= _led_up(solver_options(method, assignments))
+        return content
 
     @property
     def weight(self) -> int:
@@ -83,6 +94,11 @@ class Measure:
 
 
 Task = Run | Measure
+
+
+def _led_up(options: SolverOptions) -> dict[str, object]:
+    """Return how a loss with a plateau is led up to: Huber's loss comes first since this number."""
+    return {"annealing": 2} if options.annealing != "none" else {}
 
 
 def key(task: Task, library: Library) -> str:

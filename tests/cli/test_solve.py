@@ -133,7 +133,7 @@ def test_a_loss_with_a_plateau_is_led_up_to_unless_that_is_not_wanted(loss: str)
         ("solver.loss=huber", "without loss_scale_px (gamma)"),
         ("gamma=0", "option loss_scale_px = 0.0: expected a number in [1e-06, 1e+06] px"),
         ("annealing=gnc", "take loss = truncated_quadratic or geman_mcclure, or annealing = none"),
-        ("schur=X", "choose one of points, cameras, none, adaptive"),
+        ("schur=X", "choose one of points, cameras, none, adaptive, adaptive_scaled"),
         ("scaling=X", "choose one of none, identity, diag, inc"),
         ("damping=X", "choose one of none, identity, diag, inc"),
         ("damping_policy=X", "choose one of nielsen, fast"),

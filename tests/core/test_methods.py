@@ -42,6 +42,7 @@ VARIANTS = [
     *(("dinm", (f"preconditioner={name}",)) for name in CHOICES["preconditioner"]),
     ("adinm", ("preconditioner=b_diag",)),
     ("adinm", ("preconditioner=none",)),
+    ("adinm", ("schur=adaptive_scaled",)),
     ("irls_huber", ("loss=cauchy",)),
     ("irls_huber", ("loss=geman_mcclure", "gamma=2")),
     ("irls_tq", ("annealing=none",)),

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -298,3 +298,42 @@ def test_rigs_that_cannot_be_used(changes: dict[str, object], words: str) -> Non
     broken: CameraRig = dataclasses.replace(world.rig(), **changes)  # type: ignore[arg-type]
     with pytest.raises(FrontEndError, match=words):
         FrontEnd(broken)
+
+
+def _noise(one: Images) -> Images:
+    rng = np.random.default_rng(7)
+    return world.without(one, grey=tuple(rng.integers(0, 256, grey.shape, dtype=np.uint8) for grey in one.grey))
+
+
+def _speckled(one: Images) -> Images:
+    rng = np.random.default_rng(8)
+    grey = tuple(np.where(rng.random(grey.shape) < 0.001, 255, 0).astype(np.uint8) for grey in one.grey)
+    return world.without(one, grey=grey)
+
+
+def _wild_depth(one: Images) -> Images:
+    rng = np.random.default_rng(9)
+    values = rng.choice([0.0, np.nan, 1e9, np.inf, 1.5], size=one.grey[0].shape)
+    return world.without(one, grey=one.grey[:1], depth_m=values.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        _noise,
+        _speckled,
+        _wild_depth,
+        lambda one: world.without(one, grey=one.grey[:1]),
+        lambda one: world.without(one, grey=tuple(grey[:, ::-1].copy() for grey in one.grey)),
+        lambda one: world.without(one, mask=np.zeros(one.grey[0].shape, bool)),
+        lambda one: world.without(one, mask=np.ones((3, 3), bool)),
+    ],
+    ids=["noise", "speckled", "wild_depth", "one_image", "mirrored", "all_masked", "mask_of_another_size"],
+)
+def test_nothing_is_raised_and_the_map_stays(stereo: list[Images], spoil: Callable[[Images], Images]) -> None:
+    front_end = FrontEnd(world.rig(), PLAIN)
+    follow(front_end, stereo[:2])
+    follow(front_end, [spoil(stereo[2])])
+    after = front_end.process(stereo[3])
+    assert after.session_id == 1 and after.state is State.TRACKING
+    follow(FrontEnd(world.rig(), PLAIN), [spoil(one) for one in stereo[:2]])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ba_node.front_end import stereo
-from ba_node.front_end.tracking import soften
+from ba_node.front_end.frame import soften
 
 SHAPE, FINE = (200, 320), 4
 

@@ -19,6 +19,9 @@ from ba_node.io.rig_file import rig_yaml
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from tests.front_end import world
+from tests.messages.adapters import layouts
+
+IMAGE = "sensor_msgs/msg/Image"
 
 
 def write_pictures(folder: Path, poses: list[Transform]) -> None:
@@ -144,3 +147,42 @@ def test_real_car(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     error, scale = segments(tmp_path / "trajectory.tum", tmp_path / "ground_truth.tum")
     assert error < 0.008, f"{100 * error:.2f} % of segments of 10 to 40 m"
     assert abs(scale - 1.0) < 0.006, f"scale {scale:.4f}"
+
+
+def recording(path: Path, stamps: list[tuple[int, int]], poses: list[Transform]) -> Path:
+    """Write colour images of a stereo rig, with camera_info that tells the baseline in p; stamps (ns), poses."""
+    rig, sent = world.rig(), []
+    fx, fy, cx, cy = rig.intrinsics[0]
+    for index, name in enumerate(("left", "right")):
+        info = layouts.make(
+            layouts.CAMERA_INFO, header=layouts.header(1, name), width=world.SIZE[0], height=world.SIZE[1],
+            distortion_model="plumb_bob", d=np.zeros(5), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1]),
+            r=np.eye(3).reshape(-1),
+            p=np.array([fx, 0, cx, -fx * world.BASELINE * index, 0, fy, cy, 0, 0, 0, 1, 0]),
+        )  # fmt: skip
+        sent.append(layouts.Sent(f"/{name}/camera_info", layouts.CAMERA_INFO, info, 1))
+    for stamp_ns, i in stamps:
+        for index, name in enumerate(("left", "right")):
+            grey = world.render(rig, index, poses[i]).grey
+            pixels = np.repeat(grey[..., None], 3, axis=2)
+            image = layouts.make(
+                IMAGE, header=layouts.header(stamp_ns, name), width=world.SIZE[0], height=world.SIZE[1],
+                encoding="rgb8", step=3 * world.SIZE[0], data=pixels.reshape(-1),
+            )  # fmt: skip
+            sent.append(layouts.Sent(f"/{name}/image_raw", IMAGE, image, stamp_ns))
+    return layouts.write(path, sent)
+
+
+def test_recording_with_a_long_pause(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Dropped frames and 30 s of nothing: what was seen before is found again, and it stays one map."""
+    numbers = [0, 1, 2, 4, 5, 6, 7, 8]
+    stamps = [(10**9 + i * 10**8 + (30 * 10**9 if i > 5 else 0), i) for i in numbers]
+    bag = recording(tmp_path / "bag", stamps, world.drive(9))
+    out = tmp_path / "tracks.mcap"
+    assert main(["track", str(bag), str(out), "--track", "max_features=300"]) == 0
+    text, errors = capsys.readouterr()
+    assert "8, stereo" in text and "in 1 session" in text
+    assert errors == ""
+    with BagReader(out) as reader:
+        rig = next(one for _, _, one in reader.measurements() if isinstance(one, CameraRig))
+    assert rig.position[1] == pytest.approx([world.BASELINE, 0.0, 0.0])

@@ -133,6 +133,7 @@ def test_wheels_and_gnss_bound_the_drift(street: SyntheticData, outliers: float)
     assert backend.report.adjustments >= 1
 
 
+@pytest.mark.slow
 def test_priors_that_contradict_each_other_bend_nothing(street: SyntheticData) -> None:
     """Every second pose prior has a rotation and a place of its own, in the map's frame: the majority stands."""
     rotation, rng = geometry.matrix_from_quaternion(street.truth.orientation), np.random.default_rng(5)
@@ -148,6 +149,7 @@ def test_priors_that_contradict_each_other_bend_nothing(street: SyntheticData) -
     assert float(np.sqrt(np.mean(off**2))) < 0.15
 
 
+@pytest.mark.slow
 def test_known_points_hold_the_map(street: SyntheticData) -> None:
     """Surveyed points along the street bound the drift as pose priors do."""
     known = np.arange(0, len(street.track_id), 25)
@@ -281,3 +283,58 @@ def test_a_saved_map_keeps_its_place_in_the_world(street: SyntheticData) -> None
         broken = MapContent(content.arrays, content.facts | {"world": content.facts["world"] | {name: value}})
         with pytest.raises(MapError, match="world"):
             unpack(broken, Config().scene)
+
+
+def test_gravity_holds_the_tilt(street: SyntheticData) -> None:
+    """A front-end that tells which way is down keeps the map level, however few tracks there are."""
+    short = first(street, 60)
+    rotation = geometry.matrix_from_quaternion(street.truth.orientation)
+
+    def of(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        down = rotation[k].T @ np.array([0.0, 0.0, -9.81])
+        yield GravityDirection(0, keyframe.keyframe_id, down, 0.002)
+
+    tilt = []
+    for more in ((lambda *_: ()), of):
+        _, estimate = replayed(short, more)
+        found = geometry.matrix_from_quaternion(estimate.trajectory.orientation)
+        tilt.append(float(np.degrees(np.arccos(np.clip((found[:, 2] * rotation[:60, 2]).sum(axis=1), -1, 1)).max())))
+    assert tilt[1] < 0.15
+    assert tilt[1] < 0.3 * tilt[0]
+
+
+def test_priors_without_keyframes_or_a_path_to_align_by_are_said(street: SyntheticData) -> None:
+    backend = Backend(Config())
+    fix = GlobalFix(0, "gps", np.array([48.0, 11.0, 500.0]), np.eye(3).ravel(), is_fix=True)
+    assert list(backend.replay([fix, fix])) == []
+    backend, _ = replayed(first(street, 3), fixes(street, 0.0))
+    (text,) = backend.report.warnings
+    assert text.startswith("3 priors in frame 'enu' were not used: the path is too short")
+
+
+@pytest.mark.parametrize(("off_m", "closes"), [(0.0, True), (300.0, False)])
+def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None:
+    """A relative pose of the first and last keyframe; one that is 300 m off leaves the map as it is, and is said."""
+    data = first(round_trip(0.5), 60)
+    rotation = geometry.matrix_from_quaternion(data.truth.orientation)
+    back = geometry.inverse(rotation[0], data.truth.position[0])
+    turn, move = geometry.compose(*back, rotation[59], data.truth.position[59])
+    loop = RelativePose(
+        0,
+        int(data.truth.keyframe_id[0]),
+        int(data.truth.keyframe_id[59]),
+        True,
+        move + np.array([off_m, 0.0, 0.0]),
+        geometry.quaternion_from_matrix(turn),
+        np.diag([1e-4] * 3 + [1e-6] * 3).ravel(),
+    )
+    _, plain = replayed(data)
+    backend, estimate = replayed(data, lambda k, _: [loop] if k == 30 else [])
+    ends = [float(np.linalg.norm(e.trajectory.position[-1] - data.truth.position[59])) for e in (plain, estimate)]
+    assert ends[0] > 0.5
+    if closes:
+        assert ends[1] < 0.2 * ends[0]
+        assert not any("the map stays as it is" in text for text in backend.report.warnings)
+    else:
+        assert ends[1] < 1.1 * ends[0]
+        assert any("the map stays as it is" in text for text in backend.report.warnings)

@@ -19,10 +19,9 @@ from experiments.thesis.tasks import Run
 
 TABLES = [*(f"3.{i}" for i in range(1, 12)), "4.1", "4.2", *(f"5.{i}" for i in range(1, 5))]
 FIGURES = [
-    "3.1",
-    *(f"3.{i}" for i in range(4, 24)),
+    *(f"3.{i}" for i in range(1, 24)),
     *(f"4.{i}" for i in range(1, 7)),
-    *(f"5.{i}" for i in range(2, 20)),
+    *(f"5.{i}" for i in range(1, 20)),
 ]
 IDS = [experiment.name for experiment in catalogue.EXPERIMENTS]
 

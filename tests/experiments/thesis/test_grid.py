@@ -3,7 +3,7 @@
 """Every named method on the five spheres of the thesis ends with a finite result and a reason, and never rises.
 
 Ladybug-49 and dubrovnik-3-7 are in tests/core/test_methods.py. One step of lma_cd on the largest takes minutes in
-numpy: what it came to is recorded for Table 5.4.
+numpy: what it comes to with the C++ kernels is recorded for Table 5.4.
 """
 
 from __future__ import annotations
@@ -56,5 +56,5 @@ def test_method_on_sphere(size: str, method: str) -> None:
 
 
 def test_lma_cd_on_the_largest_is_recorded() -> None:
-    recorded = json.loads(RECORDED.read_text())["5.4"]["LMA-CD"]
-    assert recorded["steps"] >= 1.0 and recorded["objective"] < 0.5 * 1.352e8
+    recorded = json.loads(RECORDED.read_text())["5.4"]["LMA-CD, C++"]
+    assert recorded["steps"] >= 1.0 and recorded["objective"] < 0.5 * 1.422e8

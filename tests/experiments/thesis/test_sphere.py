@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ba_node.config import ConfigError
+from ba_node.config import ConfigError, SolverOptions
 from ba_node.core.geometry import so3_exp
-from ba_node.core.objective import reprojection_errors
+from ba_node.core.objective import Objective, reprojection_errors
 from ba_node.core.result import Status
 from ba_node.core.solver import solve
 from ba_node.io.bal import read_bal, to_problem
 from ba_node.offline.solver_settings import solver_options
+from experiments.thesis.final_state import truth_errors
 from experiments.thesis.sphere import HALF_IMAGE_PX, SphereData, centres, generate_sphere
 from experiments.thesis.sphere_file import start_of, truth_of, write_sphere
-from experiments.thesis.sphere_options import PRESETS, SphereOptions, preset
+from experiments.thesis.sphere_options import PRESETS, PRINTED_OBSERVATIONS, SphereOptions, preset
 
 SMALL = ("10-253", "10-289", "50-1000")
 
@@ -33,11 +34,9 @@ def sized(request: pytest.FixtureRequest) -> tuple[SphereOptions, SphereData]:
 class TestShape:
     def test_counts_are_those_asked_for(self, sized: tuple[SphereOptions, SphereData]) -> None:
         options, data = sized
-        assert (len(data.cameras), len(data.points), len(data.uv)) == (
-            options.images,
-            options.points,
-            options.observations,
-        )
+        assert (len(data.cameras), len(data.points)) == (options.images, options.points)
+        printed = PRINTED_OBSERVATIONS[f"{options.images}-{options.points}"]
+        assert len(data.uv) == pytest.approx(printed, rel=0.01), "all that is visible, as many as the thesis has"
         assert np.bincount(data.point_index).min() >= 2
         assert np.bincount(data.camera_index).min() >= options.min_image_points
         pairs = np.unique(data.point_index * options.images + data.camera_index)
@@ -68,11 +67,22 @@ class TestShape:
         inlier = error[~data.outlier]
         sigma = float(np.sqrt(np.mean(inlier**2)))
         assert sigma == pytest.approx(options.noise_px, rel=0.1)
-        assert int(data.outlier.sum()) == round(options.outlier_share * options.observations)
+        assert int(data.outlier.sum()) == round(options.outlier_share * len(data.uv))
         if data.outlier.any():
             assert np.linalg.norm(error[data.outlier], axis=1).min() > 8.0
         ideal = data.uv[~data.outlier] + inlier * [1.0, -1.0]
         assert (np.abs(ideal) <= HALF_IMAGE_PX + 1e-6).all()
+
+    def test_the_start_is_as_far_off_as_that_of_the_thesis(self, sized: tuple[SphereOptions, SphereData]) -> None:
+        options, data = sized
+        start, truth = to_problem(start_of(data)), to_problem(truth_of(data)).start
+        errors = truth_errors(start.start, truth)
+        cameras, points = {253: (None, None), 289: (75.57, 14.01), 1000: (44.14, 11.78)}[options.points]
+        if cameras is None:
+            assert Objective(start, SolverOptions()).value(start.start) == pytest.approx(2.44e5, rel=0.02)
+        else:
+            assert errors["rmse_cameras"] == pytest.approx(cameras, rel=0.01)
+            assert errors["rmse_points"] == pytest.approx(points, rel=0.01)
 
     def test_neighbours_overlap_more_than_others(self, sized: tuple[SphereOptions, SphereData]) -> None:
         centre = centres(sized[1].cameras)
