@@ -43,7 +43,13 @@ ROS_ONLY = (
 BEHIND_THE_FACE = ("scene", "window", "check")
 NUMERICS_FOR_ALL = ("geometry", "cameras", "problem")
 # `ba solve` and what belongs to it work on a file, without a back-end.
-WITHOUT_BACKEND = ("offline/solve_bal.py", "offline/solve_model.py", "offline/solver_settings.py", "cli/steps.py")
+WITHOUT_BACKEND = (
+    "offline/solve_bal.py",
+    "offline/solve_model.py",
+    "offline/solve_ranks.py",
+    "offline/solver_settings.py",
+    "cli/steps.py",
+)
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 

@@ -57,7 +57,7 @@ def test_nothing_else_repeats_a_default_of_the_solver() -> None:
     options = {option.name: option.default for option in declared(SolverOptions)}
     # A factor has a loss of its own; for PCG itself 0 is the sign that q_eps is not to be used.
     others = [(file, name) for file, name, default in defaults() if name in options and default == options[name]]
-    factors = {("core/factors.py", "loss"), ("core/priors.py", "loss")}
+    factors = {(f"core/{name}.py", "loss") for name in ("factors", "marginal", "priors")}
     assert set(others) == {*factors, ("core/linear.py", "q_eps")}
 
 
