@@ -13,7 +13,7 @@ CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 STYLED := $(CHECKED) examples docs/conf.py
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
 
-.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness regress consistency docs lint format clean
+.PHONY: help setup demo test test-all fuzz soak sanitize cross wheel bench thesis robustness consistency regress docs lint format clean
 
 help: ## list the commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12

@@ -155,7 +155,7 @@ class Checkpoint:
             RanksError: there is none, it is damaged, or it is of another problem.
         """
         try:
-            with np.load(self.path, allow_pickle=False) as found:
+            with self.path.open("rb") as file, np.load(file, allow_pickle=False) as found:
                 of = str(found["digest"])
                 state = State(*(found[field.name] for field in dataclasses.fields(State)))
                 damping, radius = float(found["damping"]), float(found["radius"])

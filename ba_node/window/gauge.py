@@ -125,8 +125,8 @@ def _shows_scale(problem: Problem) -> BoolArray:
     second = 1 + np.flatnonzero((obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1]))
     if len(second):
         centres = _camera_centres(problem)
-        apart = np.linalg.norm(centres[:, None] - centres, axis=2) > _MIN_BASELINE_M
-        scale[second] |= apart[obs.camera[second], obs.camera[second - 1]]
+        baseline = centres[obs.camera[second]] - centres[obs.camera[second - 1]]
+        scale[second] |= np.linalg.norm(baseline, axis=1) > _MIN_BASELINE_M
     return scale
 
 

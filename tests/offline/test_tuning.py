@@ -35,7 +35,8 @@ BAD: dict[str, object] = {
 
 
 def measured(bag: Path, objective: str, values: Mapping[str, object]) -> Measured:
-    return measure(Question((str(bag),), Config().with_values(values), TopicChoice(), objective))  # type: ignore[arg-type]
+    config = Config().with_values(values)  # type: ignore[arg-type]
+    return measure(Question((str(bag),), config, TopicChoice(), objective))
 
 
 def settings(values: Mapping[str, object]) -> list[str]:
