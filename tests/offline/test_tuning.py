@@ -35,8 +35,8 @@ BAD: dict[str, object] = {
 
 
 def measured(bag: Path, objective: str, values: Mapping[str, object]) -> Measured:
-    config = Config().with_values(values)  # type: ignore[arg-type]
-    return measure(Question((str(bag),), config, TopicChoice(), objective))
+    config = Config().with_values(values)
+    return measure(Question((str(bag),), config, TopicChoice(), objective))  # type: ignore[arg-type]
 
 
 def settings(values: Mapping[str, object]) -> list[str]:
