@@ -142,6 +142,8 @@ def _depth_errors(problem: Problem, state: State) -> FloatArray:
 
 def _unexplained(problem: Problem, found: Explained, sigma_px: float, config: Config) -> str:
     """Return in words whether tracks tell no distances, or are explained worse than by the front-end's poses."""
+    if not config.guard.held_out_tracks:
+        return ""
     noise = sigma_px / float(np.mean(problem.cameras.params[0, :2]))
     if not len(problem.observations.depth_m) and found.parallax_rad < MIN_PARALLAX * noise:
         return (

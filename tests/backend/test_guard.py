@@ -257,6 +257,16 @@ def test_nothing_is_held_of_sound_data(kind: str, drift: dict[str, Any]) -> None
     assert report.held_keyframes == 0
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_solution_need_not_be_tried_on_tracks(kind: str) -> None:
+    backend = Backend(ALONE.with_values({"guard.held_out_tracks": 0}))
+    stream, truth = recording(**USUAL, **KINDS[kind], keyframes=15)
+    estimates = replay(backend, stream)
+    assert not [one.report.reason for one in estimates if one.report.status.name == "HELD"]
+    before, after = errors(stream, truth, estimates[-1])
+    assert after < before
+
+
 def test_solves_are_taken_again_when_data_are_good_again() -> None:
     """Depths are wrong for twenty keyframes in the middle of a long way."""
     stream, truth = recording(**USUAL, **KINDS["depth"], keyframes=120, length_m=100.0, landmarks=8000)
