@@ -277,22 +277,34 @@ def test_a_node_goes_by_that_time(bag: Path, scene: SyntheticData, make_peer: Ma
 @pytest.mark.dds
 def test_a_loop_goes_on_until_it_is_interrupted(bag: Path, scene: SyntheticData, make_peer: MakePeer) -> None:
     peer = make_peer()
+
+    def players() -> set[tuple[int, ...]]:
+        infos = peer.node.get_publishers_info_by_topic("/keyframes")
+        return {tuple(info.endpoint_gid) for info in infos if info.node_name == "ba_play"}
+
     received = _collect(peer)
     words = ["play", str(bag), "--rate", "0", "--loop"]
     command = ["env", "--default-signal=INT", sys.executable, "-m", "ba_node.cli.main", *words]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        wanted = 3 * len(scene.keyframes)
-        peer.until(lambda: len(received["keyframes"]) > wanted, "the fourth round")
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=30)
-    assert (process.returncode, error) == (130, "ba: interrupted\n")
 
-    def players() -> list[str]:
-        infos = peer.node.get_publishers_info_by_topic("/keyframes")
-        return [info.node_name for info in infos if info.node_name == "ba_play"]
+    def leaves_with_a_word() -> bool:
+        """Play until the fourth round, interrupt, and tell whether the publishers are gone before they expire."""
+        others, begun = players(), len(received["keyframes"])
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            wanted = begun + 3 * len(scene.keyframes)
+            peer.until(lambda: len(received["keyframes"]) > wanted, "the fourth round")
+            peer.until(lambda: players() - others, "the publishers to be known")
+            own = players() - others
+            process.send_signal(signal.SIGINT)
+            _, error = process.communicate(timeout=30)
+        assert (process.returncode, error) == (130, "ba: interrupted\n")
+        # Those that end without a word are known for 20 s.
+        end = time.monotonic() + 15.0
+        while own & players() and time.monotonic() < end:
+            time.sleep(0.05)
+        return not own & players()
 
-    # Those that end without a word are known for 20 s.
-    peer.until(lambda: not players(), "the publishers to be gone", 15.0)
+    # The last datagram of a process may get lost, but not every time.
+    assert any(leaves_with_a_word() for _ in range(3))
 
 
 def test_a_start_after_the_end_is_refused(bag: Path) -> None:
