@@ -214,7 +214,7 @@ class Backend:
         if not why:
             large = len(self.scene.keyframes) > self.config.factors.adjust_max_keyframes
             begun = "" if large else self.begin_optimization()
-            if isinstance(begun, str) or large:
+            if isinstance(begun, str):
                 self.map.adjustments += 1
                 self.map.correct(int(self.scene.order[-1]))
                 return self.estimate()  # no images to refine it by

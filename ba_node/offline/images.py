@@ -134,8 +134,10 @@ def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:
             return {name: topics[0] for name, topics in zip(names, named, strict=True)}
     if not given and len(there) in (1, 2):
         return {MODES["mono"][0]: there[0]} if len(there) == 1 else _two(reader, there)
+    if not there:
+        raise BagError(f"{reader.path}: no images in it: a recording of keyframes and tracks is for ba replay")
     raise BagError(
-        f"{reader.path}: cannot tell which images are meant of: {', '.join(there) or 'none'}: say --topic left=TOPIC"
+        f"{reader.path}: cannot tell which images are meant of: {', '.join(there)}: say --topic left=TOPIC"
         " --topic right=TOPIC, rgb and depth, or image"
     )
 

@@ -154,7 +154,7 @@ def test_what_is_missing_is_counted_with_figures(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("messages", "words"),
     [
-        ([info("/a/camera_info", "a")], "cannot tell which images are meant of: none"),
+        ([info("/a/camera_info", "a")], "no images in it: a recording of keyframes and tracks is for ba replay"),
         ([image(f"/c{i}/image", 1, i) for i in range(3)], "say --topic left=TOPIC"),
         ([*stereo("/a/left", "/a/right"), *stereo("/b/left", "/b/right")], "cannot tell which images are meant"),
         (stereo()[2:], "no message on /left/camera_info"),
