@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -124,3 +125,16 @@ def test_import_brings_nothing_from_above(module: str, absent: tuple[str, ...]) 
     loaded = set(run.stdout.split())
     assert "ba_node" in loaded
     assert not loaded & set(absent), f"{module} brings {sorted(loaded & set(absent))}"
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    """Not for typing either."""
+    names = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in MODULES}
+
+    def files(path: Path) -> set[str]:
+        """Return the files that one imports, or of which it imports a name."""
+        return {part for name in imports(path) for part in (name, name.rpartition(".")[0]) if part in names}
+
+    arrows = {name: files(path) for name, path in names.items()}
+    assert sum(map(len, arrows.values())) > len(names)
+    list(graphlib.TopologicalSorter(arrows).static_order())  # raises CycleError with the files

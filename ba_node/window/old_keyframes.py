@@ -5,9 +5,9 @@
 - fix: those that see the window's points take part with fixed poses, as if they were exact.
 - drop: they take no part. What they told is forgotten, and the oldest keyframe of the window is held.
 - marginalise: when a keyframe leaves, what it and the tracks that it saw and that have ended tell of the keyframes
-  that stay becomes a prior on these (``core/marginal.py``). These observations take no part any more, nor do those of
-  tracks that go on by keyframes that have just left. Keyframes that left more than a window ago, and whose tracks are
-  still seen or seen again, are fixed as above.
+  that stay becomes a prior on these (``core/marginalisation.py``). These observations take no part any more, nor do
+  those of tracks that go on by keyframes that have just left. Keyframes that left more than a window ago, and whose
+  tracks are still seen or seen again, are fixed as above.
 
 The prior is given up, and the next windows begin as with `fix`, where anything but windows has moved its keyframes: a
 solve of everything, a loop that was closed, solutions that were taken back.
@@ -22,8 +22,9 @@ import numpy as np
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config, SolverOptions
-from ba_node.core import marginal, methods
+from ba_node.core import methods
 from ba_node.core.marginal import MarginalPrior
+from ba_node.core.marginalisation import marginalise
 from ba_node.core.problem import Problem, State
 from ba_node.core.rows import DEPTHS, MARGINAL, Rows, rows_of
 from ba_node.scene.scene import Scene
@@ -153,7 +154,7 @@ def _without(scene: Scene, known: Memory, gone: BoolArray, options: SolverOption
         rows = rows_of(problem, solved.state, options)
     absorbed = rows.take(_absorbed(problem, rows, gone, points))
     stays = ~gone[free]
-    prior = marginal.marginalise(absorbed, solved.state, free, stays)
+    prior = marginalise(absorbed, solved.state, free, stays)
     of = solved.keyframe_id[free][stays]
     newest = int(scene.keyframes.stamp_ns[scene.find_keyframes(solved.keyframe_id[-1:])[0]])
     tracks = np.concatenate([known.tracks, solved.track_id[points]])

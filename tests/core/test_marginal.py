@@ -12,6 +12,7 @@ import pytest
 
 from ba_node.config import SolverOptions
 from ba_node.core import covariance, marginal, methods, parameterisation, solver
+from ba_node.core.marginalisation import marginalise
 from ba_node.core.problem import Problem, State
 from ba_node.core.rows import rows_of
 
@@ -28,7 +29,7 @@ def prior_of(
 ) -> marginal.MarginalPrior:
     """Return the prior of all rows of a problem on keyframes that stay, of those that are free."""
     free = np.flatnonzero(~problem.fixed)
-    found = marginal.marginalise(rows_of(problem, state, options), state, free, stays[free])
+    found = marginalise(rows_of(problem, state, options), state, free, stays[free])
     assert found is not None
     return found
 
