@@ -230,12 +230,7 @@ class Constraints:
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
         """Drop what hangs on keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
         gone = set(keyframes.tolist())
-        self.relative = {key: value for key, value in self.relative.items() if gone.isdisjoint(key)}
-        self.unchecked = [key for key in self.unchecked if key in self.relative]
-        self.relative_of = {}
-        for key in self.relative:
-            for one in key:
-                self.relative_of.setdefault(one, []).append(key)
+        self._drop([key for key in self.relative if not gone.isdisjoint(key)])
         self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}
         self.steps = {key: value for key, value in self.steps.items() if key not in gone}
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
@@ -245,13 +240,23 @@ class Constraints:
         """Give up what names keyframes that never came; count what lies outside the time of all keyframes."""
         log.notice("unpaired", sum(not span_ns[0] <= one.stamp_ns <= span_ns[1] for one in self.absolute))
         known = set(keyframes.tolist())
-        for key in [key for key in self.relative if not known.issuperset(key)]:
+        never = [key for key in self.relative if not known.issuperset(key)]
+        for key in never:
             missing = next(one for one in key if one not in known)
             log.reject("unknown_keyframe", f"relative pose of keyframe {key[1]} in {key[0]}: {missing} never came")
-            del self.relative[key]
+        self._drop(never)
         for one in [one for one in self.gravity if one not in known]:
             log.reject("unknown_keyframe", f"gravity at keyframe {one}, which never came")
             del self.gravity[one]
+
+    def _drop(self, keys: list[tuple[int, int]]) -> None:
+        """Forget relative poses."""
+        for key in keys:
+            del self.relative[key]
+            for one in key:
+                self.relative_of[one].remove(key)
+        self.relative_of = {one: left for one, left in self.relative_of.items() if left}
+        self.unchecked = [key for key in self.unchecked if key in self.relative]
 
     def _insert(self, one: Absolute) -> None:
         bisect.insort(self.absolute, one, key=lambda known: known.stamp_ns)
