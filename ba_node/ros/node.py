@@ -96,6 +96,10 @@ class BaNode(ManagedNode):
         """Return how many keyframes have been refined so far."""
         return self._refined_before + (self._host.worker.refined if self._host else 0)
 
+    def summary(self) -> str:
+        """Return in words what the node has done."""
+        return f"{self.keyframes_refined} keyframes refined"
+
     def start(self) -> None:
         """Configure and activate, if ``node.autostart`` says so; a failure is logged and leaves the node running."""
         if self._settings.config.node.autostart and self.request("configure"):
