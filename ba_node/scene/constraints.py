@@ -71,6 +71,7 @@ class Constraints:
         renamed: tracks that were joined, by the id that they had: the one that they go on under.
         steps: covariance (6, 6) of the step from the keyframe before, by id of the keyframe.
         unchecked: relative poses that the map was not compared with yet; refused: those that it cannot meet.
+        steps_precise: the front-end's steps turned out to be more precise than stated; the map is still to follow.
         adjusted_at: how many keyframes there were when the map was last bent.
         map_from_world: rotation (3, 3) and translation (3,) m; None until enough is known.
         world_frame: name of the frame that all that is absolute is in; empty before the first.
@@ -88,6 +89,7 @@ class Constraints:
         self.steps: dict[int, FloatArray] = {}
         self.unchecked: list[tuple[int, int]] = []
         self.refused: set[tuple[int, int]] = set()
+        self.steps_precise = False
         self.adjusted_at = 0
         self.map_from_world: tuple[FloatArray, FloatArray] | None = None
         self.world_frame = ""
