@@ -22,7 +22,7 @@ from ba_node.config import ConfigError
 from ba_node.ros import arguments
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
-from ba_node.ros.rclpy_compat.executor import NodeExecutor
+from ba_node.ros.rclpy_compat.executor import WAIT_S, make_executor
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS
 
 USAGE_ERROR = 2
@@ -62,7 +62,7 @@ def _run(given: list[str], ended: Callable[[], bool]) -> int:
         node = BaNode()
     except (ConfigError, InvalidNodeNameException, InvalidNamespaceException) as error:
         return _refuse(str(error))
-    executor = NodeExecutor()
+    executor = make_executor()
     executor.add_node(node)
     for text in arguments.idle_files(given, node.get_fully_qualified_name()):
         log(node, Severity.WARNING, text)
@@ -81,7 +81,7 @@ def _run(given: list[str], ended: Callable[[], bool]) -> int:
     return 0
 
 
-def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
+def spin(executor: Any, node: Any, ended: Callable[[], bool]) -> None:
     """Run callbacks until a signal. One that raises, as rclpy's own do on a senseless request, is survived."""
     faults = 0
     while rclpy.ok() and not ended():
@@ -93,10 +93,10 @@ def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
             raise RuntimeError(f"{faults} internal errors one after the other: giving up")
 
 
-def _spin_once(executor: NodeExecutor, node: Any) -> bool:
+def _spin_once(executor: Any, node: Any) -> bool:
     """Run one callback, after a wait that a signal may last out; return False if it raised."""
     try:
-        executor.spin_once()
+        executor.spin_once(WAIT_S)
     except Exception as error:
         # Whoever embeds the node may end the context at any moment, also between two messages of a callback.
         if isinstance(error, ExternalShutdownException) or not rclpy.ok():

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
@@ -16,7 +17,6 @@ from ba_node.io.rig_file import RigError
 from ba_node.ros import arguments
 from ba_node.ros.front_end.node import NODE_NAME, FrontEndNode
 from ba_node.ros.main import USAGE_ERROR, signals, spin
-from ba_node.ros.rclpy_compat.executor import NodeExecutor
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS
 
 
@@ -32,7 +32,8 @@ def main(args: Sequence[str] | None = None) -> int:
         except (*ARGUMENT_ERRORS, ConfigError, RigError, FrontEndError) as error:
             return _refuse(str(error))
         try:
-            executor = NodeExecutor()
+            # That of events has no way for callbacks that ask for more than the message.
+            executor = SingleThreadedExecutor()
             executor.add_node(node)
             node.start()
             spin(executor, node, ended)
