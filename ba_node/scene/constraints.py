@@ -132,8 +132,9 @@ class Constraints:
 
     def add_merge(self, merge: TrackMerge, log: RejectionLog) -> None:
         """Take in pairs of tracks that are the same point."""
-        if merge.malformed:
-            log.reject("malformed", f"merge of tracks: {merge.malformed}")
+        malformed = merge.malformed or _lengths(merge.track_id, merge.same_as)
+        if malformed:
+            log.reject("malformed", f"merge of tracks: {malformed}")
             return
         for pair in zip(merge.track_id.tolist(), merge.same_as.tolist(), strict=True):
             one, other = (self.name_of(track) for track in pair)
@@ -172,8 +173,9 @@ class Constraints:
 
     def add_landmarks(self, priors: LandmarkPriors, log: RejectionLog) -> None:
         """Take in places of points; the last of a track counts."""
-        if priors.malformed:
-            log.reject("malformed", f"landmark priors: {priors.malformed}")
+        malformed = priors.malformed or _lengths(priors.track_id, priors.position, priors.covariance)
+        if malformed:
+            log.reject("malformed", f"landmark priors: {malformed}")
             return
         if not self._same_world("landmark priors", priors.frame_id, log):
             return
@@ -282,6 +284,9 @@ def _pose(name: str, position: FloatArray, orientation: FloatArray, log: Rejecti
 
 def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
     """Return a covariance (size, size), or None (counted) if it is not positive definite."""
+    if np.size(values) != size * size:
+        log.reject("bad_covariance", f"{name}: {np.size(values)} numbers, expected {size * size}")
+        return None
     matrix = np.asarray(values, float).reshape(size, size)
     if np.isfinite(matrix).all() and np.abs(matrix - matrix.T).max() <= _SYMMETRIC * np.abs(matrix).max():
         lowest = float(np.linalg.eigvalsh(matrix).min())
@@ -291,6 +296,12 @@ def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> 
         return None
     log.reject("bad_covariance", f"{name}: {matrix.tolist()}, expected finite and symmetric")
     return None
+
+
+def _lengths(*arrays: FloatArray | IdArray) -> str:
+    """Return in words that arrays are not of one length, empty if they are."""
+    lengths = [len(one) for one in arrays]
+    return "" if len(set(lengths)) == 1 else f"arrays of {', '.join(map(str, lengths))} rows, expected as many in each"
 
 
 def _finite(position: FloatArray) -> bool:
