@@ -24,7 +24,7 @@ from ba_node.io.model import from_bal
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.topics import CAMERAS, INPUT_TYPES
-from ba_node.offline.model_timeline import timeline
+from ba_node.offline.convert import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.ros import qos
