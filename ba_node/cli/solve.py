@@ -153,9 +153,9 @@ def _start_ranks(args: argparse.Namespace) -> int:
 
 def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | None:
     """Solve as one of several ranks; whatever ends one of them ends all."""
-    from ba_node.offline.solve_ranks import Alone, Checkpoint, solve_on_ranks, started_as_ranks, world  # noqa: PLC0415
+    from ba_node.offline.solve_ranks import Checkpoint, solve_on_ranks, world  # noqa: PLC0415
 
-    communicator = world() if started_as_ranks() else Alone()
+    communicator = world()
     checkpoint = Checkpoint(args.checkpoint, max(1, args.every), args.resume) if args.checkpoint else None
     try:
         solution = solve_on_ranks(
