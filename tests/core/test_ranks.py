@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import methods, native_kernels
+from ba_node.core.communicator import Alone
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.ranks import RankKernels, deal
 from ba_node.core.result import Result
@@ -30,7 +31,7 @@ def random_problem(seed: int) -> Problem:
     return make(Spec(seed=seed, keyframes=6, points=40, noise_px=0.5))[0]
 
 
-class Threads:
+class Threads(Alone):
     """Ranks that are threads of this process."""
 
     def __init__(self, rank: int, size: int, board: list[Any], barrier: threading.Barrier) -> None:
