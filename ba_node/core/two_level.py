@@ -115,9 +115,13 @@ class TwoLevel:
 
 
 class _Inside:
-    """The inverses of the blocks of S inside clusters, in single precision: M need not be exact."""
+    """The inverses of the blocks of S inside clusters, in single precision: M need not be exact.
+
+    Every rank has those of a share of the clusters.
+    """
 
     def __init__(self, s: scipy.sparse.bsr_matrix, label: IntArray, communicator: Communicator) -> None:
+        self._communicator = communicator
         n, (d, _) = len(label), s.blocksize
         row = np.repeat(np.arange(n), np.diff(s.indptr))
         kept = np.flatnonzero(label[row] == label[s.indices])
@@ -132,14 +136,18 @@ class _Inside:
         most = int(size.max())
         self._keyframe = np.full((len(size), most), n)
         self._keyframe[label, place] = np.arange(n)
-        self._label, self._place, self._d = label, place, d
-        matrices = np.zeros((len(size), most, d, most, d))
-        matrices[label[row], place[row], :, place[k.indices], :] = k.data
-        matrices = matrices.reshape(len(size), most * d, most * d)
+        share = slice(*(len(size) * i // communicator.size for i in (communicator.rank, communicator.rank + 1)))
+        self._keyframe, self._d = self._keyframe[share], d
+        own = np.flatnonzero((label[row] >= share.start) & (label[row] < share.stop))
+        row, column = row[own], k.indices[own]
+        matrices = np.zeros((share.stop - share.start, most, d, most, d))
+        matrices[label[row] - share.start, place[row], :, place[column], :] = k.data[own]
+        matrices = matrices.reshape(-1, most * d, most * d)
         diagonal = np.arange(most * d)
-        own = matrices[:, diagonal, diagonal]
-        matrices[:, diagonal, diagonal] = np.where(own > 0.0, own, 1.0)
-        unit = 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0))
+        squares = matrices[:, diagonal, diagonal]
+        squares = np.where(squares > 0.0, squares, 1.0)
+        matrices[:, diagonal, diagonal] = squares
+        unit = 1.0 / np.sqrt(squares)
         inverses = blocks.positive_inverses(matrices * unit[:, :, None] * unit[:, None, :])
         self._inverses = (0.5 * (inverses + np.swapaxes(inverses, 1, 2))).astype(np.float32)
         self._unit = unit[:, :, None]
@@ -149,7 +157,9 @@ class _Inside:
         padded = np.concatenate([r.reshape(-1, self._d), np.zeros((1, self._d))])
         right = self._unit * padded[self._keyframe].reshape(len(self._inverses), -1, 1)
         solved = self._unit * (self._inverses @ right.astype(np.float32))
-        return np.asarray(solved.reshape(*self._keyframe.shape, self._d)[self._label, self._place].ravel())
+        padded[:] = 0.0
+        padded[self._keyframe] = solved.reshape(*self._keyframe.shape, self._d)
+        return self._communicator.sum(padded[:-1].ravel())
 
 
 def cluster(row: IntArray, column: IntArray, strength: FloatArray, n: int, most: int) -> IntArray:

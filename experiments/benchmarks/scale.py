@@ -16,6 +16,7 @@ import time
 from typing import Any
 
 import numpy as np
+import scipy.sparse.linalg  # noqa: F401 -- otherwise the first solve would wait for it
 
 from ba_node.arrays import FloatArray
 from ba_node.core import methods
