@@ -42,6 +42,7 @@ class TwoLevel:
         self.state: State  # at which the system was linearised
         self._free = free
         self._communicator = communicator or Alone()
+        self._key: IntArray = np.empty(0, np.intp)  # places of the blocks of W, of all ranks
         self._label: IntArray | None = None  # (n_free,) cluster of each free keyframe
 
     def solve(
@@ -82,7 +83,7 @@ class TwoLevel:
         """Return ``r -> M^-1 r`` of the system that is not scaled."""
         inside = _Inside(s, label, self._communicator)
         p = self._coarse_space(label, s.blocksize[0])
-        w = total(self._communicator, (s @ p).tobsr(blocksize=p.blocksize))
+        w = self._sum((s @ p).tobsr(blocksize=p.blocksize))
         p_t, w_t = p.T.tobsr(), w.T.tobsr()
         coarse = scipy.sparse.csc_matrix(p_t @ w)
         diagonal = coarse.diagonal()
@@ -100,6 +101,20 @@ class TwoLevel:
             return np.asarray(z + p @ (y - coarsely(w_t @ z)))
 
         return apply
+
+    def _sum(self, w: scipy.sparse.bsr_matrix) -> scipy.sparse.bsr_matrix:
+        """Return the sum over ranks, whose blocks are put where those of all ranks were seen before."""
+        if self._communicator.size == 1:
+            return w
+        (n, d), (count, q) = ((size // of, of) for size, of in zip(w.shape, w.blocksize, strict=True))
+        key = np.repeat(np.arange(n), np.diff(w.indptr)) * count + w.indices
+        if self._communicator.sum(np.array([len(np.setdiff1d(key, self._key))], dtype=float))[0]:
+            keys = self._communicator.gather(np.union1d(key, self._key))
+            self._key = self._communicator.broadcast(None if keys is None else np.unique(np.concatenate(keys)))
+        data = np.zeros((len(self._key), d, q))
+        data[np.searchsorted(self._key, key)] = w.data
+        starts = np.searchsorted(self._key, np.arange(n + 1) * count)
+        return scipy.sparse.bsr_matrix((self._communicator.sum(data), self._key % count, starts), shape=w.shape)
 
     def _coarse_space(self, label: IntArray, d: int) -> scipy.sparse.bsr_matrix:
         """Return P, (n_free d, n_clusters (d + 1)): all unknowns of a cluster alike, and its growth."""
@@ -125,9 +140,7 @@ class _Inside:
         n, (d, _) = len(label), s.blocksize
         row = np.repeat(np.arange(n), np.diff(s.indptr))
         kept = np.flatnonzero(label[row] == label[s.indices])
-        starts = np.concatenate([[0], np.cumsum(np.bincount(row[kept], minlength=n))])
-        k = total(communicator, scipy.sparse.bsr_matrix((s.data[kept], s.indices[kept], starts), shape=s.shape))
-        row = np.repeat(np.arange(n), np.diff(k.indptr))
+        row, column = row[kept], s.indices[kept]
         # Clusters as rows of a table of keyframes; what is left of a row stands for keyframe n, which is nowhere.
         order = np.argsort(label, kind="stable")
         size = np.bincount(label)
@@ -137,12 +150,10 @@ class _Inside:
         self._keyframe = np.full((len(size), most), n)
         self._keyframe[label, place] = np.arange(n)
         share = slice(*(len(size) * i // communicator.size for i in (communicator.rank, communicator.rank + 1)))
+        matrices = np.zeros((len(size), most, d, most, d))
+        matrices[label[row], place[row], :, place[column], :] = s.data[kept]
+        matrices = communicator.sum(matrices)[share].reshape(-1, most * d, most * d)
         self._keyframe, self._d = self._keyframe[share], d
-        own = np.flatnonzero((label[row] >= share.start) & (label[row] < share.stop))
-        row, column = row[own], k.indices[own]
-        matrices = np.zeros((share.stop - share.start, most, d, most, d))
-        matrices[label[row] - share.start, place[row], :, place[column], :] = k.data[own]
-        matrices = matrices.reshape(-1, most * d, most * d)
         diagonal = np.arange(most * d)
         squares = matrices[:, diagonal, diagonal]
         squares = np.where(squares > 0.0, squares, 1.0)
