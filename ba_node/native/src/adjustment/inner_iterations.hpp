@@ -84,7 +84,7 @@ inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end
     lower_times(li, sums.g, y);
     V8 promise = y[0] * y[0] + y[1] * y[1] + y[2] * y[2];
     const Mask close = promise <= kClose * sums.cost;
-    if (flat.any && any(close)) {
+    if (step > 0 && flat.any && any(close)) {
       for (int i = 0; i < 6; ++i) flat.c[i] = sums.c[i] - select(close, flat.c[i], V8{});
       inverse_cholesky(flat.c, damping, li);
       lower_times(li, sums.g, y);
