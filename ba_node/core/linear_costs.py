@@ -22,6 +22,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ba_node.core.kernels import DENSE_LIMIT
+
 # Rates of one core, flop/s and byte/s: measured on an AMD EPYC (AVX2). Their ratios count.
 _FORM_FLOPS = 20e9
 _DENSE_FLOPS = 32e9
@@ -33,6 +35,8 @@ _CACHE_BYTES = 5e6
 # Steps of PCG that an outer iteration is charged: of a map where all keyframes meet, and for each stretch of a long
 # one (10 stretches of 1000 keyframes took 45 steps, then 144, then 232, where a factor ends after six iterations).
 _PCG_STEPS, _PCG_STEPS_OF_STRETCH = 60, 20
+# The same with clusters and a coarse system in place of block Jacobi.
+_TWO_LEVEL_STEPS = 20
 # From so many steps of PCG on for the cost of forming S PCG is tried first, for half as many.
 _WORTH_A_TRY = 15
 # No factor may take more memory than this.
@@ -91,6 +95,18 @@ def pcg_s(sizes: Sizes, products: float) -> float:
     keyframes = max(sizes.unknowns / sizes.block, 1.0)
     stretches = keyframes / math.sqrt(max(2.0 * products / keyframes, 1.0))
     return (_PCG_STEPS + _PCG_STEPS_OF_STRETCH * stretches) * _pcg_step_s(sizes)
+
+
+def preconditioner(sizes: Sizes, schur_blocks: int) -> str:
+    """Return which preconditioner of PCG costs less; S has so many blocks on and above its diagonal.
+
+    With two levels S is formed, and is there as a whole beside its upper half, each with a copy while it is made.
+    """
+    size = 2.0 * 8.0 * sizes.block**2 * schur_blocks
+    if sizes.unknowns <= DENSE_LIMIT or 3.0 * size > MAX_BYTES:
+        return "schur_block"
+    two_level = _form_s(sizes) + (_TWO_LEVEL_STEPS + 3) * 2.0 * size / _BYTES
+    return "two_level" if two_level < _PCG_STEPS * _pcg_step_s(sizes) else "schur_block"
 
 
 def pcg_tries(sizes: Sizes) -> int:
