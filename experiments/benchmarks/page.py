@@ -17,9 +17,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ba_node.offline.figures import COLOURS, Figure, array
-from ba_node.offline.page import write_page
-from ba_node.offline.report import html_table
+import numpy as np
+
+from ba_node.offline.figures import COLOURS
+from ba_node.offline.page import Figure, Page, html_table, write_page
 from experiments.benchmarks import metrics
 
 Problems = Sequence[Mapping[str, Any]]
@@ -87,7 +88,7 @@ def figures(problems: Problems) -> list[Figure]:
 
 def _steps(name: str, ratios: list[float], share: list[float], style: Mapping[str, str]) -> dict[str, Any]:
     x, y = [1.0, *ratios, max(1e3, ratios[-1])], [0.0, *share, share[-1]]
-    trace = {"type": "scatter", "mode": "lines", "x": array(x), "y": array(y), "name": name}
+    trace = {"type": "scatter", "mode": "lines", "x": np.array(x), "y": np.array(y), "name": name}
     return trace | {"line": dict(style) | {"shape": "hv"}}
 
 
@@ -113,7 +114,7 @@ def write(path: Path, summary: Mapping[str, Any], problems: Problems) -> None:
     """
     rows = [("best" if row[0].startswith("ba_node") else "", row) for row in ranking(problems)]
     head = f"<p>{summary['machine']}, medians of the runs.</p><h3>Objective at the end</h3>{html_table(RANKING, rows)}"
-    write_page(path, "Solvers beside each other", figures(problems), head)
+    write_page(path, Page("Solvers beside each other", figures(problems), head))
 
 
 def main() -> int:
