@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read and write trajectories in the format of the TUM RGB-D benchmark: ``stamp x y z qx qy qz qw`` a line.
+"""Read and write trajectories as the TUM RGB-D benchmark has them, ``stamp x y z qx qy qz qw`` a line; write KITTI.
 
 Stamps are seconds with nine decimals, made from and read to integer nanoseconds without a float in between; the
 other numbers are written so that they read back as the same float64.
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ba_node.core.geometry import matrix_from_quaternion
 from ba_node.estimate import Poses
 from ba_node.io.files import FileKindError, open_regular, whole_file
 
@@ -45,18 +46,9 @@ def read_tum(path: Path | str) -> Poses:
             int64 nanoseconds, or a quaternion of zeros. Names the line.
     """
     path = Path(path)
-    try:
-        with open_regular(path, MAX_BYTES) as stream:
-            text = stream.read().decode("utf-8")
-    except FileKindError as error:
-        raise TrajectoryError(str(error)) from None
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: not a text file: {error}") from error
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -70,6 +62,31 @@ def read_tum(path: Path | str) -> Poses:
     values = np.array(rows)
     ids = np.arange(len(rows), dtype=np.uint64)
     return Poses(ids, np.array(stamps, dtype=np.int64), values[:, :3], values[:, 3:])
+
+
+def write_kitti(path: Path, poses: Poses) -> None:
+    """Write poses as KITTI's odometry benchmark has them: three rows of world from body a line, without stamps."""
+    rotation = matrix_from_quaternion(poses.orientation)
+    rows = np.concatenate([rotation, poses.position[:, :, None]], axis=2).reshape(-1, 12)
+    with whole_file(path) as stream:
+        stream.write("".join(f"{' '.join(map(repr, row))}\n" for row in rows.tolist()).encode())
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        TrajectoryError: it cannot be opened, or is no text.
+    """
+    try:
+        with open_regular(path, MAX_BYTES) as stream:
+            return stream.read().decode("utf-8")
+    except FileKindError as error:
+        raise TrajectoryError(str(error)) from None
+    except OSError as error:
+        raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path}: not a text file: {error}") from error
 
 
 def format_stamp(stamp_ns: int) -> str:

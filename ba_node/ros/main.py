@@ -19,10 +19,12 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
+from ba_node.front_end.records import FrontEndError
+from ba_node.io.rig_file import RigError
 from ba_node.ros import arguments
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
-from ba_node.ros.rclpy_compat.executor import NodeExecutor
+from ba_node.ros.rclpy_compat.executor import WAIT_S, make_executor
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS
 
 USAGE_ERROR = 2
@@ -34,10 +36,20 @@ _SWITCH_INTERVAL_S = 0.0005
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit code, 2 if parameters or arguments are wrong.
+    """Run the node until SIGINT or SIGTERM; return the exit code, 2 if parameters or arguments are wrong."""
+    return run(NODE_NAME, BaNode, args)
+
+
+def run(
+    name: str, make: Callable[[], Any], args: Sequence[str] | None, executor: Callable[[], Any] = make_executor
+) -> int:
+    """Run a managed node as a process until SIGINT or SIGTERM; return the exit code.
 
     Args:
+        name: of the program, which begins what it says.
+        make: makes the node, which starts, stops and sums up what it did.
         args: the program and its arguments; None for those of the process.
+        executor: makes what calls its callbacks.
     """
     given = list(sys.argv if args is None else args)
     with signals() as ended:
@@ -45,24 +57,23 @@ def main(args: Sequence[str] | None = None) -> int:
             # rclpy's own handlers end the context at once: nobody who waits for an answer could be told any more.
             rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
         except ARGUMENT_ERRORS as error:
-            return _refuse(str(error))
+            return _refuse(name, str(error))
         try:
-            return _run(given, ended)
+            return _run(name, lambda: (make(), executor()), given, ended)
         finally:
             rclpy.try_shutdown()
 
 
-def _run(given: list[str], ended: Callable[[], bool]) -> int:
+def _run(name: str, make: Callable[[], tuple[Any, Any]], given: list[str], ended: Callable[[], bool]) -> int:
     if arguments.asks_for_help(given):
-        print(arguments.USAGE, end="")
+        print(arguments.usage(name), end="")
         return 0
     if reason := arguments.objection(given):
-        return _refuse(reason)
+        return _refuse(name, reason)
     try:
-        node = BaNode()
-    except (ConfigError, InvalidNodeNameException, InvalidNamespaceException) as error:
-        return _refuse(str(error))
-    executor = NodeExecutor()
+        node, executor = make()
+    except (ConfigError, FrontEndError, RigError, InvalidNodeNameException, InvalidNamespaceException) as error:
+        return _refuse(name, str(error))
     executor.add_node(node)
     for text in arguments.idle_files(given, node.get_fully_qualified_name()):
         log(node, Severity.WARNING, text)
@@ -77,11 +88,11 @@ def _run(given: list[str], ended: Callable[[], bool]) -> int:
         node.stop()
         executor.shutdown()
         node.destroy_node()
-    print(f"stopped: {node.keyframes_refined} keyframes refined", flush=True)
+    print(f"stopped: {node.summary()}", flush=True)
     return 0
 
 
-def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
+def spin(executor: Any, node: Any, ended: Callable[[], bool]) -> None:
     """Run callbacks until a signal. One that raises, as rclpy's own do on a senseless request, is survived."""
     faults = 0
     while rclpy.ok() and not ended():
@@ -93,10 +104,10 @@ def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
             raise RuntimeError(f"{faults} internal errors one after the other: giving up")
 
 
-def _spin_once(executor: NodeExecutor, node: Any) -> bool:
+def _spin_once(executor: Any, node: Any) -> bool:
     """Run one callback, after a wait that a signal may last out; return False if it raised."""
     try:
-        executor.spin_once()
+        executor.spin_once(WAIT_S)
     except Exception as error:
         # Whoever embeds the node may end the context at any moment, also between two messages of a callback.
         if isinstance(error, ExternalShutdownException) or not rclpy.ok():
@@ -106,8 +117,8 @@ def _spin_once(executor: NodeExecutor, node: Any) -> bool:
     return True
 
 
-def _refuse(reason: str) -> int:
-    print(f"{NODE_NAME}: {' '.join(reason.split())}", file=sys.stderr)
+def _refuse(name: str, reason: str) -> int:
+    print(f"{name}: {' '.join(reason.split())}", file=sys.stderr)
     return USAGE_ERROR
 
 
