@@ -16,14 +16,8 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.io import ros_types
 from ba_node.io.mcap import ROSBAGS_FACTORY
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.conversion import (
-    guesses_message,
-    keyframe_message,
-    measurement_from_message,
-    rig_message,
-    tracks_message,
-)
+from ba_node.measurements import CameraRig, Measurement
+from ba_node.messages.conversion import input_message, measurement_from_message
 from ba_node.messages.topics import INPUT_TYPES
 from experiments.robustness.faults import RIGS, SOUND, spoiled
 
@@ -182,13 +176,7 @@ def _good_cdr() -> list[tuple[int, bytes]]:
     good = good_stream(next(iter(RIGS)))
     parts: list[tuple[str, Any]] = []
     for measurement in good[:5]:
+        parts.append(input_message(ROSBAGS_FACTORY, measurement, 5, "camera"))
         if isinstance(measurement, CameraRig):
-            message = rig_message(ROSBAGS_FACTORY, measurement, 5)
-            parts += [("camera_rig", message), ("camera_info", message.cameras[0])]
-        elif isinstance(measurement, Keyframe):
-            parts.append(("keyframes", keyframe_message(ROSBAGS_FACTORY, measurement)))
-        elif isinstance(measurement, FeatureTracks):
-            parts.append(("feature_tracks", tracks_message(ROSBAGS_FACTORY, measurement, 5, "camera")))
-        elif isinstance(measurement, LandmarkGuesses):
-            parts.append(("landmark_guesses", guesses_message(ROSBAGS_FACTORY, measurement, 5, "odom")))
+            parts.append(("camera_info", parts[-1][1].cameras[0]))
     return [(names.index(name), ros_types.encode(INPUT_TYPES[name], message)) for name, message in parts]

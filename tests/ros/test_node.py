@@ -179,9 +179,9 @@ def test_bad_input_is_counted_and_nothing_is_lost(
     peer.connect()
     factory = RclpyFactory()
     good = scene.tracks[0][0]
-    message = conversion.tracks_message(factory, good, 0, "camera")
+    message = conversion.input_message(factory, good, 0, "camera")[1]
     message.u = message.u[:-1]
-    short_rig = conversion.rig_message(factory, scene.rig, 0)
+    short_rig = conversion.input_message(factory, scene.rig, 0)[1]
     short_rig.body_from_camera = []
     nan = np.full(3, np.nan)
     storm = [
@@ -249,7 +249,7 @@ def test_a_camera_driver_is_heard(
     camera = peer.node.create_publisher(CameraInfo, "camera_info", profile)
     peer.publishers["camera_info"] = camera
     peer.connect()
-    info = conversion.rig_message(RclpyFactory(), mono.rig, 0).cameras[0]
+    info = conversion.input_message(RclpyFactory(), mono.rig, 0)[1].cameras[0]
     timer = peer.node.create_timer(0.03, lambda: camera.publish(info))
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
         peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
