@@ -10,6 +10,7 @@ holds on to the buffer of a message or of a file.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -31,7 +32,7 @@ from ba_node.measurements import (
     RelativePose,
     TrackMerge,
 )
-from ba_node.messages.camera_info import Lens, lens_of
+from ba_node.messages.camera_info import Lens, lens_of, unplaced
 from ba_node.messages.factory import (
     ConversionError,
     MessageFactory,
@@ -134,31 +135,18 @@ def _fix(msg: Any) -> GlobalFix:
 
 def rig_from_parts(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
     """Return the rig; without poses the cameras sit at the origin of the body."""
-    n = len(cameras)
-    names = tuple(str(info.header.frame_id) for info in cameras)
-    read = [_lens(info) for info in cameras]
-    lenses, wrong = [lens for lens, _ in read], ""
-    if poses is not None and len(poses) != n:
-        wrong = f"cameras has {n} entries, body_from_camera {len(poses)}: expected one pose for each camera"
-    for i, (_, why) in enumerate(read):
-        if why:
-            wrong = wrong or f"camera {i} ({names[i]!r}): {why}"
-    position, orientation = np.zeros((n, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    if poses and not wrong:
-        position = np.array([_xyz(pose.position) for pose in poses])
-        orientation = np.array([_xyzw(pose.orientation) for pose in poses])
-    return CameraRig(
-        frame_id=frame_id,
-        names=names,
-        models=tuple(str(info.distortion_model) for info in cameras),
-        intrinsics=np.array([lens.intrinsics for lens in lenses]).reshape(-1, 4),
-        distortion=tuple(lens.distortion for lens in lenses),
-        image_size=np.array([lens.image_size for lens in lenses], dtype=np.int64).reshape(-1, 2),
-        position=position,
-        orientation=orientation,
-        malformed=wrong,
-        notes=tuple(f"camera {i} ({names[i]!r}): {lens.note}" for i, lens in enumerate(lenses) if lens.note),
-    )
+    names, read = [str(info.header.frame_id) for info in cameras], [_lens(info) for info in cameras]
+    wrong = [f"camera {i} ({names[i]!r}): {why}" for i, (_, why) in enumerate(read) if why]
+    if poses is not None and len(poses) != len(cameras):
+        counts = f"cameras has {len(cameras)} entries, body_from_camera {len(poses)}"
+        wrong.insert(0, f"{counts}: expected one pose for each camera")
+    rig = unplaced(frame_id, names, [str(info.distortion_model) for info in cameras], [lens for lens, _ in read])
+    if wrong:
+        return dataclasses.replace(rig, malformed=wrong[0])
+    if not poses:
+        return rig
+    position, orientation = zip(*((_xyz(pose.position), _xyzw(pose.orientation)) for pose in poses), strict=True)
+    return dataclasses.replace(rig, position=np.array(position), orientation=np.array(orientation))
 
 
 def _lens(info: Any) -> tuple[Lens, str]:
