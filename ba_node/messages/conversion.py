@@ -38,8 +38,10 @@ from ba_node.messages.factory import (
     MessageFactory,
     float32,
     header_message,
+    numbers_message,
     pose_message,
     stamp_ns_from_message,
+    uncertain_pose_message,
 )
 from ba_node.messages.topics import INPUT_TYPES
 
@@ -186,11 +188,8 @@ def _plain(factory: MessageFactory, what: Any, *but: str) -> dict[str, Any]:
 
 
 def _with_pose(factory: MessageFactory, what: Keyframe | RelativePose | PosePrior, *_: Any) -> dict[str, Any]:
-    pose = factory.make(
-        "geometry_msgs/msg/PoseWithCovariance",
-        pose=pose_message(factory, what.position, what.orientation),
-        covariance=factory.fixed(what.covariance if len(what.covariance) else np.zeros(36)),
-    )
+    covariance = what.covariance if len(what.covariance) else np.zeros(36)
+    pose = uncertain_pose_message(factory, what.position, what.orientation, covariance)
     fields = _plain(factory, what, "position", "orientation", "covariance", "is_loop")
     return fields | {"pose": pose} | ({"kind": int(what.is_loop)} if isinstance(what, RelativePose) else {})
 
@@ -201,8 +200,7 @@ def _tracks_fields(factory: MessageFactory, tracks: FeatureTracks, *_: Any) -> d
 
 
 def _gravity_fields(factory: MessageFactory, what: GravityDirection, *_: Any) -> dict[str, Any]:
-    down = dict(zip("xyz", what.down.tolist(), strict=True))
-    return _plain(factory, what) | {"down": factory.make("geometry_msgs/msg/Vector3", **down)}
+    return _plain(factory, what) | {"down": numbers_message(factory, "geometry_msgs/msg/Vector3", what.down)}
 
 
 def _fix_fields(factory: MessageFactory, fix: GlobalFix, *_: Any) -> dict[str, Any]:
