@@ -11,8 +11,7 @@ from typing import Any
 import yaml
 
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations
-from ba_node.io.files import FileKindError
-from ba_node.io.yaml_file import YamlError, read_yaml
+from ba_node.io.yaml_file import read_yaml
 
 NODE_NAME = "ba_node"
 _ROS_KEY = "ros__parameters"
@@ -28,12 +27,7 @@ def read_parameters(path: Path | str) -> dict[str, object]:
     Raises:
         ConfigError: the file cannot be read, is not YAML, or holds no mapping of parameters.
     """
-    try:
-        content = read_yaml(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be opened: {error.strerror}") from error
-    except (YamlError, FileKindError) as error:
-        raise ConfigError(_named(path, error)) from error
+    content = read_yaml(path, ConfigError)
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -57,13 +51,8 @@ def configure(path: Path | str | None, changes: Mapping[str, object]) -> Config:
         try:
             config = config.with_values(read_parameters(path))
         except ConfigError as error:
-            raise ConfigError(_named(path, error)) from None
+            raise ConfigError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     return config.with_values(changes)
-
-
-def _named(path: Path | str, error: Exception) -> str:
-    """Return what an error says, with the name of the file in front."""
-    return f"{path}: {str(error).removeprefix(f'{path}: ')}"
 
 
 def parameters_yaml(config: Config, *, comments: bool = True) -> str:

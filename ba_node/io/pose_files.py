@@ -15,7 +15,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Poses
-from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.files import opened, whole_file
 from ba_node.io.model import stamps
 from ba_node.io.trajectory import MAX_BYTES, TrajectoryError
 
@@ -78,13 +78,8 @@ def _matrix(poses: Poses) -> FloatArray:
 
 
 def _text(path: Path) -> str:
-    try:
-        with open_regular(path, MAX_BYTES) as stream:
-            return stream.read().decode("utf-8", errors="replace")
-    except FileKindError as error:
-        raise TrajectoryError(str(error)) from None
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
+    with opened(path, MAX_BYTES, TrajectoryError) as stream:
+        return stream.read().decode("utf-8", errors="replace")
 
 
 def _write(path: Path, lines: list[str]) -> None:

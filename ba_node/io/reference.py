@@ -17,7 +17,7 @@ import numpy as np
 
 from ba_node.core.geometry import quaternion_from_matrix
 from ba_node.estimate import Poses
-from ba_node.io.files import open_regular
+from ba_node.io.files import opened
 from ba_node.io.mcap import BagError, BagReader
 from ba_node.io.trajectory import MAX_BYTES, TrajectoryError, read_tum
 from ba_node.messages.factory import stamp_ns_from_message
@@ -81,15 +81,15 @@ def _read(path: Path, topic: str) -> tuple[Poses, bool]:
 def first_line(path: Path) -> str:
     """Return the first line of a file that is no comment, empty if it has none or cannot be read."""
     try:
-        with open_regular(path, MAX_BYTES) as stream:
+        with opened(path, MAX_BYTES, TrajectoryError) as stream:
             lines = (line.decode(errors="replace").strip() for line in itertools.islice(stream, 1000))
             return next((line for line in lines if line and not line.startswith("#")), "")
-    except (OSError, ValueError):
+    except TrajectoryError:
         return ""  # read_tum says what is wrong
 
 
 def _read_table(path: Path, separator: str | None, width: int, expected: str) -> Poses:
-    with open_regular(path, MAX_BYTES) as stream:
+    with opened(path, MAX_BYTES, TrajectoryError) as stream:
         lines = stream.read().decode(errors="replace").splitlines()
     rows: list[list[float]] = []
     stamps: list[int] = []

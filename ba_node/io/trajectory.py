@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ba_node.estimate import Poses
-from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.files import opened, whole_file
 
 # A million poses.
 MAX_BYTES = 2**27
@@ -46,12 +46,8 @@ def read_tum(path: Path | str) -> Poses:
     """
     path = Path(path)
     try:
-        with open_regular(path, MAX_BYTES) as stream:
+        with opened(path, MAX_BYTES, TrajectoryError) as stream:
             text = stream.read().decode("utf-8")
-    except FileKindError as error:
-        raise TrajectoryError(str(error)) from None
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise TrajectoryError(f"{path}: not a text file: {error}") from error
     stamps: list[int] = []

@@ -14,6 +14,7 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.io.bag_topics import NO_CHOICE, Chooser, TopicChoice, parse_topic
+from ba_node.io.bag_source import BagChannel
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import input_message
@@ -178,7 +179,7 @@ def test_topics_without_messages_are_not_meant(tmp_path: Path) -> None:
         messages = list(reader.messages())
     with BagWriter(tmp_path / "two.mcap") as bag:
         for name in (KF, FT, RIG):
-            bag._channel(f"/robot1/{name}", INPUT_TYPES[name], latched=False)
+            bag._register(BagChannel(0, f"/robot1/{name}", INPUT_TYPES[name], ("cdr", "ros2msg"), "", 0), {})
         for topic, kind, time, data in messages:
             bag.write(topic, kind, data, time)
     with BagReader(tmp_path / "two.mcap") as reader:
