@@ -10,8 +10,6 @@ compared in its order, and needs as many poses as the other.
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 from pathlib import Path
 
 from ba_node.cli.console import require_folder, table, write_result
@@ -56,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from ba_node.evaluation import relative  # noqa: PLC0415
     from ba_node.evaluation.metrics import absolute_error_of, pair  # noqa: PLC0415
-    from ba_node.io.files import whole_file  # noqa: PLC0415
+    from ba_node.io.files import write_csv  # noqa: PLC0415
     from ba_node.io.reference import read_pair  # noqa: PLC0415
 
     for path in (args.csv, args.plot):
@@ -79,20 +77,15 @@ def run(args: argparse.Namespace) -> int:
     about = {"align": args.align, "scale": paired.alignment.scale, "interval": args.interval, "unit": args.unit}
     write_result(args.json, about | found)
     if args.csv:
-        text = io.StringIO(newline="")
-        rows = csv.writer(text, lineterminator="\n")
-        rows.writerow(("error", *_HEAD))
-        rows.writerows((name, *(of[key] for key in _HEAD)) for name, of in found.items())
-        with whole_file(args.csv) as stream:
-            stream.write(text.getvalue().encode())
+        write_csv(args.csv, [("error", *_HEAD), *((name, *(of[key] for key in _HEAD)) for name, of in found.items())])
     if args.plot:
         import numpy as np  # noqa: PLC0415
 
-        from ba_node.evaluation.plot import Comparison, draw  # noqa: PLC0415
+        from ba_node.offline.pictures import draw_trajectory  # noqa: PLC0415
+        from ba_node.offline.run_folder import Comparison  # noqa: PLC0415
 
-        by_time = [poses[np.argsort(poses.stamp_ns, kind="stable")] for poses in (estimate, reference)]
-        with whole_file(args.plot) as stream:
-            draw(stream, Comparison(None, by_time[0], by_time[1], np.empty((0, 3)), args.align))
+        ours, theirs = (poses[np.argsort(poses.stamp_ns, kind="stable")] for poses in (estimate, reference))
+        draw_trajectory(args.plot, Comparison("estimate", None, ours, theirs, np.empty((0, 3)), args.align))
     return 0
 
 

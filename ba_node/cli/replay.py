@@ -142,8 +142,8 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
     failed = [row for row in rows if row["state"] == batch.FAILED]
     say_left_out({row["recording"]: row["note"] for row in failed})
     with delivered(args.out) as folder:
-        missing = batch.write_results(folder, rows)
-    print(f"written to {args.out}: {missing or 'index.html, results.csv, results.json, a folder a recording'}")
+        names = batch.write_summary(folder, rows)
+    print(f"written to {args.out}: {names}, a folder for each recording")
     write_result(args.json, {"recordings": rows})
     if not is_url(args.out):
         lost = [row for row in rows if row not in failed and not (Path(row["folder"]) / "report.json").is_file()]

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make one page of the results of `ba replay`; of several folders side by side, each in a colour of its own.
 
-The page needs nothing else and opens without a network. `--png` has a browser (chromium) draw each figure to a file
-beside it.
+The page needs nothing else and opens without a network. Each figure is a PNG too, in a folder called as the page.
 """
 
 from __future__ import annotations
@@ -23,19 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="HTML", help="file to write (default: report.html in the first folder, or here)"
     )
-    parser.add_argument("--png", action="store_true", help="write each figure as PNG too, beside the page")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
-    from ba_node.offline.page import write_pictures  # noqa: PLC0415
     from ba_node.offline.report import REPORT, write_report  # noqa: PLC0415
 
     require_folder(args.out)
     path = args.out or (args.folders[0] / REPORT if len(args.folders) == 1 else Path(REPORT))
-    write_report(args.folders, path)
-    print(f"written to {path}")
-    if args.png:
-        for picture in write_pictures(path, path.parent):
-            print(f"written to {picture}")
+    print(f"written to {path.parent}: {write_report(args.folders, path)}")
     return 0

@@ -49,7 +49,6 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline import tuning, tuning_page  # noqa: PLC0415
     from ba_node.offline.batch import recordings  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet  # noqa: PLC0415
-    from ba_node.offline.page import PageError  # noqa: PLC0415
     from ba_node.offline.study import Plan  # noqa: PLC0415
 
     base = parameters(args)
@@ -65,11 +64,6 @@ def run(args: argparse.Namespace) -> int:
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("sweep", "replays") as progress:
         found, left_out = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
     print(table(*tuning_page.sweep_rows(found)))
-    names = "sweep.csv, sweep.json, index.html"
-    try:
-        tuning_page.write_sweep(args.out, found)
-    except PageError as error:
-        names = f"sweep.csv, sweep.json; {error}"
-    print(f"written to {args.out}: {names}")
+    print(f"written to {args.out}: {tuning_page.write_sweep(args.out, found)}")
     write_result(args.json, tuning_page.sweep_as_dict(found))
     return say_left_out(left_out)

@@ -101,7 +101,6 @@ def run(args: argparse.Namespace) -> int:
 def _tune(args: argparse.Namespace) -> int:
     from ba_node.offline import tuning, tuning_page  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet  # noqa: PLC0415
-    from ba_node.offline.page import PageError  # noqa: PLC0415
 
     base = parameters(args)
     plan = _plan(args)
@@ -117,14 +116,9 @@ def _tune(args: argparse.Namespace) -> int:
 
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("tune", "trials") as progress:
         tuned = tuning.tune(plan, base, fleet, storage, better, progress)
-    tuning_page.write_parameters(args.out, base, tuned.changes)
+    names = tuning_page.write_tuned(args.out, tuned, base)
     print(table(tuning_page.ERRORS, tuning_page.error_rows(tuned)), end="\n\n")
     print(table(tuning_page.PARAMETERS, tuning_page.parameter_rows(tuned, base)))
-    names = "tuned.yaml, tuning.json, index.html"
-    try:
-        tuning_page.write_tuned(args.out, tuned, base)
-    except PageError as error:
-        names = f"tuned.yaml, tuning.json; {error}"
     print(f"written to {args.out}: {names}")
     write_result(args.json, tuning_page.tuned_as_dict(tuned))
     return max(say_left_out(tuned.left_out), _verdict(tuned))

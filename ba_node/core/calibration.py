@@ -2,17 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine what all keyframes share: intrinsics, places of the cameras on the body, and offsets of their clocks.
 
-An outer Gauss-Newton method around the solver. At a solution of poses and points for given cameras the normal equations
-are bordered by the columns K of the shared parameters q; with the points, and then the poses, eliminated a small system
-is left::
-
-    S_q = K' W K - ...,    (S_q + P) dq = -(g_q + P (q - q_0)),    P = diag(1 / sigma_0^2)
-
-for priors sigma_0 about the given values q_0. Then poses and points are solved again for the cameras that this gives.
-
-Only what is observable moves: in the directions of ``P^-1/2 S_q P^-1/2 = V diag(lambda) V'`` the data tell lambda times
-as much as the priors, and those of less than 1 stay where they are. A parameter counts as told where the standard
-deviation after it is less than a quarter of the prior's (lambda = :data:`LEAST_TOLD`).
+Poses, points and the shared parameters q are solved together (``bordered.py``), with priors sigma_0 about the given
+values. With poses and points eliminated at a solution, ``S_q`` is what the data tell of q. Only what is observable
+moves: in the directions of ``P^-1/2 S_q P^-1/2 = V diag(lambda) V'``, P = diag(1 / sigma_0^2), the data tell lambda
+times as much as the priors; those of more than 1 are the basis in which q moves, the others stay where they are. A
+parameter counts as told where the standard deviation after it is less than a quarter of the prior's (lambda =
+:data:`LEAST_TOLD`). This is repeated, as the way and the loss depend on the solution.
 
 Parameters of camera c, in their order:
 
@@ -28,7 +23,6 @@ Parameters of camera c, in their order:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,25 +32,22 @@ from scipy.spatial import transform
 
 from ba_node.arrays import FloatArray
 from ba_node.config import CalibrationConfig, SolverOptions
-from ba_node.core import covariance, geometry, parameterisation
+from ba_node.core import bordered, covariance, geometry, point_priors, solver
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.core.rows import GIVEN, Rows, joined, rows_of
 
 # The data have to tell so many times as much as the prior.
 LEAST_TOLD = 16.0
-_ROUNDS = 12
-# A step of less than this share of the priors' sigmas is none.
+_ROUNDS, _ITERATIONS = 12, 20
+# A change of less than this share of the priors' sigmas is none.
 _SMALL = 2e-3
-_NONE = 1e-9  # rounding
-# No parameter steps by more than this many of the priors' sigmas at once.
-_MOST = 2.0
 # While the cameras are wrong the loss is as wide as this many times the median residual.
 _WIDE = 3.0
 _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2")
 _PLACE = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
 _TIME = "time_offset"
-_STEP = 1e-6
+_COLUMNS = dict(zip((*_INTRINSICS, *_PLACE, _TIME), (*range(6), *bordered.PLACE, bordered.TIME), strict=True))
 # Standard deviation of fy / fx, which is that of the pixels.
 _NOT_SQUARE = 0.003
 
@@ -135,9 +126,6 @@ class Motion:
     doubt: float = 0.0
 
 
-Solve = Callable[[Problem, SolverOptions], State]
-
-
 def parameters_of(problem: Problem, config: CalibrationConfig) -> tuple[Parameter, ...]:
     """Return the shared parameters that are to be refined."""
     found = []
@@ -176,30 +164,85 @@ def motion_of(state: State, stamp_s: FloatArray) -> Motion:
 
 
 def calibrate(
-    problem: Problem, stamp_s: FloatArray, options: SolverOptions, config: CalibrationConfig, solve: Solve
+    problem: Problem, stamp_s: FloatArray, options: SolverOptions, config: CalibrationConfig
 ) -> tuple[Problem, State, Calibration]:
     """Refine the shared parameters of a problem, and its poses and points with them.
 
-    ``stamp_s`` (n_kf,) are the stamps of its keyframes, ascending; ``solve`` solves for poses and points alone.
+    ``stamp_s`` (n_kf,) are the stamps of its keyframes, ascending.
 
     Returns:
         The problem with the refined cameras and its pixels at the time of the stamps, its solution, and what was found.
     """
     found = Calibration(problem.cameras, np.zeros(len(problem.cameras.model)), parameters_of(problem, config))
-    given, state = problem, solve(problem, _wide(problem, problem.start, options))
+    given, state = problem, _solved(problem, problem.start, _wide(problem, problem.start, options))
     for _ in range(_ROUNDS):
-        problem = with_calibration(given, state, found, stamp_s)
-        wide = _wide(problem, state, options)
-        state = solve(dataclasses.replace(problem, start=state), wide)
-        border = _Border(problem, state, wide, found, motion_of(state, stamp_s))
-        step = border.step()
-        found = _stepped(found, step)
-        if np.abs(step).max(initial=0.0) < _SMALL:
+        before = found
+        state, found = _round(given, state, found, stamp_s, options)
+        pairs = zip(before.parameters, found.parameters, strict=True)
+        if max((abs(now.change - then.change) / now.prior for then, now in pairs), default=0.0) < _SMALL:
             break
     problem = with_calibration(given, state, found, stamp_s)
-    state = solve(dataclasses.replace(problem, start=state), options)
-    border = _Border(problem, state, options, found, motion_of(state, stamp_s))
-    return problem, state, dataclasses.replace(found, parameters=border.described())
+    state = _solved(problem, state, options)
+    parameters = _described(problem, state, options, found, motion_of(state, stamp_s))
+    return problem, state, dataclasses.replace(found, parameters=parameters)
+
+
+def _solved(problem: Problem, start: State, options: SolverOptions) -> State:
+    """Return the solution for given cameras."""
+    result = solver.solve(dataclasses.replace(problem, start=start), options)
+    return result.state if result.status.usable and result.state.is_finite() else start
+
+
+def _round(
+    given: Problem, state: State, found: Calibration, stamp_s: FloatArray, options: SolverOptions
+) -> tuple[State, Calibration]:
+    """Solve for poses, points and what can be observed of the parameters, with the way and the loss of a state."""
+    problem = with_calibration(given, state, found, stamp_s)
+    chosen = dataclasses.replace(
+        _wide(problem, state, options), trust_region="none", schur="points", annealing="none", kernels="numpy"
+    )
+    chosen = dataclasses.replace(chosen, linear_solver="auto", max_iterations=_ITERATIONS)
+    problem, motion = dataclasses.replace(problem, start=state), motion_of(state, stamp_s)
+    if problem.point_priors is not None:
+        problem = point_priors.as_observations(problem)
+        beside = ((0, problem.n_keyframes - given.n_keyframes), (0, 0))
+        motion = Motion(np.pad(motion.velocity, beside), np.pad(motion.turn, beside))
+    shared = bordered.Shared(_unknowns(found), flow=_flow(problem, problem.start, motion))
+    prior = np.array([parameter.prior for parameter in found.parameters])
+    moves = _following(found) * prior
+    with np.errstate(all="ignore"):
+        kernels = bordered.SharedKernels(problem, chosen, dataclasses.replace(shared, basis=_held(found, moves)))
+        kernels.linearise(kernels.start)
+        system = kernels.damp("none", 0.0)
+        assert isinstance(system, bordered.BorderedSystem)
+        values, vectors = np.linalg.eigh(system.of_border())
+    told = vectors[:, values > 1.0]
+    if not told.shape[1]:
+        return state, found
+    change = np.array([parameter.change for parameter in found.parameters]) / prior
+    shared = dataclasses.replace(shared, basis=_held(found, moves) @ told, prior=told.T @ change)
+    result, end = bordered.solve_shared(problem, shared, chosen)
+    if not (result.status.usable and end.is_finite()):
+        return state, found
+    step = told @ end.z
+    parameters = tuple(
+        dataclasses.replace(one, change=one.change + float(by))
+        for one, by in zip(found.parameters, prior * step, strict=True)
+    )
+    n = len(given.cameras.model)
+    late = found.time_offset + bordered.offsets(shared.unknowns, moves @ step, n)
+    refined = Cameras(*(values[:n] for values in vars(end.cameras).values()))
+    return point_priors.without(end, given), Calibration(refined, late, parameters)
+
+
+def _unknowns(found: Calibration) -> tuple[bordered.Unknown, ...]:
+    return tuple(bordered.Unknown(one.camera, (_COLUMNS[one.name],)) for one in found.parameters)
+
+
+def _held(found: Calibration, moves: FloatArray) -> FloatArray:
+    """Return how the numbers of the cameras move (q, q), without the place of the first one."""
+    held = [one.camera == 0 and one.name in _PLACE for one in found.parameters]
+    return np.where(np.array(held, bool)[:, None], 0.0, moves)
 
 
 def with_calibration(given: Problem, state: State, found: Calibration, stamp_s: FloatArray) -> Problem:
@@ -220,152 +263,70 @@ def _flow(problem: Problem, state: State, motion: Motion) -> FloatArray:
     return np.asarray(_by_time(at.d_point, state, motion, obs)[:, :2] * obs.sigma_px[:, None])
 
 
-def _in_body(d_point: FloatArray, state: State, obs: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (n_obs, d, 3) by the points in the body, and these points (n_obs, 3), m."""
-    rotation = state.rotation[obs.keyframe]
-    points = (rotation @ state.points[obs.point][:, :, None])[..., 0] + state.translation[obs.keyframe]
-    return d_point @ np.swapaxes(rotation, 1, 2), points
-
-
 def _by_time(d_point: FloatArray, state: State, motion: Motion, obs: Observations) -> FloatArray:
     """Return the derivatives (n_obs, d) of residuals by the time at which the body sees the points."""
-    by_body, points = _in_body(d_point, state, obs)
+    rotation = state.rotation[obs.keyframe]
+    points = (rotation @ state.points[obs.point][:, :, None])[..., 0] + state.translation[obs.keyframe]
     moves = -np.cross(motion.turn[obs.keyframe], points) - motion.velocity[obs.keyframe]
-    return np.asarray((by_body @ moves[:, :, None])[..., 0])
+    return np.asarray((d_point @ np.swapaxes(rotation, 1, 2) @ moves[:, :, None])[..., 0])
 
 
-class _Border:
-    """The equations at a solution, bordered by the shared parameters."""
-
-    def __init__(
-        self, problem: Problem, state: State, options: SolverOptions, found: Calibration, motion: Motion
-    ) -> None:
-        self._parameters, self._cameras = found.parameters, found.cameras
-        self._squared = options.loss == "squared"
-        self._prior = np.array([parameter.prior for parameter in found.parameters])
-        self._change = np.array([parameter.change for parameter in found.parameters])
-        self._n, self._doubt = 6 * int(np.count_nonzero(~problem.fixed)), motion.doubt
-        with np.errstate(all="ignore"):
-            self._rows = _with_columns(rows_of(problem, state, options), _columns(problem, state, found, motion))
-
-    def step(self) -> FloatArray:
-        """Return the step of the shared parameters in units of the priors' sigmas, (q,)."""
-        rows, n = self._rows, self._n
-        reduced = covariance.Reduced(rows, rows.weight)
-        gradient = np.asarray(reduced.influence.T @ (rows.weight * rows.residual))
-        s = reduced.s + 1e-12 * np.diag(np.diagonal(reduced.s))
-        poses = np.linalg.solve(s[:n, :n], np.column_stack([s[:n, n:], gradient[:n]]))
-        own = s[n:, n:] - s[n:, :n] @ poses[:, :-1]
-        slope = gradient[n:] - s[n:, :n] @ poses[:, -1]
-        values, vectors = np.linalg.eigh(own * self._prior[:, None] * self._prior)
-        along = vectors.T @ (self._prior * slope + self._change / self._prior)
-        step = vectors @ np.where(values > 1.0, -along / (1.0 + np.maximum(values, 0.0)), 0.0)
-        step[np.abs(step) < _NONE] = 0.0
-        return np.asarray(step * min(1.0, _MOST / max(float(np.abs(step).max(initial=0.0)), _NONE)))
-
-    def described(self) -> tuple[Parameter, ...]:
-        """Return the parameters with what is known of them."""
-        rows, q = self._rows, len(self._prior)
+def _described(
+    problem: Problem, state: State, options: SolverOptions, found: Calibration, motion: Motion
+) -> tuple[Parameter, ...]:
+    """Return the parameters with what is known of them at a solution."""
+    prior = np.array([parameter.prior for parameter in found.parameters])
+    change = np.array([parameter.change for parameter in found.parameters])
+    n, q = 6 * int(np.count_nonzero(~problem.fixed)), len(prior)
+    follow = _following(found)
+    with np.errstate(all="ignore"):
+        rows = _with_columns(problem, state, options, found, _flow(problem, state, motion))
         priors = Rows(
-            self._change / self._prior,
-            sparse.csr_matrix((1.0 / self._prior, (np.arange(q), self._n + np.arange(q))), (q, self._n + q)),
+            change / prior,
+            sparse.csr_matrix((1.0 / prior, (np.arange(q), n + np.arange(q))), (q, n + q)),
             sparse.csr_matrix((q, rows.points.shape[1])),
             np.ones(q),
             np.ones(q),
             np.full(q, GIVEN),
             np.arange(q),
         )
-        conditions = np.empty((self._n + q, 0))
-        found = covariance.uncertainty_of_rows(joined([rows, priors]), self._squared, conditions)
-        if found is None:
-            return self._parameters
-        follow = self._following()
-        sigma = np.sqrt(np.diagonal(follow @ found.of(self._n + np.arange(q)) @ follow.T))
-        prior = np.sqrt(np.sum((follow * self._prior) ** 2, axis=1))
-        # The clock of the first camera shows in how velocities change, that of another one in the velocities.
-        shared = [parameter.name == _TIME and parameter.camera == 0 for parameter in self._parameters]
-        sigma = np.hypot(sigma, np.where(shared, self._doubt * np.abs(self._change), 0.0))
-        told = sigma * np.sqrt(1.0 + LEAST_TOLD) < prior
-        rows_of_all = zip(self._parameters, prior, follow @ self._change, sigma, told, strict=True)
-        return tuple(
-            dataclasses.replace(one, prior=float(p), change=float(c), sigma=float(s), told=bool(t))
-            for one, p, c, s, t in rows_of_all
+        told_by = covariance.uncertainty_of_rows(
+            joined([rows, priors]), options.loss == "squared", np.empty((n + q, 0))
         )
-
-    def _following(self) -> FloatArray:
-        """Return the matrix (q, q) by which fy follows fx."""
-        follow = np.eye(len(self._parameters))
-        for i, parameter in enumerate(self._parameters):
-            if parameter.name == "fy":
-                params = self._cameras.params[parameter.camera]
-                follow[i, i - 1] = params[1] / params[0]
-        return follow
-
-
-def _with_columns(rows: Rows, columns: FloatArray) -> Rows:
-    """Return rows with columns (n_obs rows that count, q) beside those of the poses; those of factors are 0."""
-    beside = np.zeros((len(rows), columns.shape[1]))
-    beside[: len(columns)] = columns
-    return dataclasses.replace(rows, keyframes=sparse.hstack([rows.keyframes, sparse.csr_matrix(beside)], "csr"))
+    if told_by is None:
+        return found.parameters
+    sigma = np.sqrt(np.diagonal(follow @ told_by.of(n + np.arange(q)) @ follow.T))
+    prior = np.sqrt(np.sum((follow * prior) ** 2, axis=1))
+    # The clock of the first camera shows in how velocities change, that of another one in the velocities.
+    of_all = [parameter.name == _TIME and parameter.camera == 0 for parameter in found.parameters]
+    sigma = np.hypot(sigma, np.where(of_all, motion.doubt * np.abs(change), 0.0))
+    told = sigma * np.sqrt(1.0 + LEAST_TOLD) < prior
+    rows_of_all = zip(found.parameters, prior, follow @ change, sigma, told, strict=True)
+    return tuple(
+        dataclasses.replace(one, prior=float(p), change=float(c), sigma=float(s), told=bool(t))
+        for one, p, c, s, t in rows_of_all
+    )
 
 
-def _columns(problem: Problem, state: State, found: Calibration, motion: Motion) -> FloatArray:
-    """Return the derivatives by the shared parameters, (m, q), of all rows of observations that count."""
-    obs = problem.observations
-    at = Objective(problem, SolverOptions(cheirality="constant")).linearise(state)
-    by_body, points = _in_body(at.d_point, state, obs)
-    by_place = np.concatenate([np.cross(points[:, None, :], by_body), by_body], axis=2)
-    by_time = _by_time(at.d_point, state, motion, obs)
-    by_time[:, 2:] = 0.0  # a depth is not moved to the time of the stamp
-    out = np.zeros((*at.residual.shape, len(found.parameters)))
+def _following(found: Calibration) -> FloatArray:
+    """Return the matrix (q, q) by which fy follows fx."""
+    follow = np.eye(len(found.parameters))
     for i, parameter in enumerate(found.parameters):
-        of = obs.camera == parameter.camera
-        if parameter.name in _INTRINSICS:
-            out[of, :2, i] = _by_intrinsics(problem, state, parameter)[of]
-        elif parameter.name == _TIME:
-            of |= parameter.camera == 0
-            out[of, :, i] = by_time[of]
-        elif parameter.camera > 0:
-            out[of, :, i] = by_place[of, :, _PLACE.index(parameter.name)]
-    return out[np.any(at.d_point != 0.0, axis=2)]
+        if parameter.name == "fy":
+            params = found.cameras.params[parameter.camera]
+            follow[i, i - 1] = params[1] / params[0]
+    return follow
 
 
-def _by_intrinsics(problem: Problem, state: State, parameter: Parameter) -> FloatArray:
-    """Return the derivatives (n_obs, 2) of whitened residuals by an intrinsic parameter, by central differences."""
-    step = _STEP * parameter.prior
-    errors = []
-    for sign in (1.0, -1.0):
-        params = problem.cameras.params.copy()
-        _change_intrinsics(params[parameter.camera], parameter.name, sign * step)
-        changed = dataclasses.replace(problem, cameras=dataclasses.replace(problem.cameras, params=params))
-        errors.append(Objective(changed, SolverOptions()).errors(state))
-    return np.nan_to_num((errors[0] - errors[1]) / (2.0 * step)) / problem.observations.sigma_px[:, None]
-
-
-def _change_intrinsics(params: FloatArray, name: str, by: float) -> None:
-    """Change a parameter of a camera (12,) in place; fy follows fx."""
-    if name == "fx":
-        params[1] *= 1.0 + by / params[0]
-    params[_INTRINSICS.index(name)] += by
-
-
-def _stepped(found: Calibration, step: FloatArray) -> Calibration:
-    """Return a calibration after a step (q,) in units of the priors' sigmas."""
-    cams, offset = found.cameras, found.time_offset.copy()
-    params, place = cams.params.copy(), np.zeros((len(offset), 6))
-    changed = []
-    for parameter, size in zip(found.parameters, step, strict=True):
-        by = parameter.prior * float(size)
-        if parameter.name in _INTRINSICS:
-            _change_intrinsics(params[parameter.camera], parameter.name, by)
-        elif parameter.name == _TIME:
-            offset[parameter.camera or slice(None)] += by
-        else:
-            place[parameter.camera, _PLACE.index(parameter.name)] += by
-        changed.append(dataclasses.replace(parameter, change=parameter.change + by))
-    rotation, translation = parameterisation.retract("local", cams.rotation, cams.translation, place)
-    refined = dataclasses.replace(cams, params=params, rotation=rotation, translation=translation)
-    return Calibration(refined, offset, tuple(changed))
+def _with_columns(problem: Problem, state: State, options: SolverOptions, found: Calibration, flow: FloatArray) -> Rows:
+    """Return the rows of a problem at a state, with columns of the parameters beside those of the poses."""
+    rows = rows_of(problem, state, options)
+    plain = Objective(problem, SolverOptions(cheirality="constant"))
+    counts = np.any(plain.linearise(state).d_point != 0.0, axis=2).ravel()
+    by_theta = bordered.shared_jacobian(plain, state, bordered.Shared(_unknowns(found), flow=flow))[counts]
+    beside = sparse.csr_matrix(by_theta @ _held(found, _following(found)))
+    beside.resize(len(rows), len(found.parameters))
+    return dataclasses.replace(rows, keyframes=sparse.hstack([rows.keyframes, beside], "csr"))
 
 
 def _wide(problem: Problem, state: State, options: SolverOptions) -> SolverOptions:

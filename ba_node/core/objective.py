@@ -104,25 +104,29 @@ class Objective:
         if options.cheirality == "drop":
             self._all = replace(self._all, ignored=cameras.behind(self.in_camera(problem.start), self._all.model))
 
-    def through(self, cams: Cameras) -> Objective:
-        """Return the same objective with other cameras; observations that count for nothing are those of before."""
+    def through(self, cams: Cameras, uv: FloatArray) -> Objective:
+        """Return the same with other cameras and pixels (n_obs, 2); what counts for nothing is what did before."""
         other = copy.copy(self)
         other.problem = replace(self.problem, cameras=cams)
         model, params = _lenses(other.problem, self._image_camera)
-        other._all = replace(self._all, model=model, params=params)
+        other._all = replace(self._all, model=model, params=params, uv=np.asfortranarray(uv))
         return other
 
     def camera_rows(self, state: State) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Return points in their camera's optical frame (n_obs, 3), m, the masked rows, sqrt(weight) / sigma (n_obs,).
+        """Return points in their camera's optical frame, the masked rows, and sqrt(weight) / sigma of each row.
 
-        The rows of masked observations count for nothing. For problems without depths.
+        (n_obs, 3) m; rows of masked observations count for nothing; (n_obs, d).
         """
         of = self._all
         x_cam, _ = self._in_camera(state, of)
         masked = self._mask(x_cam, of)
         uv = cameras.project(x_cam, of.model, self._params(state, of))
         _, root_weight = self._costs(self._residual(uv, x_cam, masked, of), masked, of)
-        return x_cam, masked, np.broadcast_to(self._row_scale(root_weight, of)[:, 0], len(x_cam))
+        return (
+            x_cam,
+            masked,
+            np.broadcast_to(self._row_scale(root_weight, of), (len(x_cam), 3 if self._has_depth else 2)),
+        )
 
     def in_camera(self, state: State) -> FloatArray:
         """Return the observed points in their camera's optical frame, (n_obs, 3), m."""

@@ -1,3 +1,3 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluate trajectories: alignment, metrics, plots."""
+"""Evaluate trajectories: alignment, metrics."""

@@ -9,6 +9,7 @@ planted is written through, and locked, so that what a killed process has left i
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import fcntl
 import io
@@ -17,7 +18,7 @@ import math
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -149,6 +150,14 @@ def write_json(path: Path | str, content: Mapping[str, Any]) -> None:
     """Write JSON that every reader takes: null for infinity and NaN, which JSON does not have."""
     with whole_file(path) as stream:
         stream.write(json_text(content).encode())
+
+
+def write_csv(path: Path | str, rows: Sequence[Sequence[object]]) -> None:
+    """Write a table; None is an empty cell."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    with whole_file(path) as stream:
+        stream.write(text.getvalue().encode())
 
 
 def json_text(content: Mapping[str, Any]) -> str:

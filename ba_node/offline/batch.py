@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,15 +14,14 @@ import numpy as np
 
 from ba_node.config import Config
 from ba_node.io.bag_files import same_recording
-from ba_node.io.files import whole_file, write_json
 from ba_node.io.mcap import TopicChoice
 from ba_node.io.parameters import parameters_yaml
 from ba_node.offline.check import check_recording
-from ba_node.offline.figures import COLOURS, Figure, array
+from ba_node.offline.figures import BEFORE, COLOURS
 from ba_node.offline.fleet import Fleet, delivered, expand, fetched, is_url, name_of, words_of
-from ba_node.offline.page import PageError, write_page
+from ba_node.offline.page import Figure, Page, html_table, write_results
 from ba_node.offline.replay import MapOptions, Watch, replay
-from ba_node.offline.report import REPORT, html_table, show
+from ba_node.offline.report import REPORT, show
 
 # Columns of the table of all recordings: name in results.json and .csv, heading.
 COLUMNS = {
@@ -182,28 +179,15 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     return ["" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
 
 
-def write_results(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Write results.json, results.csv and index.html; return what to say if the page is left out.
+def write_summary(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write results.json, results.csv and index.html; return their names, or why there is no page.
 
     Raises:
         OSError: a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "results.json", {"recordings": rows})
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, [*COLUMNS, "folder"], lineterminator="\n", extrasaction="ignore")
-    table.writeheader()
-    table.writerows(rows)
-    with whole_file(out / "results.csv") as stream:
-        stream.write(text.getvalue().encode())
-    try:
-        _write_page(out, rows)
-    except PageError as error:
-        return str(error)
-    return ""
-
-
-def _write_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    columns = [*COLUMNS, "folder"]
+    listed: list[list[object]] = [list(columns), *([row.get(name) for name in columns] for row in rows)]
     states = {state: sum(row["state"] == state for row in rows) for state in (OK, LOOK, FAILED)}
     names = [name_of(str(row["recording"])) for row in rows]
     kind = "bad" if states[FAILED] else "look" if states[LOOK] else "good"
@@ -220,17 +204,17 @@ def _write_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         _bars("median", "Median residual", names, rows, "median_before_px", "median_after_px", "px"),
     ]
     head = f"<div class='verdict {kind}'><b>{verdict}</b></div>{shown}<ul>{links}</ul>"
-    write_page(out / "index.html", "Replays", [figure for figure in figures if figure.data], head)
+    return write_results(out, "results", {"recordings": rows}, listed, Page("Replays", figures, head))
 
 
 def _bars(
     key: str, title: str, names: Sequence[str], rows: Sequence[Mapping[str, Any]], before: str, after: str, unit: str
 ) -> Figure:
     data = []
-    for name, column, colour in (("before", before, "#D55E00"), ("after", after, COLOURS[0])):
+    for name, column, colour in (("before", before, BEFORE), ("after", after, COLOURS[0])):
         values = [row.get(column) for row in rows]
         if any(value is not None for value in values):
-            bar = {"type": "bar", "x": list(names), "y": array([np.nan if v is None else v for v in values])}
+            bar = {"type": "bar", "x": list(names), "y": values}
             data.append(bar | {"name": name, "marker": {"color": colour}})
     layout = {"yaxis": {"title": f"[{unit}]", "type": "log"}, "barmode": "group", "xaxis": {}}
     return Figure(key, title, "Before and after adjustment, of each recording.", data, layout, wide=True)

@@ -18,14 +18,14 @@ import numpy as np
 
 from ba_node.estimate import Cloud, Poses
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
-from ba_node.evaluation.plot import Comparison, draw
-from ba_node.io.files import whole_file
 from ba_node.io.mcap import BagReader
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import Keyframe
 from ba_node.messages.factory import stamp_ns_from_message
+from ba_node.offline.pictures import draw_trajectory
 from ba_node.offline.recording import read_truth
+from ba_node.offline.run_folder import Comparison
 from ba_node.ros.tools.domain import free_domain, isolation
 from ba_node.ros.tools.listen import NodeListener
 
@@ -116,9 +116,8 @@ def write(outcome: Outcome, out: Path) -> dict[str, TrajectoryError]:
     write_tum(out / "trajectory_input.tum", outcome.before)
     write_tum(out / "ground_truth.tum", outcome.truth)
     write_ply(out / "points.ply", outcome.cloud, outcome.frame_id)
-    comparison = Comparison(outcome.before, outcome.after, outcome.truth, outcome.cloud.position)
-    with whole_file(out / "trajectory.png") as stream:
-        draw(stream, comparison)
+    comparison = Comparison("demo", outcome.before, outcome.after, outcome.truth, outcome.cloud.position, "se3")
+    draw_trajectory(out / "trajectory.png", comparison)
     return {
         "before": absolute_error(outcome.before, outcome.truth),
         "after": absolute_error(outcome.after, outcome.truth),

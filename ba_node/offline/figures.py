@@ -12,7 +12,6 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,101 +21,120 @@ from ba_node.arrays import FloatArray
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
-from ba_node.evaluation.plot import ground_axes
-from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Run
+from ba_node.offline.page import Figure
+from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Comparison, Run
 
 TRUTH, BEFORE, CLOUD = "#000000", "#D55E00", "#9AA0A6"
 COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 _BAD = {"HELD": "#E69F00", "FAILED": "#D55E00", "SKIPPED": "#9AA0A6"}
 # Points that are drawn at most, in space and from above, and residuals.
 _POINTS, _ABOVE, _ARROWS, _CAMERAS = 100_000, 6_000, 3_000, 4
-# Beyond it a float32 has steps of more than a centimetre.
-_FAR = 1e5
 # Length of a drawn residual: the 90th percentile takes this share of the image's width.
 _ARROW_SHARE = 0.02
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One figure of a page."""
-
-    key: str  # name of its picture
-    title: str
-    caption: str
-    data: list[dict[str, Any]]  # traces, as of plotly.js
-    layout: dict[str, Any]
-    wide: bool = False  # takes the whole width
-
-
 def figures(runs: Sequence[Run]) -> list[Figure]:
     """Return all figures that there is something to draw for."""
-    shown = [_Shown(run, COLOURS[n % len(COLOURS)], several=len(runs) > 1) for n, run in enumerate(runs)]
+    shown = [_ShownRun(run, COLOURS[n % len(COLOURS)], several=len(runs) > 1) for n, run in enumerate(runs)]
     found = [make(shown) for make in _FIGURES]
     return [figure for figure in found if figure.data]
 
 
-class _Shown:
-    """A run in its colour, with its errors."""
+def trajectory_figures(comparison: Comparison) -> tuple[list[Figure], str]:
+    """Return the way from above and the error over time, and in words how large the error is."""
+    shown = _Shown(comparison, COLOURS[0])
+    found = [figure for figure in (_above([shown]), _over_time([shown])) if figure.data]
+    if shown.after is None:
+        return found, "Trajectory before and after adjustment"
+    change = f"{shown.after.translation.rmse:.3f} m"
+    if shown.before is not None:
+        change = f"{shown.before.translation.rmse:.3f} m before, {change} after adjustment"
+    return found, f"Trajectory error (RMSE, {comparison.kind} alignment): {change}"
 
-    def __init__(self, run: Run, colour: str, *, several: bool) -> None:
-        self.run, self.colour, self.several = run, colour, several
-        self.before, self.after = (_error(poses, run.truth) for poses in (run.before, run.after))
-        self.details = run.details
+
+class _Shown:
+    """Trajectories and cloud in their colour, with their errors."""
+
+    def __init__(self, comparison: Comparison, colour: str, *, several: bool = False) -> None:
+        self.poses, self.colour, self.several = comparison, colour, several
+        self.before, self.after = (self._error(poses) for poses in (comparison.before, comparison.after))
+
+    def _error(self, poses: Poses | None) -> TrajectoryError | None:
+        if poses is None or self.poses.truth is None:
+            return None
+        try:
+            return absolute_error(poses, self.poses.truth, self.poses.kind)
+        except EvaluationError:
+            return None
 
     def name(self, what: str) -> str:
-        return f"{self.run.name}: {what}" if self.several else what
-
-    def aligned(self, points: FloatArray, error: TrajectoryError | None) -> FloatArray:
-        return points if error is None else error.alignment.apply(points)
+        return f"{self.poses.name}: {what}" if self.several else what
 
     def seconds(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        return np.asarray((stamp_ns - self.run.after.stamp_ns[0]) * 1e-9)
+        return np.asarray((stamp_ns - self.poses.after.stamp_ns[0]) * 1e-9)
 
     @property
-    def solve_s(self) -> FloatArray:
-        return self.seconds(self.details["solve_stamp_ns"])
+    def cloud(self) -> FloatArray:
+        """Return the points that all but 1 % along each axis span: strays must not shrink the picture."""
+        cloud = _aligned(self.poses.cloud, self.after)
+        if not len(cloud):
+            return cloud
+        low, high = np.percentile(cloud, [0.5, 99.5], axis=0)
+        return np.asarray(cloud[((cloud >= low) & (cloud <= high)).all(axis=1)])
+
+    @property
+    def paths(self) -> list[tuple[str, FloatArray, str, str]]:
+        """Return name, positions, colour and dash of the trajectories, in the frame of the truth if there is one."""
+        of = self.poses
+        found = []
+        if of.truth is not None and self.after is not None:
+            found.append(("reference", of.truth.position, TRUTH, "dot"))
+        if of.before is not None and not self.several:
+            found.append(("before", _aligned(of.before.position, self.before), BEFORE, "dash"))
+        name = "estimate" if of.before is None else "after"
+        return [*found, (name, _aligned(of.after.position, self.after), self.colour, "solid")]
 
 
-def _error(poses: Poses, truth: Poses | None) -> TrajectoryError | None:
-    try:
-        return None if truth is None else absolute_error(poses, truth)
-    except EvaluationError:
-        return None
+class _ShownRun(_Shown):
+    """A run in its colour."""
+
+    def __init__(self, run: Run, colour: str, *, several: bool) -> None:
+        super().__init__(run, colour, several=several)
+        self.run, self.details = run, run.details
+        self.solve_s = self.seconds(run.details["solve_stamp_ns"])
 
 
-def array(values: Any) -> dict[str, str]:
-    """Return numbers as plotly.js takes them: bytes in base64, of float32 where that is precise enough."""
-    values = np.asarray(values, float)
-    kind = "f8" if len(values) and np.nanmax(np.abs(values), initial=0.0) > _FAR else "f4"
-    return {"dtype": kind, "bdata": base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()}
+def _aligned(points: FloatArray, error: TrajectoryError | None) -> FloatArray:
+    return points if error is None else error.alignment.apply(points)
+
+
+def ground_axes(path: FloatArray) -> tuple[int, int]:
+    """Return the two axes along which a path (n, 3) goes most: those of the ground, whatever the frame is."""
+    spread = np.ptp(path, axis=0) if len(path) else np.zeros(3)
+    # Of equal ones the first: z is up in most frames.
+    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
+    return first, second
 
 
 def line(x: Any, y: Any, name: str, colour: str, **more: Any) -> dict[str, Any]:
     """Return a trace of lines and markers."""
     style: dict[str, Any] = {"line": {"color": colour, "width": 1.8}, "marker": {"color": colour, "size": 4}}
-    return {"type": "scatter", "mode": "lines+markers", "x": array(x), "y": array(y), "name": name} | style | more
-
-
-def _paths(one: _Shown) -> list[tuple[str, FloatArray, str, str]]:
-    """Return name, positions, colour and dash of the trajectories of a run, in the frame of the truth if it has one."""
-    run = one.run
-    found = [("after", one.aligned(run.after.position, one.after), one.colour, "solid")]
-    if not one.several:
-        found.insert(0, ("before", one.aligned(run.before.position, one.before), BEFORE, "dash"))
-    if run.truth is not None and one.after is not None:
-        found.insert(0, ("reference", run.truth.position, TRUTH, "dot"))
-    return found
+    return (
+        {"type": "scatter", "mode": "lines+markers", "x": np.asarray(x, float), "y": np.asarray(y, float), "name": name}
+        | style
+        | more
+    )
 
 
 def _above(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
-    across, up = ground_axes(_paths(shown[0])[0][1])
+    across, up = ground_axes(shown[0].paths[-1][1])
     for number, one in enumerate(shown):
-        cloud = _few(_without_strays(one.aligned(one.run.cloud, one.after)), _ABOVE)
+        cloud = _few(one.cloud, _ABOVE)
         if len(cloud) and number == 0:
             style = {"mode": "markers", "marker": {"color": CLOUD, "size": 3, "opacity": 0.6}, "hoverinfo": "skip"}
             data.append(line(cloud[:, across], cloud[:, up], "map", CLOUD, **style))
-        for name, path, colour, dash in _paths(one):
+        for name, path, colour, dash in one.paths:
             if name != "reference" or number == 0:
                 drawn = line(path[:, across], path[:, up], one.name(name), colour)
                 data.append(drawn | {"line": {"color": colour, "width": 2, "dash": dash}})
@@ -128,8 +146,8 @@ def _above(shown: Sequence[_Shown]) -> Figure:
 def _space(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
     for number, one in enumerate(shown):
-        cloud = _few(_without_strays(one.aligned(one.run.cloud, one.after)), _POINTS)
-        for name, path, colour, dash in _paths(one):
+        cloud = _few(one.cloud, _POINTS)
+        for name, path, colour, dash in one.paths:
             if name != "reference" or number == 0:
                 style = {"mode": "lines", "line": {"color": colour, "width": 5, "dash": dash}}
                 data.append(_in_space(path, one.name(name)) | style)
@@ -137,26 +155,17 @@ def _space(shown: Sequence[_Shown]) -> Figure:
             marker = {"color": CLOUD if number == 0 else one.colour, "size": 1.5, "opacity": 0.6}
             data.append(_in_space(cloud, one.name("map")) | {"mode": "markers", "marker": marker, "hoverinfo": "skip"})
     # Upwards is the axis along which nothing goes; cameras look along z, with y downwards.
-    vertical = "xyz"[3 - sum(ground_axes(_paths(shown[0])[0][1]))]
+    vertical = "xyz"[3 - sum(ground_axes(shown[0].paths[-1][1]))]
     camera: dict[str, Any] = {"up": dict.fromkeys("xyz", 0) | {vertical: -1 if vertical == "y" else 1}}
     camera["eye"] = {axis: -1.3 if axis == "y" else 1.3 for axis in "xyz"}
     axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
-    note = f" {_POINTS} of its points are drawn." if any(len(one.run.cloud) > _POINTS for one in shown) else ""
+    note = f" {_POINTS} of its points are drawn." if any(len(one.poses.cloud) > _POINTS for one in shown) else ""
     text = f"Drag to turn. Strays of the map, one point in a hundred along each axis, are left out.{note}"
     return Figure("space", "In space", text, data, {"scene": axes | {"aspectmode": "data", "camera": camera}})
 
 
-def _without_strays(cloud: FloatArray) -> FloatArray:
-    """Return the points that all but 1 % along each axis span: strays must not shrink the picture."""
-    if not len(cloud):
-        return cloud
-    low, high = np.percentile(cloud, [0.5, 99.5], axis=0)
-    return np.asarray(cloud[((cloud >= low) & (cloud <= high)).all(axis=1)])
-
-
 def _in_space(points: FloatArray, name: str) -> dict[str, Any]:
-    x, y, z = (array(column) for column in points.T)
-    return {"type": "scatter3d", "x": x, "y": y, "z": z, "name": name}
+    return {"type": "scatter3d", "name": name} | dict(zip("xyz", points.T, strict=True))
 
 
 def _over_time(shown: Sequence[_Shown]) -> Figure:
@@ -169,14 +178,16 @@ def _over_time(shown: Sequence[_Shown]) -> Figure:
     text = "Distance of each keyframe to the reference, after SE(3) alignment."
     if not data:
         for one in shown:
-            moved = np.linalg.norm(one.run.after.position - one.run.before.position, axis=1)
-            data.append(line(one.seconds(one.run.after.stamp_ns), moved, one.name("moved"), one.colour))
+            after, before = one.poses.after, one.poses.before
+            if before is not None and len(before) == len(after):
+                moved = np.linalg.norm(after.position - before.position, axis=1)
+                data.append(line(one.seconds(after.stamp_ns), moved, one.name("moved"), one.colour))
         layout["yaxis"] = {"title": "moved by [m]", "rangemode": "tozero"}
         text = "No reference to compare with: how far the adjustment moved each keyframe."
     return Figure("error", "Error over time", text, data, layout)
 
 
-def _of_solves(shown: Sequence[_Shown], what: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _of_solves(shown: Sequence[_ShownRun], what: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return a figure of each solve: before it, unless several runs are shown, and after it; 0 is none."""
     data = []
     for one in shown:
@@ -187,17 +198,17 @@ def _of_solves(shown: Sequence[_Shown], what: str) -> tuple[list[dict[str, Any]]
     return data, {"xaxis": {"title": "time [s]"}, "yaxis": {"type": "log"}}
 
 
-def _objective(shown: Sequence[_Shown]) -> Figure:
+def _objective(shown: Sequence[_ShownRun]) -> Figure:
     text = "The cost at its start and at its end."
     return Figure("objective", "Objective of each solve", text, *_of_solves(shown, "objective"))
 
 
-def _held_out(shown: Sequence[_Shown]) -> Figure:
+def _held_out(shown: Sequence[_ShownRun]) -> Figure:
     text = "Median residual [px] of tracks that took no part in a solve, by the front-end's poses and by the solution."
     return Figure("held_out", "Tracks held out", text, *_of_solves(shown, "held_out_px"))
 
 
-def _arrows(shown: Sequence[_Shown]) -> Figure:
+def _arrows(shown: Sequence[_ShownRun]) -> Figure:
     """Draw the residuals of the first run as vectors, for each camera; on images those of one keyframe."""
     details = shown[0].details
     images = {camera: details[f"image_{camera}"] for camera in range(_CAMERAS) if f"image_{camera}" in details}
@@ -260,7 +271,7 @@ def _segments(begin: FloatArray, end: FloatArray) -> FloatArray:
     return np.stack([begin, end, np.full(len(begin), np.nan)], axis=1).ravel()
 
 
-def _histogram(shown: Sequence[_Shown]) -> Figure:
+def _histogram(shown: Sequence[_ShownRun]) -> Figure:
     data = []
     middle, width = 0.5 * (BINS[1:] + BINS[:-1]), BINS[1] - BINS[0]
     for one in shown:
@@ -277,16 +288,16 @@ def _histogram(shown: Sequence[_Shown]) -> Figure:
     return Figure("histogram", "Residuals against the Gaussian", text, data, layout)
 
 
-def _tracks(shown: Sequence[_Shown]) -> Figure:
+def _tracks(shown: Sequence[_ShownRun]) -> Figure:
     data = []
     for one in shown:
         views, parallax = one.details["views"], one.details["parallax"]
         length = np.arange(len(views))
         style = {"marker": {"color": one.colour}, "legendgroup": one.run.name, "name": one.run.name}
-        data.append({"type": "bar", "x": array(length[2:]), "y": array(views[2:]), **style, "showlegend": False})
+        data.append({"type": "bar", "x": length[2:], "y": views[2:], **style, "showlegend": False})
         edges = np.maximum(PARALLAX_DEG, 0.03)
         middle = np.sqrt(edges[1:] * edges[:-1])
-        bar = {"x": array(middle), "width": array(np.diff(edges)), "y": array(parallax), "xaxis": "x2", "yaxis": "y2"}
+        bar = {"x": middle, "width": np.diff(edges), "y": parallax, "xaxis": "x2", "yaxis": "y2"}
         data.append({"type": "bar", **bar, **style, "showlegend": len(shown) > 1})
     layout = {
         "xaxis": {"title": "observations of a track", "domain": [0.0, 0.46]},
@@ -299,7 +310,7 @@ def _tracks(shown: Sequence[_Shown]) -> Figure:
     return Figure("tracks", "Tracks: length and parallax", text, data, layout)
 
 
-def _health(shown: Sequence[_Shown]) -> Figure:
+def _health(shown: Sequence[_ShownRun]) -> Figure:
     data = []
     for one in shown:
         if len(one.solve_s):
@@ -329,7 +340,7 @@ def _health(shown: Sequence[_Shown]) -> Figure:
     return Figure("health", "Health of each window", text, data, layout)
 
 
-def _latency(shown: Sequence[_Shown]) -> Figure:
+def _latency(shown: Sequence[_ShownRun]) -> Figure:
     data = []
     for one in shown:
         times = 1e3 * np.array(one.run.report.get("solve_times_s", []))
@@ -337,12 +348,13 @@ def _latency(shown: Sequence[_Shown]) -> Figure:
             p50, p95 = np.percentile(times, [50, 95])
             name = one.name(f"median {p50:.1f} ms, p95 {p95:.1f} ms")
             data.append(line(one.solve_s, times, name, one.colour, mode="markers"))
-    layout = {"xaxis": {"title": "time [s]"}, "yaxis": {"title": "time of a solve [ms]", "rangemode": "tozero"}}
+    layout: dict[str, Any] = {"showlegend": True, "xaxis": {"title": "time [s]"}}
+    layout["yaxis"] = {"title": "time of a solve [ms]", "rangemode": "tozero"}
     caption = "Time in the solver for each keyframe, on the machine of the replay."
     return Figure("latency", "Latency", caption, data, layout)
 
 
-def _rejected(shown: Sequence[_Shown]) -> Figure:
+def _rejected(shown: Sequence[_ShownRun]) -> Figure:
     data: list[dict[str, Any]] = []
     for one in shown:
         counts: Counter[str] = Counter(one.run.report["bag_rejected"])
@@ -364,7 +376,7 @@ def _few(rows: NDArray[Any], most: int) -> NDArray[Any]:
     return rows[np.linspace(0, len(rows) - 1, most).astype(np.intp)]
 
 
-_FIGURES: tuple[Callable[[Sequence[_Shown]], Figure], ...] = (
+_FIGURES: tuple[Callable[[Sequence[_ShownRun]], Figure], ...] = (
     _above,
     _space,
     _over_time,

@@ -9,47 +9,85 @@ import gzip
 import importlib.util
 import json
 import re
-import shutil
-import subprocess
-import tempfile
-from collections.abc import Sequence
-from dataclasses import asdict
-from html import escape, unescape
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from typing import Any
 
-from ba_node.io.files import whole_file
-from ba_node.offline.figures import Figure
+import numpy as np
 
-# Browsers that draw a page without a window, for its pictures.
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_DRAW_MS = 60_000
-_TIMEOUT_S = 300
+from ba_node.io.files import whole_file, write_csv, write_json
+
+# Beyond it a float32 has steps of more than a centimetre.
+_FAR = 1e5
 
 
 class PageError(ValueError):
-    """A page that cannot be made, or a picture of it."""
+    """A page that cannot be made."""
 
 
-def write_page(path: Path, title: str, figures: Sequence[Figure], head: str, tail: str = "") -> None:
-    """Write a page: title, ``head`` (HTML), the figures, ``tail`` (HTML).
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a page."""
+
+    key: str  # name of its picture
+    title: str
+    caption: str
+    data: list[dict[str, Any]]  # traces, as of plotly.js, with arrays
+    layout: dict[str, Any]
+    wide: bool = False  # takes the whole width
+
+
+@dataclass(frozen=True)
+class Page:
+    """What stands on a page: title, ``head`` (HTML), the figures that have data, ``tail`` (HTML)."""
+
+    title: str
+    figures: Sequence[Figure]
+    head: str
+    tail: str = ""
+
+
+def write_results(
+    out: Path, name: str, content: Mapping[str, Any], table: Sequence[Sequence[object]], page: Page
+) -> str:
+    """Write NAME.json, NAME.csv and index.html; return their names, or in words why there is no page.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    write_json(out / f"{name}.json", content)
+    write_csv(out / f"{name}.csv", table)
+    names = f"{name}.json, {name}.csv"
+    try:
+        write_page(out / "index.html", page)
+    except PageError as error:
+        return f"{names}; {error}"
+    return f"{names}, index.html"
+
+
+def write_page(path: Path, page: Page) -> None:
+    """Write a page.
 
     Raises:
         PageError: plotly is not installed.
         OSError: the file cannot be written.
     """
+    figures = [figure for figure in page.figures if figure.data]
     frames = (
         f"<figure{' class=wide' if figure.wide else ''}><h3>{escape(figure.title)}</h3>"
         f'<figcaption>{escape(figure.caption)}</figcaption><div class="plot" id="plot-{figure.key}"></div></figure>'
         for figure in figures
     )
-    data = [{key: value for key, value in asdict(figure).items() if key != "caption"} for figure in figures]
+    data = [{"key": figure.key, "data": figure.data, "layout": figure.layout} for figure in figures]
     parts = {
-        "TITLE": escape(title),
-        "HEAD": head,
+        "TITLE": escape(page.title),
+        "HEAD": page.head,
         "FIGURES": "\n".join(frames),
-        "TAIL": tail,
+        "TAIL": page.tail,
         "LIBRARY": _packed(_library()),
-        "DATA": _packed(json.dumps(data, separators=(",", ":")).encode()),
+        "DATA": _packed(json.dumps(data, separators=(",", ":"), default=_encoded).encode()),
     }
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     text = re.sub(r"@([A-Z]+)@", lambda found: parts[found[1]], template)
@@ -69,41 +107,17 @@ def _packed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
 
-def write_pictures(page: Path, folder: Path) -> list[Path]:
-    """Have a browser without a window draw each figure of a page, and write it as PNG.
-
-    Raises:
-        PageError: there is no such browser, or it draws nothing.
-    """
-    found = list(re.finditer(r'<img id="png-(\w+)" src="data:image/png;base64,([^"]+)"', browse(page, "#png")))
-    if not found:
-        raise PageError(f"{page}: the browser has drawn nothing of it")
-    written = []
-    for picture in found:
-        written.append(folder / f"{picture[1]}.png")
-        with whole_file(written[-1]) as stream:
-            stream.write(base64.b64decode(picture[2]))
-    return written
+def _encoded(values: np.ndarray) -> dict[str, str]:
+    """Return numbers as plotly.js takes them: bytes in base64, of float32 where that is precise enough."""
+    values = np.asarray(values, float)
+    kind = "f8" if len(values) and np.nanmax(np.abs(values), initial=0.0) > _FAR else "f4"
+    return {"dtype": kind, "bdata": base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()}
 
 
-def browse(page: Path, fragment: str = "") -> str:
-    """Open a page in a browser without a window and return what stands in it then, as HTML.
-
-    Raises:
-        PageError: there is no such browser, or it fails.
-    """
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        raise PageError(f"no pictures without one of these programs: {', '.join(BROWSERS)}")
-    with tempfile.TemporaryDirectory() as profile:
-        command = [browser, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader"]
-        command += [f"--user-data-dir={profile}", f"--virtual-time-budget={_DRAW_MS}", "--dump-dom"]
-        command += ["--window-size=1366,900", page.resolve().as_uri() + fragment]
-        try:
-            run = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True)
-        except subprocess.SubprocessError as error:
-            raise PageError(f"{page}: {browser} cannot open it: {error}") from None
-    failed = re.search(r'<body[^>]* data-failed="([^"]*)"', run.stdout)
-    if failed:
-        raise PageError(f"{page}: the browser reports: {unescape(failed[1])}")
-    return run.stdout
+def html_table(head: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Return a table; each row has a class and its cells."""
+    lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
+    for kind, cells in rows:
+        row = "".join(f"<td{' class=text' if len(cell) > 40 else ''}>{escape(cell)}</td>" for cell in cells)
+        lines.append(f"<tr class={kind}>{row}</tr>" if kind else f"<tr>{row}</tr>")
+    return f"<div class=wrap><table>{''.join(lines)}</table></div>"

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,70 +12,47 @@ from typing import Any
 import numpy as np
 
 from ba_node.config import Config
-from ba_node.evaluation.alignment import EvaluationError
-from ba_node.evaluation.plot import Comparison, draw
-from ba_node.io.files import whole_file
 from ba_node.offline.figures import figures, verdicts
-from ba_node.offline.page import PageError, write_page
+from ba_node.offline.page import Page, PageError, html_table, write_page
+from ba_node.offline.pictures import draw_trajectory, write_pictures
 from ba_node.offline.run_folder import Run, read_run
 
 REPORT = "report.html"
 
 
-def write_report(folders: Sequence[Path], path: Path) -> None:
-    """Write a page of one replay, or of several side by side.
+def write_report(folders: Sequence[Path], path: Path) -> str:
+    """Write a page of one replay, or of several side by side, and each figure as PNG; return what to say of them.
+
+    The pictures go to a folder beside the page, of the same name without its end.
 
     Raises:
         RunError: a folder holds no results.
-        PageError: plotly is not installed.
-        OSError: the page cannot be written.
+        OSError: a file cannot be written.
     """
     runs = [read_run(folder, name) for folder, name in zip(folders, _names(folders), strict=True)]
+    drawn = figures(runs)
+    write_pictures(path.with_suffix(""), drawn)
     head = [_subtitle(runs), *map(_verdict, runs)]
     head.append(_tiles(runs[0]) if len(runs) == 1 else _side_by_side(runs))
     tail = [_guard(run, several=len(runs) > 1) for run in runs] + [_parameters(runs), _origin(runs)]
     title = f"Replay of {runs[0].report['bag']}" if len(runs) == 1 else f"{len(runs)} replays side by side"
-    write_page(path, title, figures(runs), "\n".join(head), "\n".join(tail))
+    pictures = f"each figure as PNG in {path.stem}/"
+    try:
+        write_page(path, Page(title, drawn, "\n".join(head), "\n".join(tail)))
+    except PageError as error:
+        return f"{pictures}; {error}"
+    return f"{path.name}, {pictures}"
 
 
 def show(folder: Path) -> str:
-    """Write page and picture of a replay into its folder; return what to say of them.
+    """Write page and pictures of a replay into its folder; return what to say of them.
 
     Raises:
         RunError: the folder holds no results.
         OSError: a file cannot be written.
     """
-    draw_trajectory(folder)
-    try:
-        write_report([folder], folder / REPORT)
-    except PageError as error:
-        return f"trajectory.png; {error}"
-    return f"{REPORT}, trajectory.png and others"
-
-
-def draw_trajectory(folder: Path) -> None:
-    """Draw the trajectory of a replay to trajectory.png in its folder.
-
-    Raises:
-        RunError: the folder holds no results.
-        OSError: the picture cannot be written.
-    """
-    run = read_run(folder)
-    comparison = Comparison(run.before, run.after, run.truth, run.cloud)
-    with whole_file(folder / "trajectory.png") as stream:
-        try:
-            draw(stream, comparison)
-        except EvaluationError:  # a reference that cannot be compared with
-            draw(stream, replace(comparison, truth=None))
-
-
-def html_table(head: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Return a table; each row has a class and its cells."""
-    lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
-    for kind, cells in rows:
-        row = "".join(f"<td{' class=text' if len(cell) > 40 else ''}>{escape(cell)}</td>" for cell in cells)
-        lines.append(f"<tr class={kind}>{row}</tr>" if kind else f"<tr>{row}</tr>")
-    return f"<div class=wrap><table>{''.join(lines)}</table></div>"
+    draw_trajectory(folder / "trajectory.png", read_run(folder))
+    return f"trajectory.png, {write_report([folder], folder / REPORT)}"
 
 
 def _names(folders: Sequence[Path]) -> list[str]:

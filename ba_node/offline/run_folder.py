@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ba_node import __version__
 from ba_node.arrays import FloatArray
 from ba_node.estimate import Poses
+from ba_node.evaluation.alignment import Kind
 from ba_node.io.files import whole_file
 from ba_node.io.parameters import configure
 from ba_node.io.ply import read_ply_points
@@ -43,16 +44,22 @@ class RunError(ValueError):
 
 
 @dataclass(frozen=True)
-class Run:
-    """The results of a replay."""
+class Comparison:
+    """A trajectory beside others, and the map."""
 
     name: str  # what it is called beside others
-    folder: Path  # where they are
-    report: dict[str, Any]  # content of report.json
-    before: Poses  # the front-end's trajectory
+    before: Poses | None  # the front-end's trajectory; None to show that after adjustment alone
     after: Poses  # after adjustment
-    truth: Poses | None  # reference, if the recording has one
-    cloud: FloatArray  # (n, 3) points of the map, m
+    truth: Poses | None  # reference, if there is one
+    cloud: FloatArray  # (n, 3) points of the map, in the frame of ``after``, m
+    kind: Kind  # alignment of both trajectories to the reference
+
+
+@dataclass(frozen=True)
+class Run(Comparison):
+    """The results of a replay."""
+
+    report: dict[str, Any]  # content of report.json
     details: dict[str, NDArray[Any]]  # see :func:`write_details`
     parameters: dict[str, object]  # by full name
 
@@ -108,12 +115,12 @@ def read_run(folder: Path, name: str = "") -> Run:
         truth = folder / "ground_truth.tum"
         return Run(
             name or folder.name,
-            folder,
-            report,
             read_tum(folder / "trajectory_input.tum"),
             read_tum(folder / "trajectory.tum"),
             read_tum(truth) if truth.is_file() else None,
             read_ply_points(folder / "points.ply"),
+            "se3",
+            report,
             details,
             dict(configure(folder / "effective.yaml", {}).values()),
         )

@@ -13,10 +13,10 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
+from ba_node.core.bordered import Shared, Unknown, place_of, solve_shared
 from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Cameras, Problem, State
 from ba_node.core.result import Result
-from ba_node.core.self_calibration import Unknown, calibrate, place_of
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
 from ba_node.io.colmap import ColmapModel, read_colmap, write_colmap
@@ -121,7 +121,8 @@ def solve_model(
     unknowns = tuple(unknowns_of(colmap.model, groups))
     ready = clock()
     if unknowns:
-        result, cameras = calibrate(problem, unknowns, options, clock=clock, on_iteration=on_iteration)
+        result, end = solve_shared(problem, Shared(unknowns), options, clock=clock, on_iteration=on_iteration)
+        cameras = end.cameras
     else:
         result, cameras = solve(problem, options, clock=clock, on_iteration=on_iteration), problem.cameras
     return ModelSolution(

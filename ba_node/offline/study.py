@@ -14,6 +14,7 @@ import numpy as np
 from ba_node.config import Config, Parameter, Value
 from ba_node.io.mcap import TopicChoice
 from ba_node.offline.measure import Measured, Objective
+from ba_node.offline.page import Figure
 
 Goal = Literal["accuracy", "latency"]
 STUDY = "ba_node"
@@ -22,6 +23,8 @@ MAX_SCORE = 1.05
 # What says that the search is worth it, and that it fits the recordings alone.
 MIN_GAIN, MAX_LOSS = 0.01, 0.02
 _RANDOM_FIRST = 10
+# Parameters that are drawn one by one, of those that decide most.
+_DRAWN = 6
 # Trials of which the recording for validation chooses one, none of them worse than the best by more than this.
 _FINALISTS, _NEARLY = 10, 1.1
 
@@ -162,6 +165,27 @@ class Study:
         except (ValueError, RuntimeError):
             return {}
         return {name: float(value) for name, value in found.items()}
+
+    def slices(self) -> list[Figure]:
+        """Return the score over each of the parameters that decide most; nothing where plotly is not installed."""
+        draw = self._optuna.visualization
+        if not draw.is_available():
+            return []
+        names = [*self.importance(), *self._ranges]
+        drawn = draw.plot_slice(
+            self._study,
+            params=list(dict.fromkeys(names))[:_DRAWN],
+            target=lambda trial: trial.user_attrs["score"],
+            target_name="error beside the start's",
+        ).to_plotly_json()
+        layout = {
+            name: axis | {"title": axis.get("title", {}).get("text", "")}
+            for name, axis in drawn["layout"].items()
+            if name.startswith(("xaxis", "yaxis"))
+        }
+        return [
+            Figure("slices", "Each parameter by itself", "Later trials are darker.", drawn["data"], layout, wide=True)
+        ]
 
 
 def _rounded(values: Mapping[str, Value]) -> dict[str, Value]:

@@ -25,6 +25,7 @@ import numpy as np
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations, find
 from ba_node.offline.fleet import Fleet, result_of, words_of
 from ba_node.offline.measure import Measured, MeasureError, Question, measure
+from ba_node.offline.page import Figure
 from ba_node.offline.study import MAX_LOSS, MAX_SCORE, MIN_GAIN, Goal, Plan, Study, Trial, TuneError
 
 
@@ -39,6 +40,7 @@ class Tuned:
     trials: list[Trial]
     failed: int  # trials whose parameters contradict each other, or gave nothing to measure
     importance: dict[str, float]  # of each parameter, share; empty if too few trials tell
+    slices: list[Figure]  # the score over each parameter
     left_out: dict[str, str]  # recordings that cannot be used, and why
 
     @property
@@ -113,7 +115,7 @@ def tune(
     after, useless = usable(plan, base.with_values(best.values), fleet)
     if useless:
         raise TuneError(f"with the best parameters: {next(iter(useless.values()))}")
-    return Tuned(plan, start, best, after, study.trials(), study.failed(), study.importance(), left_out)
+    return Tuned(plan, start, best, after, study.trials(), study.failed(), study.importance(), study.slices(), left_out)
 
 
 def _validated(plan: Plan, base: Config, fleet: Fleet, study: Study) -> Trial:

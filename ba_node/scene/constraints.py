@@ -132,8 +132,9 @@ class Constraints:
 
     def add_merge(self, merge: TrackMerge, log: RejectionLog) -> None:
         """Take in pairs of tracks that are the same point."""
-        if merge.malformed:
-            log.reject("malformed", f"merge of tracks: {merge.malformed}")
+        malformed = merge.malformed or _lengths(merge.track_id, merge.same_as)
+        if malformed:
+            log.reject("malformed", f"merge of tracks: {malformed}")
             return
         for pair in zip(merge.track_id.tolist(), merge.same_as.tolist(), strict=True):
             one, other = (self.name_of(track) for track in pair)
@@ -172,8 +173,9 @@ class Constraints:
 
     def add_landmarks(self, priors: LandmarkPriors, log: RejectionLog) -> None:
         """Take in places of points; the last of a track counts."""
-        if priors.malformed:
-            log.reject("malformed", f"landmark priors: {priors.malformed}")
+        malformed = priors.malformed or _lengths(priors.track_id, priors.position, priors.covariance)
+        if malformed:
+            log.reject("malformed", f"landmark priors: {malformed}")
             return
         if not self._same_world("landmark priors", priors.frame_id, log):
             return
@@ -230,12 +232,7 @@ class Constraints:
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
         """Drop what hangs on keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
         gone = set(keyframes.tolist())
-        self.relative = {key: value for key, value in self.relative.items() if gone.isdisjoint(key)}
-        self.unchecked = [key for key in self.unchecked if key in self.relative]
-        self.relative_of = {}
-        for key in self.relative:
-            for one in key:
-                self.relative_of.setdefault(one, []).append(key)
+        self._drop([key for key in self.relative if not gone.isdisjoint(key)])
         self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}
         self.steps = {key: value for key, value in self.steps.items() if key not in gone}
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
@@ -245,13 +242,23 @@ class Constraints:
         """Give up what names keyframes that never came; count what lies outside the time of all keyframes."""
         log.notice("unpaired", sum(not span_ns[0] <= one.stamp_ns <= span_ns[1] for one in self.absolute))
         known = set(keyframes.tolist())
-        for key in [key for key in self.relative if not known.issuperset(key)]:
+        never = [key for key in self.relative if not known.issuperset(key)]
+        for key in never:
             missing = next(one for one in key if one not in known)
             log.reject("unknown_keyframe", f"relative pose of keyframe {key[1]} in {key[0]}: {missing} never came")
-            del self.relative[key]
+        self._drop(never)
         for one in [one for one in self.gravity if one not in known]:
             log.reject("unknown_keyframe", f"gravity at keyframe {one}, which never came")
             del self.gravity[one]
+
+    def _drop(self, keys: list[tuple[int, int]]) -> None:
+        """Forget relative poses."""
+        for key in keys:
+            del self.relative[key]
+            for one in key:
+                self.relative_of[one].remove(key)
+        self.relative_of = {one: left for one, left in self.relative_of.items() if left}
+        self.unchecked = [key for key in self.unchecked if key in self.relative]
 
     def _insert(self, one: Absolute) -> None:
         bisect.insort(self.absolute, one, key=lambda known: known.stamp_ns)
@@ -277,6 +284,9 @@ def _pose(name: str, position: FloatArray, orientation: FloatArray, log: Rejecti
 
 def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
     """Return a covariance (size, size), or None (counted) if it is not positive definite."""
+    if np.size(values) != size * size:
+        log.reject("bad_covariance", f"{name}: {np.size(values)} numbers, expected {size * size}")
+        return None
     matrix = np.asarray(values, float).reshape(size, size)
     if np.isfinite(matrix).all() and np.abs(matrix - matrix.T).max() <= _SYMMETRIC * np.abs(matrix).max():
         lowest = float(np.linalg.eigvalsh(matrix).min())
@@ -286,6 +296,12 @@ def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> 
         return None
     log.reject("bad_covariance", f"{name}: {matrix.tolist()}, expected finite and symmetric")
     return None
+
+
+def _lengths(*arrays: FloatArray | IdArray) -> str:
+    """Return in words that arrays are not of one length, empty if they are."""
+    lengths = [len(one) for one in arrays]
+    return "" if len(set(lengths)) == 1 else f"arrays of {', '.join(map(str, lengths))} rows, expected as many in each"
 
 
 def _finite(position: FloatArray) -> bool:

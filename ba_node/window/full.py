@@ -31,14 +31,13 @@ from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import METHOD_LOSSES, CalibrationConfig, Config, SolverConfig, SolverOptions
-from ba_node.core import geometry, methods, native_kernels, solver
+from ba_node.core import calibration, geometry, methods, native_kernels, solver
 from ba_node.core.calibration import Calibration
 from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
-from ba_node.window.calibration import calibrated
 from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
@@ -112,7 +111,7 @@ class Optimization:
         """Solve, on any thread; the map is not touched. Arguments as of :func:`options` and ``solver.solve``."""
         chosen = options(config, method, max_iterations)
         if self.refine.wanted:
-            self.selection, self.calibration = calibrated(self.selection, self.held, self.stamp_ns, chosen, self.refine)
+            self._calibrate(chosen)
         result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
@@ -121,6 +120,19 @@ class Optimization:
             state = scaled(self.selection, self.position, result.state)
             selection = dataclasses.replace(self.selection, problem=problem)
             self.covariances = covariances(selection, state, self.position, chosen, points=self.wanted.points)
+
+    def _calibrate(self, chosen: SolverOptions) -> None:
+        """Let the problem begin at the solution for refined cameras."""
+        given, stamp_s = self.selection.problem, (self.stamp_ns - self.stamp_ns[0]) * 1e-9
+        if given.n_factors:
+            given = dataclasses.replace(given, fixed=self.held)  # the front-end's steps hold the scale
+        problem, state, found = calibration.calibrate(given, stamp_s, chosen, self.refine)
+        # The observations that sit the solve out are to be classified by the same cameras.
+        everything = dataclasses.replace(given, observations=self.selection.observations)
+        whole = calibration.with_calibration(everything, state, found, stamp_s)
+        problem = dataclasses.replace(problem, start=state)
+        self.selection = dataclasses.replace(self.selection, problem=problem, observations=whole.observations)
+        self.calibration = found
 
     @property
     def result(self) -> Result:

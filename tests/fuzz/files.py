@@ -30,12 +30,21 @@ from ba_node.io.colmap import read_colmap, to_colmap, write_colmap
 from ba_node.io.map_file import load_map, write_map
 from ba_node.io.mcap import BagReader
 from ba_node.io.parameters import configure, parameters_yaml
-from ba_node.io.pose_files import read_g2o, write_g2o
+from ba_node.io.pose_files import read_g2o, write_g2o, write_kitti
+from ba_node.io.reference import read_poses
+from ba_node.io.rig_file import FORMS, read_rig, rig_yaml
 from ba_node.io.trajectory import read_tum, write_tum
+from ba_node.messages.adapters import SOURCES, AdapterOptions
+from ba_node.offline.adapt import adapt
 from ba_node.offline.recording import read_truth, record
+from ba_node.offline.track import TrackRequest, track
 from experiments.robustness.faults import MONO, SOUND, spoiled
+from tests.front_end import world
+from tests.messages.adapters import layouts
 
 COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
+# Images of a recording, and left, top, width and height of the part of each that is in it, px.
+_IMAGE, _IMAGES, _CUT = "sensor_msgs/msg/Image", 3, (80, 60, 160, 120)
 Reader = Callable[[Path], object]
 _TINY: dict[str, Any] = {"keyframes": 3, "length_m": 10.0, "landmarks": 200, "tracks": 12}
 _MEMBER = struct.Struct("<HI")
@@ -78,18 +87,28 @@ def read_plain_map(path: Path) -> None:
     load_map(path, Config().scene)
 
 
-def _colmap(part: str) -> Reader:
-    """Return a reader of a model of COLMAP of which one file is the input."""
+def _colmap(part: str, text: str = "") -> Reader:
+    """Return a reader of a model of COLMAP of which one file is the input; ``text`` is "_text" where files are text."""
 
     def read(path: Path) -> None:
         folder = path.with_suffix(".model")
         folder.mkdir()
         for name in COLMAP:
-            content = path.read_bytes() if name == part else seeds()[f"colmap_{name}"][0]
-            (folder / f"{name}.bin").write_bytes(content)
+            content = path.read_bytes() if name == part else seeds()[f"colmap{text}_{name}"][0]
+            (folder / f"{name}.{'txt' if text else 'bin'}").write_bytes(content)
         read_colmap(folder)
 
     return read
+
+
+def _adapted(source: str) -> Reader:
+    """Return a reader of a recording of another front-end."""
+    return lambda path: adapt(path, path.with_suffix(".mcap"), source, AdapterOptions(), 1, {})
+
+
+def read_images(path: Path) -> None:
+    """Track the images of a recording."""
+    track(path, path.with_suffix(".mcap"), TrackRequest())
 
 
 def _packed(suffix: str, pack: Callable[[bytes], bytes]) -> Reader:
@@ -114,7 +133,12 @@ READERS: dict[str, Reader] = {
     "bal_bz2_raw": lambda path: read_bal(path.rename(path.with_suffix(".bz2"))),
     "bundler": read_bundler,
     "g2o": read_g2o,
+    "poses": read_poses,
+    "rig": read_rig,
     **{f"colmap_{part}": _colmap(part) for part in COLMAP},
+    **{f"colmap_text_{part}": _colmap(part, "_text") for part in COLMAP},
+    **{f"adapt_{source}": _adapted(source) for source in SOURCES},
+    "images": read_images,
     "yaml": lambda path: configure(path, {}),
     "map": lambda path: load_map(path, Config().scene),
     "map_members": read_plain_map,
@@ -145,7 +169,9 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
     write_bal(folder / "a.txt", bal)
     write_bundler(folder / "a.out", from_bal(bal, np.full(bal.points.shape, 255)))
     write_g2o(folder / "a.g2o", estimate.trajectory)
-    write_colmap(folder / "model", to_colmap(model.from_bal(bal)))
+    for name, text in (("model", False), ("text", True)):
+        write_colmap(folder / name, to_colmap(model.from_bal(bal)), text=text)
+    write_kitti(folder / "a.kitti", estimate.trajectory)
     read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "npz", "txt")}
     yaml = parameters_yaml(Config()).encode()
     metadata = (folder / "b" / "metadata.yaml").read_bytes()
@@ -161,7 +187,12 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
         "bal_bz2_raw": [bz2.compress(read["txt"])],
         "bundler": [(folder / "a.out").read_bytes()],
         "g2o": [(folder / "a.g2o").read_bytes()],
+        "poses": [(folder / "a.kitti").read_bytes(), read["tum"], read["tum"].replace(b" ", b",")],
+        "rig": [rig_yaml(world.rig(), form)[0].encode() for form in FORMS],
         **{f"colmap_{part}": [(folder / "model" / f"{part}.bin").read_bytes()] for part in COLMAP},
+        **{f"colmap_text_{part}": [(folder / "text" / f"{part}.txt").read_bytes()] for part in COLMAP},
+        **{f"adapt_{source}": [_of_front_end(folder, source)] for source in SOURCES},
+        "images": [_of_images(folder)],
         "yaml": [yaml, b"a: &a [1, 2]\nb: *a\nsolver: {max_iterations: 3}\n"],
         "map": [read["npz"]],
         "map_members": [_members(folder / "a.npz")],
@@ -172,6 +203,38 @@ def _bal(rng: np.random.Generator) -> BalProblem:
     camera, point = (index.ravel() for index in np.meshgrid(np.arange(2), np.arange(4), indexing="ij"))
     cameras = np.hstack([rng.normal(size=(2, 6)).round(2), np.tile([500.0, 0.0, 0.0], (2, 1))])
     return BalProblem(cameras, rng.normal(size=(4, 3)).round(2), camera, point, rng.normal(size=(8, 2)).round(1))
+
+
+def _of_front_end(folder: Path, source: str) -> bytes:
+    """Return a recording of what another front-end publishes."""
+    made = getattr(layouts, source)(layouts.scene(5, tracks=8, landmarks=300))
+    return _file_in(layouts.write(folder / source, made))
+
+
+def _of_images(folder: Path) -> bytes:
+    """Return a recording of images of a stereo rig, cut so that they are small."""
+    rig, (left, top, width, height), sent = world.rig(), _CUT, []
+    fx, fy, cx, cy = rig.intrinsics[0] - [0.0, 0.0, left, top]
+    for index, name in enumerate(rig.names):
+        info = layouts.make(
+            layouts.CAMERA_INFO, header=layouts.header(1, name), width=width, height=height,
+            k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1]), r=np.eye(3).ravel(),
+            p=np.array([fx, 0, cx, -fx * world.BASELINE * index, 0, fy, cy, 0, 0, 0, 1, 0]),
+        )  # fmt: skip
+        sent.append(layouts.Sent(f"/{name}/camera_info", layouts.CAMERA_INFO, info, 1))
+    for k, pose in enumerate(world.drive(_IMAGES)):
+        for index, name in enumerate(rig.names):
+            grey = world.render(rig, index, pose).grey[top : top + height, left : left + width]
+            image = layouts.make(
+                _IMAGE, header=layouts.header(10**9 + 10**8 * k, name), width=width, height=height,
+                encoding="mono8", step=width, data=grey.ravel(),
+            )  # fmt: skip
+            sent.append(layouts.Sent(f"/{name}/image_raw", _IMAGE, image, 10**9 + 10**8 * k))
+    return _file_in(layouts.write(folder / "images", sent))
+
+
+def _file_in(folder: Path) -> bytes:
+    return next(folder.glob("*.mcap")).read_bytes()
 
 
 def _unpacked(path: Path, chunked: bool) -> bytes:

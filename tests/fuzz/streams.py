@@ -16,8 +16,18 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.io import ros_types
 from ba_node.io.mcap import ROSBAGS_FACTORY
-from ba_node.measurements import CameraRig, Measurement
-from ba_node.messages.conversion import input_message, measurement_from_message
+from ba_node.measurements import (
+    FeatureTracks,
+    GlobalFix,
+    GravityDirection,
+    Keyframe,
+    LandmarkPriors,
+    Measurement,
+    PosePrior,
+    RelativePose,
+    TrackMerge,
+)
+from ba_node.messages.conversion import InputMessages, measurement_from_message
 from ba_node.messages.topics import INPUT_TYPES
 from experiments.robustness.faults import RIGS, SOUND, spoiled
 
@@ -63,8 +73,29 @@ class Bytes:
 
 @functools.cache
 def good_stream(rig: str, keyframes: int = 6) -> tuple[Measurement, ...]:
-    """Return a stream of some keyframes."""
-    return spoiled(SOUND, rig, **_TINY, keyframes=keyframes).measurements
+    """Return a stream of some keyframes, with all that may be known beside pixels after the third and the last."""
+    measurements = list(spoiled(SOUND, rig, **_TINY, keyframes=keyframes).measurements)
+    at = [i for i, one in enumerate(measurements) if isinstance(one, Keyframe)]
+    for end in (len(measurements), at[3]):
+        measurements[end:end] = _beside(measurements[:end])
+    return tuple(measurements)
+
+
+def _beside(stream: list[Measurement]) -> list[Measurement]:
+    """Return one of each kind of what may be known beside pixels, of the newest keyframes of a stream."""
+    keyframes = [one for one in stream if isinstance(one, Keyframe)]
+    ids = next(one.track_id for one in reversed(stream) if isinstance(one, FeatureTracks))
+    before, newest = keyframes[-2:]
+    pose = newest.position, newest.orientation
+    return [
+        RelativePose(0, before.keyframe_id, newest.keyframe_id, False, *pose, np.eye(6).ravel()),
+        RelativePose(0, keyframes[0].keyframe_id, newest.keyframe_id, True, *pose, np.eye(6).ravel()),
+        LandmarkPriors(0, newest.frame_id, ids[:2], np.ones((2, 3)), np.tile(np.eye(3), (2, 1, 1))),
+        TrackMerge(0, ids[2:4], ids[4:6]),
+        GravityDirection(0, newest.keyframe_id, np.array([0.0, 0.0, -1.0]), 0.02),
+        PosePrior(newest.stamp_ns, "site", *pose, np.eye(6).ravel()),
+        GlobalFix(newest.stamp_ns, "gps", np.array([48.0, 11.0, 500.0]), np.eye(3).ravel(), is_fix=True),
+    ]
 
 
 def stream(data: bytes, keyframes: int = 6) -> int:
@@ -172,11 +203,9 @@ def _type_bytes(index: int) -> bytes:
 
 
 def _good_cdr() -> list[tuple[int, bytes]]:
-    names = list(INPUT_TYPES)
-    good = good_stream(next(iter(RIGS)))
-    parts: list[tuple[str, Any]] = []
-    for measurement in good[:5]:
-        parts.append(input_message(ROSBAGS_FACTORY, measurement, 5, "camera"))
-        if isinstance(measurement, CameraRig):
-            parts.append(("camera_info", parts[-1][1].cameras[0]))
-    return [(names.index(name), ros_types.encode(INPUT_TYPES[name], message)) for name, message in parts]
+    """Return the number of an input and a good message of it, of each kind."""
+    names, messages = list(INPUT_TYPES), InputMessages(ROSBAGS_FACTORY)
+    good = dict(messages.of(measurement, 5) for measurement in good_stream(next(iter(RIGS))))
+    good["camera_info"] = good["camera_rig"].cameras[0]
+    assert good.keys() == INPUT_TYPES.keys(), "an input that no message is made of"
+    return [(names.index(name), ros_types.encode(INPUT_TYPES[name], message)) for name, message in good.items()]

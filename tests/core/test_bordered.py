@@ -9,19 +9,21 @@ import pytest
 
 from ba_node.arrays import FloatArray
 from ba_node.config import ConfigError, SolverOptions
+from ba_node.core.bordered import (
+    TIME,
+    Shared,
+    SharedKernels,
+    SharedState,
+    Unknown,
+    moved_cameras,
+    place_of,
+    shared_jacobian,
+    solve_shared,
+)
 from ba_node.core.cameras import Model, project
 from ba_node.core.methods import options
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.core.self_calibration import (
-    CalibratedState,
-    Unknown,
-    calibrate,
-    moved_cameras,
-    params_jacobian,
-    place_of,
-    theta_jacobian,
-)
 from ba_node.core.solver import solve
 
 AUTO = dataclasses.replace(
@@ -60,29 +62,16 @@ def unknowns(*groups: tuple[int, ...]) -> list[Unknown]:
 
 
 @pytest.mark.parametrize("model", list(Model))
-def test_derivatives_are_those_of_finite_differences(model: Model) -> None:
-    rng = np.random.default_rng(1)
-    x_cam = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 4.0], (20, 3))
-    params = np.array(LENS[model])
-    analytic = params_jacobian(x_cam, model, params)
-    for column in range(12 if model == Model.RATIONAL else 8):
-        step = np.zeros(12)
-        step[column] = 1e-6
-        ends = [project(x_cam, np.full(20, model, np.uint8), (params + s * step)[None]) for s in (1.0, -1.0)]
-        np.testing.assert_allclose(analytic[:, :, column], (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("model", list(Model))
 def test_the_jacobian_by_all_of_a_camera_is_that_of_finite_differences(model: Model) -> None:
     problem, cameras = scene(model, 1.0)
-    state = CalibratedState(**vars(problem.start), cameras=cameras)
-    wanted = unknowns((0, 1), (2,), (4,), (5,))
-    objective = Objective(problem, AUTO)
+    wanted = unknowns((0, 1), (2,), *((column,) for column in range(4, 12 if model == Model.RATIONAL else 8)))
+    objective, uv = Objective(problem, AUTO), problem.observations.uv
+    state = SharedState(**vars(problem.start), cameras=cameras, z=np.zeros(len(wanted)), uv=uv)
 
     def errors(theta: FloatArray) -> FloatArray:
-        return objective.through(moved_cameras(cameras, wanted, theta)).errors(state).ravel()
+        return objective.through(moved_cameras(cameras, wanted, theta), uv).errors(state).ravel()
 
-    analytic = theta_jacobian(objective, state, wanted).toarray()
+    analytic = shared_jacobian(objective, state, Shared(tuple(wanted))).toarray()
     for column in range(len(wanted)):
         step = np.zeros(len(wanted))
         step[column] = 1e-6
@@ -104,7 +93,8 @@ def test_wrong_cameras_are_found_again(model: Model, linear_solver: str) -> None
     wrong.params[:, 4] += 0.01
     problem = dataclasses.replace(problem, cameras=wrong, fixed=fixed)
     wanted = unknowns((0,), (1,), (2,), (3,), (4,))
-    result, found = calibrate(problem, wanted, dataclasses.replace(AUTO, linear_solver=linear_solver))
+    result, end = solve_shared(problem, Shared(tuple(wanted)), dataclasses.replace(AUTO, linear_solver=linear_solver))
+    found = end.cameras
     assert result.status.usable
     assert result.objective_before > 1e3
     assert result.objective_after < 1e-10
@@ -114,8 +104,8 @@ def test_wrong_cameras_are_found_again(model: Model, linear_solver: str) -> None
 
 def test_with_nothing_free_it_is_the_solver_itself() -> None:
     problem, _ = scene(Model.RATIONAL, 1.0)
-    result, cameras = calibrate(problem, [], AUTO)
-    np.testing.assert_array_equal(cameras.params, problem.cameras.params)
+    result, end = solve_shared(problem, Shared(()), AUTO)
+    np.testing.assert_array_equal(end.cameras.params, problem.cameras.params)
     plain = solve(problem, dataclasses.replace(AUTO, kernels="numpy", linear_solver="dense"))
     assert result.objective_after == pytest.approx(plain.objective_after, rel=1e-9)
 
@@ -131,6 +121,29 @@ def test_with_nothing_free_it_is_the_solver_itself() -> None:
 )
 def test_what_cannot_be_had_is_named(change: dict[str, str], words: str) -> None:
     problem, _ = scene(Model.RATIONAL)
+    chosen = dataclasses.replace(SolverOptions(), **change)  # type: ignore[arg-type]
     with pytest.raises(ConfigError) as error:
-        calibrate(problem, unknowns((0, 1)), dataclasses.replace(SolverOptions(), **change))  # type: ignore[arg-type]
+        solve_shared(problem, Shared(tuple(unknowns((0, 1)))), chosen)
     assert words in str(error.value)
+
+
+def test_gradient_and_model_are_those_of_the_objective_with_a_prior_and_a_clock() -> None:
+    """Along any step the objective falls as the bordered equations say, to second order."""
+    problem, _ = scene(Model.RATIONAL, 1.0)
+    rng = np.random.default_rng(8)
+    wanted = (*unknowns((0, 1), (4,)), Unknown(0, (TIME,)), Unknown(1, (TIME,)))
+    basis = (
+        np.diag([10.0, 0.1, 10.0, 0.1, *(0.01 * np.ones(6)), 0.01, 0.01]) @ np.linalg.qr(rng.normal(size=(12, 5)))[0]
+    )
+    flow = rng.normal(size=(len(problem.observations), 2)) * 100.0
+    shared = Shared(wanted, basis, rng.normal(size=5), flow)
+    kernels = SharedKernels(problem, AUTO, shared)
+    value = kernels.linearise(kernels.start)
+    system = kernels.damp("none", 1e-9)
+    n = len(system.rhs)
+    ratios = []
+    for size in (1e-3, 1e-4):
+        step = kernels.step(kernels.start, system, size * np.linspace(-1.0, 1.0, n), 0)
+        ratios.append(abs(value - step.objective - step.predicted) / abs(step.predicted))
+        kernels.linearise(kernels.start)
+    assert ratios[1] < 1e-2 and ratios[1] < 0.3 * ratios[0], ratios
