@@ -37,6 +37,7 @@ from ba_node.messages.factory import ConversionError
 from ba_node.messages.rig import rig_from_infos
 
 FORMS = ("own", "kalibr", "camera_info")
+_OWN = ("intrinsics", "distortion", "image_size", "position", "orientation")
 # Kalibr's names of distortions, and ROS's.
 _KALIBR = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": ""}
 
@@ -183,11 +184,7 @@ def _own_row(rig: CameraRig, i: int) -> dict[str, Any]:
     return {
         "name": rig.names[i],
         "distortion_model": rig.models[i],
-        "intrinsics": rig.intrinsics[i].tolist(),
-        "distortion": rig.distortion[i].tolist(),
-        "image_size": rig.image_size[i].tolist(),
-        "position": rig.position[i].tolist(),
-        "orientation": rig.orientation[i].tolist(),
+        **{name: getattr(rig, name)[i].tolist() for name in _OWN},
     }
 
 

@@ -8,11 +8,14 @@ other numbers are written so that they read back as the same float64.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from decimal import ROUND_HALF_EVEN, Decimal, DecimalException, InvalidOperation, localcontext
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.estimate import Poses
 from ba_node.io.files import opened, whole_file
 
@@ -20,6 +23,7 @@ from ba_node.io.files import opened, whole_file
 MAX_BYTES = 2**27
 _NS = 1_000_000_000
 _COLUMNS = "stamp x y z qx qy qz qw"
+Row = TypeVar("Row")
 
 
 class TrajectoryError(ValueError):
@@ -44,28 +48,39 @@ def read_tum(path: Path | str) -> Poses:
         TrajectoryError: the file cannot be opened or holds no pose; a line has not eight finite numbers, a stamp beyond
             int64 nanoseconds, or a quaternion of zeros. Names the line.
     """
-    path = Path(path)
-    try:
-        with opened(path, MAX_BYTES, TrajectoryError) as stream:
-            text = stream.read().decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: not a text file: {error}") from error
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            stamps.append(parse_stamp(words[0]))
-            rows.append(_parse_pose(words))
-        except ValueError as error:
-            raise TrajectoryError(f"{path}:{number}: {error}") from None
+    rows = read_rows(path, lambda words: (parse_stamp(words[0]), _parse_pose(words)))
     if not rows:
         raise TrajectoryError(f"{path}: no pose in it: expected lines with {_COLUMNS}")
-    values = np.array(rows)
-    ids = np.arange(len(rows), dtype=np.uint64)
-    return Poses(ids, np.array(stamps, dtype=np.int64), values[:, :3], values[:, 3:])
+    stamps, values = zip(*rows, strict=True)
+    return numbered(np.array(stamps, np.int64), np.array(values)[:, :3], np.array(values)[:, 3:])
+
+
+def numbered(stamp_ns: IntArray, position: FloatArray, orientation: FloatArray) -> Poses:
+    """Return poses whose ids count from 0."""
+    return Poses(np.arange(len(stamp_ns), dtype=np.uint64), stamp_ns, position, orientation)
+
+
+def read_rows(path: Path | str, parse: Callable[[list[str]], Row], separator: str | None = None) -> list[Row]:
+    """Return what is made of the words of each line; empty lines and those with # are passed over.
+
+    Raises:
+        TrajectoryError: the file cannot be opened, is no text, or ``parse`` raises ValueError; names the line.
+    """
+    rows: list[Row] = []
+    with opened(path, MAX_BYTES, TrajectoryError) as stream:
+        data = stream.read()
+    try:
+        lines = data.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path}: not a text file: {error}") from error
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            rows.append(parse(line.split(separator)))
+        except ValueError as error:
+            raise TrajectoryError(f"{path}:{number}: {error}") from None
+    return rows
 
 
 def format_stamp(stamp_ns: int) -> str:
