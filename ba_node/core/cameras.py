@@ -101,13 +101,14 @@ def parameters(name: str, intrinsics: FloatArray, coefficients: FloatArray) -> t
     return model, params
 
 
-def widest(model: Model, params: FloatArray) -> float:
-    """Return how far from the axis a distorted ray may lie and be the image of one ray alone; inf without a limit.
+def fold(model: Model, params: FloatArray) -> tuple[float, float]:
+    """Return from where on the distortion folds over: the image of rays farther out turns back.
 
-    Beyond it the distortion folds over: the image of rays farther out turns back. Tangential terms are left out.
+    Given as the angle of the ray from the axis, rad, and as the length of its distorted ray; inf without a limit.
+    Tangential terms are left out.
     """
     if not params[DISTORTION].any():
-        return np.inf
+        return np.inf, np.inf
     angle = np.linspace(0.0, np.pi if model == Model.EQUIDISTANT else np.deg2rad(89.0), _FOLD_STEPS)
     with np.errstate(all="ignore"):
         if model == Model.EQUIDISTANT:
@@ -119,7 +120,12 @@ def widest(model: Model, params: FloatArray) -> float:
             ray = np.stack([np.tan(angle), np.zeros(_FOLD_STEPS)], axis=1)
             radius = _rational(ray, radial[None, DISTORTION])[0][:, 0]
         turns = np.flatnonzero(~(np.diff(radius) > 0.0))
-    return float(radius[turns[0]]) if len(turns) else np.inf
+    return (float(angle[turns[0]]), float(radius[turns[0]])) if len(turns) else (np.inf, np.inf)
+
+
+def widest(model: Model, params: FloatArray) -> float:
+    """Return how far from the axis a distorted ray may lie and be the image of one ray alone; inf without a limit."""
+    return fold(model, params)[1]
 
 
 def behind(x_cam: FloatArray, model: ModelArray) -> BoolArray:

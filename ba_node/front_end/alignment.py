@@ -36,7 +36,7 @@ _WORTH = 0.05
 _KEPT, _KEPT_ROWS = 0.97, 0.9
 # Fewest points of a pair, and least median shift between the keyframes, px.
 _LEAST_POINTS, _LEAST_SHIFT_PX = 60, 3.0
-_STEPS = 10
+_STEPS, _SMALL_PX = 10, 0.01
 # Keyframes at the start that rows are learned from, and how often later.
 _FIRST, _EVERY = 10, 4
 _FLOOR_PX = 0.1
@@ -172,7 +172,7 @@ class StereoAlignment:
             rotation = geometry.so3_exp(step[:3])
             motion = Transform(rotation @ motion.rotation, rotation @ motion.translation + step[3:6])
             turn = turn + step[6:]
-            if np.abs(step[6:]).max() < 1e-3:
+            if np.abs(step[6:]).max() < _SMALL_PX:
                 break
         if np.abs(turn).max() > 5.0 * _PRIOR_PX.max():
             return None

@@ -9,7 +9,6 @@ from collections import Counter
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.front_end import features, stereo
 from ba_node.front_end.frame import Frame
@@ -104,7 +103,7 @@ class ImageWatch:
 
     def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
         """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""
-        assert frame.right is not None and frame.right_soft is not None
+        assert frame.right is not None
         as_given = (frame.grey, frame.right, frame.soft, frame.right_soft)
         exchanged = (frame.right, frame.grey, frame.right_soft, frame.soft)
         ours, theirs = (_share(*images, rig) for images in (as_given, exchanged))
@@ -131,10 +130,3 @@ def _share(first: Grey, second: Grey, soft: Floats, other_soft: Floats, rig: Ide
     begin = stereo.look_up(stereo.dense(first, second, first.shape[1] // 5, rig.baseline < 0.0), uv, size)
     found = stereo.measure(soft, other_soft, uv, begin, _SIDE, np.zeros(len(uv)))
     return float(found.found.mean()) if len(uv) else 0.0
-
-
-def covariance_of(found: FloatArray, fixed_from_camera: FloatArray) -> FloatArray:
-    """Return x, y, z, turn in the fixed frame of a covariance of turn and place in the camera's: (6, 6)."""
-    order = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
-    R = np.kron(np.eye(2), fixed_from_camera)
-    return np.asarray(R @ found[order] @ R.T)

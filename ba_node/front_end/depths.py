@@ -56,7 +56,7 @@ def measure_depths(
     n = len(uv)
     blank = [np.full(n, np.nan) for _ in range(4)]
     nothing = Depths(False, blank[0], blank[1], np.zeros((n, 2)), blank[2], blank[3])
-    if frame.right is not None and frame.right_soft is not None and rig.baseline:
+    if frame.right is not None and rig.baseline:
         return _stereo(frame, rig, uv, first, side, alignment)
     if frame.depth is not None:
         return _depth(frame, uv, nothing)
@@ -66,7 +66,7 @@ def measure_depths(
 def _stereo(
     frame: Frame, rig: IdealRig, uv: FloatArray, first: FloatArray, side: int, alignment: StereoAlignment
 ) -> Depths:
-    assert frame.right is not None and frame.right_soft is not None
+    assert frame.right is not None
     fb = rig.focal * rig.baseline
     dense = stereo.dense(frame.grey, frame.right, int(_LARGEST_SHARE * frame.grey.shape[1]), rig.baseline < 0.0)
     start, slant = stereo.look_up(dense, uv, stereo.smaller(frame.grey.shape[1]))
@@ -82,7 +82,6 @@ def _stereo(
 
 def _learn_rows(frame: Frame, uv: FloatArray, found: stereo.Disparities, side: int, alignment: StereoAlignment) -> None:
     """Tell the alignment how far from their rows points are in the second image."""
-    assert frame.right_soft is not None
     rows = np.flatnonzero(found.found)[:: max(1, int(found.found.sum()) // _FOR_ROWS)]
     if not len(rows):
         return

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +24,20 @@ class Frame:
     """Images of one time, as ideal cameras see them."""
 
     grey: Grey
-    soft: Floats  # smoothed
     right: Grey | None
-    right_soft: Floats | None
     depth: NDArray[np.float32] | None
     allowed: BoolArray  # (h, w) where features may be
 
-    @classmethod
-    def of(cls, grey: Grey, right: Grey | None, depth: NDArray[np.float32] | None, allowed: BoolArray) -> Frame:
-        """Prepare images."""
-        return cls(grey, soften(grey), right, None if right is None else soften(right), depth, allowed)
+    @cached_property
+    def soft(self) -> Floats:
+        """Return the first image smoothed, in which patches are compared: (h, w) float32."""
+        return soften(self.grey)
+
+    @cached_property
+    def right_soft(self) -> Floats:
+        """Return the second image smoothed."""
+        assert self.right is not None
+        return soften(self.right)
 
 
 def soften(image: Grey) -> Floats:

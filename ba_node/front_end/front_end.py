@@ -12,8 +12,8 @@ from ba_node.arrays import BoolArray, FloatArray
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.core import geometry
 from ba_node.estimate import Cloud, Poses, Transform
-from ba_node.front_end import opencv
-from ba_node.front_end.checks import ImageWatch, covariance_of
+from ba_node.front_end import covariance, opencv
+from ba_node.front_end.checks import ImageWatch
 from ba_node.front_end.frame import Frame
 from ba_node.front_end.records import FrontEndError, Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig, ideal_rig
@@ -23,8 +23,6 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGue
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
 # Features have moved by less than this since the last keyframe (median): nothing moves, px.
 _STANDS_PX = 0.5
-# While lost, the pose is off by at least so much with each image: m, rad.
-_LOST_M, _LOST_RAD = 0.1, 0.05
 # Depth cameras tell nothing beyond this, m.
 _FARTHEST_M = 1e4
 # One camera alone begins once features have moved this far by its motion (median), px.
@@ -118,6 +116,9 @@ class FrontEnd:
         self._tracker = None
         self._motion = _IDENTITY  # camera now from camera at the image before
         self._lost = 0  # images in a row without a pose
+        self._unseen = 0  # images without a pose since the last keyframe
+        self._keyframe_pose: Transform | None = None  # fixed frame from body at it
+        self._alone = False  # one camera without odometry
         self._waiting: Content | None = None  # first keyframe of one camera alone, until it has moved
         self._waiting_ns = 0
         self._fixed_from_map = _IDENTITY  # changes when the map is refined, so that published poses do not
@@ -161,17 +162,23 @@ class FrontEnd:
                 self._watch.say("rig", str(error), self._notes)
                 usable = None
         if usable is None:
+            if self._stamp_ns is not None and images.stamp_ns > self._stamp_ns:
+                self._lost, self._unseen = self._lost + 1, self._unseen + 1
             return self._told(State.LOST if self._tracker else State.STARTING, images)
         gap_s = 0.0 if self._stamp_ns is None else (images.stamp_ns - self._stamp_ns) / 1e9
         self._stamp_ns = images.stamp_ns
         frame = self._frame(usable)
+        if self._alone and odometry is not None:
+            self._end("an odometry is there now, whose scale it has")
         if self._tracker is None:
             return self._first(images, frame, odometry)
         if self._waiting is not None:
             return self._wait(images, frame)
+        if self._tracker.given and odometry is None:
+            return self._lose(images, frame, None, gap_s, "no odometry, which the session has its scale from")
         found = self._locate(frame, odometry, gap_s > self.options.max_gap_s)
         if found is None:
-            return self._lose(images, frame, odometry, gap_s)
+            return self._lose(images, frame, odometry, gap_s, "too little of what was seen before is found again")
         self._lost = 0
         self._watch.clear("lost")
         return self._tracking(images, found, odometry)
@@ -188,7 +195,7 @@ class FrontEnd:
             depth = np.where((depth >= self.options.min_depth_m) & (depth <= farthest), depth, np.float32(0.0))
         if images.mask is not None and images.mask.shape == images.grey[0].shape:
             allowed = allowed & (ideal.image(0, images.mask.astype(np.uint8), linear=False) > 0)
-        return Frame.of(grey[0], grey[1] if len(grey) > 1 else None, depth, allowed)
+        return Frame(grey[0], grey[1] if len(grey) > 1 else None, depth, allowed)
 
     def _first(self, images: Images, frame: Frame, odometry: Transform | None) -> Tracked:
         """Begin a session with an image."""
@@ -207,9 +214,10 @@ class FrontEnd:
         self._tracker, self._odometry = tracker, odometry
         if not content.depths.measures and odometry is None:
             self._watch.say("alone", _ALONE, self._notes)
+            self._alone = True
             self._waiting, self._waiting_ns = content, images.stamp_ns
             return self._told(State.STARTING, images)
-        return self._keyframe(images, content, State.TRACKING)
+        return self._keyframe(images, content)
 
     def _wait(self, images: Images, frame: Frame) -> Tracked:
         """Begin with one camera alone, once it has moved."""
@@ -221,10 +229,10 @@ class FrontEnd:
             return self._first(images, frame, None)
         if not tracker.begin_alone(_START_PX):
             return self._told(State.STARTING, images)
-        earlier = self._measurements(self._waiting_ns, first, _IDENTITY.after(self._body(tracker.keyframe_pose)))
+        earlier = self._measurements(self._waiting_ns, first, self._body(tracker.keyframe_pose))
         self._waiting = None
         content, _ = tracker.keyframe(self._count + 1)
-        return self._keyframe(images, content, State.TRACKING, earlier)
+        return self._keyframe(images, content, earlier)
 
     def _expected(self, odometry: Transform | None) -> Transform:
         """Return camera from map as foretold, by odometry or by going on as before."""
@@ -255,17 +263,14 @@ class FrontEnd:
             tracker.restore(before)
         return None
 
-    def _lose(self, images: Images, frame: Frame, odometry: Transform | None, gap_s: float) -> Tracked:
+    def _lose(self, images: Images, frame: Frame, odometry: Transform | None, gap_s: float, why: str) -> Tracked:
         """Say that an image has no pose; begin anew when that has gone on for too long."""
-        self._lost += 1
-        text = f"lost at {images.stamp_ns} ns: too little of what was seen before is found again"
-        self._watch.say("lost", text, self._notes)
+        self._lost, self._unseen = self._lost + 1, self._unseen + 1
+        self._watch.say("lost", f"lost at {images.stamp_ns} ns: {why}", self._notes)
         if self._lost <= self.options.max_lost and gap_s <= self.options.max_gap_s:
             return self._told(State.LOST, images)
-        why = (
-            f"{gap_s:.1f} s without images" if gap_s > self.options.max_gap_s else f"{self._lost} images without a pose"
-        )
-        self._end(why)
+        gap = gap_s > self.options.max_gap_s
+        self._end(f"{gap_s:.1f} s without images" if gap else f"{self._lost} images without a pose")
         return self._first(images, frame, odometry)
 
     def _end(self, why: str) -> None:
@@ -283,11 +288,11 @@ class FrontEnd:
         moved, shift = tracker.moved()
         share = len(tracker.rows) / max(tracker.shared, 1)
         o = self.options
-        if moved < o.keyframe_parallax_px and share >= o.keyframe_min_shared:
+        if moved < o.keyframe_parallax_px and share >= o.keyframe_min_shared and not self._unseen:
             state = State.STANDING if shift < _STANDS_PX else State.TRACKING
             return self._told(state, images, found, odometry)
         content, refined = tracker.keyframe(self._count + 1)
-        return self._keyframe(images, content, State.TRACKING, found=refined or found, odometry=odometry)
+        return self._keyframe(images, content, (), refined or found, odometry)
 
     def _body(self, camera_from_map: Transform) -> Transform:
         """Return fixed frame from body of a camera in the map."""
@@ -299,17 +304,15 @@ class FrontEnd:
         self,
         images: Images,
         content: Content,
-        state: State,
         earlier: tuple[Measurement, ...] = (),
         found: Found | None = None,
         odometry: Transform | None = None,
     ) -> Tracked:
         """Tell of an image that was made a keyframe."""
-        told = self._told(state, images, found, odometry)
+        told = self._told(State.TRACKING, images, found, odometry)
         assert told.pose is not None
         measured = self._measurements(images.stamp_ns, content, told.pose)
-        keyframe = measured[0]
-        assert isinstance(keyframe, Keyframe)
+        keyframe = next(one for one in measured if isinstance(one, Keyframe))
         tracks = tuple(one for one in measured if isinstance(one, FeatureTracks))
         return dataclasses.replace(
             told, keyframe=keyframe, tracks=tracks, guesses=self._guesses(content), earlier=earlier
@@ -320,15 +323,16 @@ class FrontEnd:
     ) -> Tracked:
         """Return what is known of an image that is no keyframe."""
         tracker = self._tracker
-        pose, covariance = None, np.full((6, 6), np.nan)
+        pose, uncertain = None, np.full((6, 6), np.nan)
         if tracker is not None and self._waiting is None:
             pose = self._body(tracker.pose)
-            covariance = np.diag([_LOST_M**2] * 3 + [_LOST_RAD**2] * 3) * (1.0 + self._lost) ** 2
+            uncertain = covariance.of_lost(self._lost)
             if found is not None:
-                covariance = covariance_of(found.covariance, self._fixed_from_map.rotation @ tracker.pose.rotation.T)
+                fixed_from_camera = self._fixed_from_map.rotation @ tracker.pose.rotation.T
+                uncertain = covariance.of_tracked(found.covariance, fixed_from_camera)
         if odometry is not None and (self._ideal is None or not self._ideal.baseline) and images.depth_m is None:
             pose = odometry
-        return Tracked(state, self.session_id, images.stamp_ns, pose, covariance, notes=tuple(self._notes))
+        return Tracked(state, self.session_id, images.stamp_ns, pose, uncertain, notes=tuple(self._notes))
 
     def _measurements(self, stamp_ns: int, content: Content, pose: Transform) -> tuple[Measurement, ...]:
         """Return keyframe and tracks, in pixels of the raw images."""
@@ -336,7 +340,8 @@ class FrontEnd:
         self._count += 1
         ideal, session, number = self._ideal, self.session_id, self._count
         orientation = geometry.quaternion_from_matrix(pose.rotation)
-        keyframe = Keyframe(session, number, stamp_ns, self._fixed_frame, pose.translation, orientation)
+        told = self._step_covariance(pose)
+        keyframe = Keyframe(session, number, stamp_ns, self._fixed_frame, pose.translation, orientation, told)
         depths = content.depths
         depth_m = np.empty(0)
         stereo = np.isfinite(depths.disparity)
@@ -351,6 +356,16 @@ class FrontEnd:
         sigma = np.hypot(depths.disparity_sigma[stereo], self.options.sigma_px)
         right = FeatureTracks(session, number, 1, content.track_id[stereo], ideal.raw(1, there), sigma)
         return keyframe, left, right
+
+    def _step_covariance(self, pose: Transform) -> FloatArray:
+        """Return the covariance of the step to a keyframe, (36,); (0,) where it is what images that see well give."""
+        tracker, before, unseen = self._tracker, self._keyframe_pose, self._unseen
+        self._keyframe_pose, self._unseen = pose, 0
+        if before is None or tracker is None:
+            return np.empty(0)
+        if tracker.given:
+            return covariance.of_step(before.inverse().after(pose)).reshape(-1)
+        return covariance.of_lost(unseen).reshape(-1) if unseen else np.empty(0)
 
     def _guesses(self, content: Content) -> LandmarkGuesses | None:
         """Return where points are that were not told before, in the fixed frame."""

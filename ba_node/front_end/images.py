@@ -8,7 +8,6 @@ and of recordings are both served.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -143,19 +142,6 @@ def _to_8_bit(pixels: NDArray[Any]) -> Grey:
     scaled = (pixels.astype(np.float32) - low) * (255.0 / max(high - low, 1.0))
     grey: Grey = np.clip(scaled, 0.0, 255.0).astype(np.uint8)
     return grey
-
-
-def as_grey(pixels: NDArray[Any]) -> Grey:
-    """Return the grey values of a picture as OpenCV reads it from a file: (h, w) or (h, w, 3 or 4), 8 or 16 bit."""
-    if pixels.ndim == 3:
-        code = cv2().COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2().COLOR_BGR2GRAY
-        pixels = cv2().cvtColor(pixels, code)
-    return _to_8_bit(pixels)
-
-
-def is_encoding_of_depth(encoding: str) -> bool:
-    """Return True for the encodings that depth cameras send."""
-    return re.fullmatch(r"16UC1|32FC1", encoding) is not None
 
 
 def read_mask(path: Path | str) -> BoolArray:

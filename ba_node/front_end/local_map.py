@@ -24,7 +24,9 @@ from ba_node.front_end.rectify import IdealRig
 
 # Inverse depths below this are as good as zero, 1/m.
 _FAR = 1e-4
-_MOST = 6_000
+# Most points, and how many there is room for at first.
+_MOST, _ROOM = 6_000, 2_000
+_COLUMNS = ("track_id", "anchor", "uv", "inverse_depth", "sigma", "slant", "last_seen")
 
 
 @dataclass
@@ -52,14 +54,13 @@ class LocalMap:
     def __init__(self, rig: IdealRig, side: int) -> None:
         self._rig = rig
         self.track_id: IdArray = np.empty(0, np.uint64)
-        self.patch: Floats = np.empty((0, side + 2, side + 2), np.float32)
+        self._patch: Floats = np.empty((_ROOM, side + 2, side + 2), np.float32)  # of rows to come too: they are large
         self.anchor: IntArray = np.empty(0, np.intp)  # keyframe, by its place in the lists below
         self.uv = np.empty((0, 2))  # in the anchor's image, px
         self.inverse_depth = np.empty(0)  # 1/m, in the anchor; NaN while unknown
         self.sigma = np.empty(0)  # of it, 1/m
         self.slant = np.empty((0, 2))  # s, 1/m a px
         self.last_seen: IntArray = np.empty(0, np.intp)  # keyframe, by its place
-        self.views: IntArray = np.empty(0, np.intp)  # keyframes that saw it
         self.keyframe_id: list[int] = []
         self.rotation = np.empty((0, 3, 3))  # map from camera of keyframes
         self.position = np.empty((0, 3))
@@ -67,6 +68,11 @@ class LocalMap:
 
     def __len__(self) -> int:
         return len(self.track_id)
+
+    @property
+    def patch(self) -> Floats:
+        """Return the patch of each point, cut from its anchor's image: (n, side + 2, side + 2)."""
+        return self._patch[: len(self)]
 
     @property
     def known(self) -> BoolArray:
@@ -83,22 +89,16 @@ class LocalMap:
 
     def add(self, keyframe: int, uv: FloatArray, patch: Floats) -> IntArray:
         """Add points of unknown depth that a keyframe sees; return their rows."""
-        n = len(uv)
-        rows = np.arange(len(self), len(self) + n)
+        n, before = len(uv), len(self)
+        place, nowhere = np.full(n, keyframe, np.intp), np.full(n, np.nan)
         ids = np.arange(self._next_id, self._next_id + n, dtype=np.uint64)
         self._next_id += n
-        nowhere = np.full(n, np.nan)
-        place = np.full(n, keyframe, np.intp)
-        self.track_id = np.concatenate([self.track_id, ids])
-        self.patch = np.concatenate([self.patch, patch])
-        self.anchor = np.concatenate([self.anchor, place])
-        self.uv = np.concatenate([self.uv, uv])
-        self.inverse_depth = np.concatenate([self.inverse_depth, nowhere])
-        self.sigma = np.concatenate([self.sigma, nowhere])
-        self.slant = np.concatenate([self.slant, np.zeros((n, 2))])
-        self.last_seen = np.concatenate([self.last_seen, place])
-        self.views = np.concatenate([self.views, np.ones(n, np.intp)])
-        return rows
+        for name, new in zip(_COLUMNS, (ids, place, uv, nowhere, nowhere, np.zeros((n, 2)), place), strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name), new]))
+        while len(self) > len(self._patch):
+            self._patch = np.concatenate([self._patch, np.empty_like(self._patch)])
+        self._patch[before : len(self)] = patch
+        return np.arange(before, len(self))
 
     def place(self, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, slant: FloatArray) -> None:
         """Set how far points are from their anchors."""
@@ -106,7 +106,7 @@ class LocalMap:
 
     def move(self, rows: IntArray, keyframe: int, uv: FloatArray, patch: Floats) -> None:
         """Give points another anchor, from which they are seen better; :meth:`place` them next."""
-        self.anchor[rows], self.uv[rows], self.patch[rows] = keyframe, uv, patch
+        self.anchor[rows], self.uv[rows], self._patch[rows] = keyframe, uv, patch
 
     def points(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return positions in the map (n, 3), m, and one standard deviation of each by its depth, a vector (n, 3)."""
@@ -156,6 +156,7 @@ class LocalMap:
         keep = np.sort(np.argsort(-self.last_seen, kind="stable")[: _MOST * 3 // 4])
         new = np.full(n, -1)
         new[keep] = np.arange(len(keep))
-        for name in ("track_id", "patch", "anchor", "uv", "inverse_depth", "sigma", "slant", "last_seen", "views"):
+        self._patch[: len(keep)] = self._patch[keep]
+        for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[keep])
         return new

@@ -31,8 +31,9 @@ from ba_node.front_end.opencv import cv2
 
 Floats = NDArray[np.float32]
 # Steps shorter than this end an alignment, px.
-_STEP_PX = 0.005
+_STEP_PX = 0.01
 _LEAST_STD = 0.5
+_LEAST_HESSIAN = 1e-6
 _STRIDE = 2
 _MANY = 0.6
 
@@ -130,7 +131,6 @@ class Aligned:
     slant: FloatArray  # (n, 2) of ``row``: change of x' - x by p_x and by p_y; 0 of ``place``
     correlation: FloatArray  # (n,) of template and image, -1 to 1
     covariance: FloatArray  # (n, k, k) of the movements, px^2, by what is left unexplained
-    step_px: FloatArray  # (n,) length of the last step
 
 
 def align(
@@ -154,8 +154,9 @@ def align(
     n, k = len(templates), templates.hessian.shape[1]
     p, w = grid(templates.side), window(templates.side)
     place, a = uv.astype(np.float64).copy(), affine.astype(np.float64).copy()
-    inverse = np.linalg.pinv(templates.hessian, hermitian=True)
-    step, correlation, left = np.full(n, np.inf), np.zeros(n), np.full(n, np.inf)
+    # A patch without texture has no Hessian to speak of; what it is given moves it by nothing.
+    inverse = np.linalg.inv(templates.hessian + _LEAST_HESSIAN * np.eye(k))
+    correlation, left = np.zeros(n), np.full(n, np.inf)
     depth = None if bend is None else 1.0 / (1.0 + bend.astype(np.float32) @ p.T)
     rows = np.arange(n)
     jacobian, weighted, std, back = templates.jacobian, templates.weighted, templates.std, inverse
@@ -170,7 +171,6 @@ def align(
         left[rows] = 2.0 * std**2 * np.maximum(1.0 - agree, 0.0)
         _move(place, a, rows, e)
         length = np.linalg.norm(e[:, :2] if k == 2 else e[:, :1], axis=1)
-        step[rows] = length
         going = (length > _STEP_PX) & np.isfinite(length)
         if not going.any():
             break
@@ -181,22 +181,20 @@ def align(
     # As many independent values as pixels under the window.
     independent = 1.0 / float((w * w).sum())
     covariance = inverse * (left / independent)[:, None, None]
-    return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance, step)
+    return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance)
 
 
 def _at(image: Floats, place: FloatArray, a: FloatArray, p: Floats, depth: Floats | None) -> Floats:
-    offset = np.matmul(a.astype(np.float32), p.T)
-    if depth is not None:
-        offset *= depth[:, None]
-    offset += place.astype(np.float32)[:, :, None]
-    return sample(image, offset[:, 0], offset[:, 1])
+    x, y = (a[:, row].astype(np.float32) @ p.T * (1.0 if depth is None else depth) for row in (0, 1))
+    at = place.astype(np.float32)
+    return sample(image, x + at[:, :1], y + at[:, 1:])
 
 
 def _move(place: FloatArray, a: FloatArray, rows: NDArray[np.intp], e: FloatArray) -> None:
     """Compose warps with p - B e."""
     if e.shape[1] == 2:
         e = e * np.minimum(1.0, 3.0 / np.maximum(np.linalg.norm(e, axis=1), 1e-9))[:, None]
-        place[rows] -= np.einsum("nij,nj->ni", a[rows], e)
+        place[rows] -= np.matmul(a[rows], e[:, :, None])[:, :, 0]
         return
     along = a[rows, 0, 0]
     e = e * np.minimum(1.0, 3.0 / np.maximum(np.abs(e[:, 0]), 1e-9))[:, None]

@@ -20,6 +20,8 @@ from ba_node.front_end.opencv import poselib
 from ba_node.front_end.rectify import IdealRig
 
 _STEPS = 8
+# A step that ends it, rad and m.
+_SMALL = 1e-5
 _CAUCHY = 2.0
 
 
@@ -82,7 +84,7 @@ def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Trans
         if not np.isfinite(step).all():
             return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
         pose = Transform(geometry.so3_exp(step[:3]), step[3:]).after(pose)
-        if np.linalg.norm(step) < 1e-6:
+        if np.linalg.norm(step) < _SMALL:
             break
     error, jacobian = _linear(rig, seen, pose)
     weighted, size = _weights(error)

@@ -11,7 +11,7 @@ Features are looked for there and told in pixels of the raw images, which are wh
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,26 +207,7 @@ def _project(camera: Camera, rays: FloatArray) -> FloatArray:
     model = np.full(1, camera.model)
     with np.errstate(all="ignore"):
         uv = cameras.project(turned, model, camera.params[None])
-        wide = np.hypot(*(turned[:, :2] / turned[:, 2:]).T) if camera.model == cameras.Model.RATIONAL else None
+        angle = np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), turned[:, 2])
         bad = cameras.behind(turned, model) | ~np.isfinite(uv).all(axis=1)
-        if wide is not None:
-            bad |= wide > _widest_ray(camera)
-    uv[bad] = np.nan
+    uv[bad | (angle > cameras.fold(camera.model, camera.params)[0])] = np.nan
     return uv
-
-
-def _widest_ray(camera: Camera) -> float:
-    """Return the undistorted length of a ray from which on a lens folds over."""
-    if not camera.params[cameras.DISTORTION].any():
-        return np.inf
-    return _fold(tuple(camera.params.tolist()))
-
-
-def _fold(params: tuple[Any, ...]) -> float:
-    along = np.linspace(0.0, 5.0, 500)
-    ray = np.column_stack([along, 0.0 * along, np.ones(500)])
-    row = np.array(params)
-    row[[6, 7]] = 0.0
-    radius = cameras.project(ray, np.full(1, cameras.Model.RATIONAL), row[None])[:, 0]
-    turns = np.flatnonzero(~(np.diff(radius) > 0.0))
-    return float(along[turns[0]]) if len(turns) else np.inf

@@ -104,10 +104,10 @@ def look_up(disparity: Floats, uv: FloatArray, size: float) -> tuple[FloatArray,
             / span
         )
     slant = np.where(np.abs(slant) < 0.6, slant, 0.0).astype(np.float64)
-    around = np.stack([disparity[y + j, x + i] for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    some = np.isfinite(around).any(axis=0)
-    value = np.full(len(uv), np.nan)
-    value[some] = np.nanmedian(around[:, some], axis=0)
+    around = np.sort(np.stack([disparity[y + j, x + i] for i in (-1, 0, 1) for j in (-1, 0, 1)]), axis=0)
+    # NaN come last: the median of the others, the lower one of two.
+    middle = (np.maximum(np.isfinite(around).sum(axis=0), 1) - 1) // 2
+    value = around[middle, np.arange(len(uv))].astype(np.float64)
     return value, slant
 
 

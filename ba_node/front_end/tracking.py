@@ -29,8 +29,9 @@ from ba_node.front_end.rectify import IdealRig
 _SAME, _SAME_AGAIN, _RENEW = 0.7, 0.85, 0.8
 # How far from where the pose says a patch may be found: followed ones, lost ones, px.
 _NEAR_PX, _AGAIN_PX = 4.0, 4.0
-# Least sigma of one camera alone, px.
-_ALONE_PX = 0.5
+# Least sigma of one camera, px; and as it is told beside an odometry, whose lengths must not be bent by what all points
+# of a track are off by alike, which no average of them makes smaller.
+_ALONE_PX, _TOLD_PX = 0.5, 1.0
 # Distance of features of one camera from their epipolar line, px.
 _EPIPOLAR_PX = 1.0
 # Patches are cut anew when they appear larger or smaller by this.
@@ -57,7 +58,6 @@ class Content:
     uv: FloatArray  # (n, 2) in the first image, px
     sigma: FloatArray  # (n,) px
     depths: Depths  # of the same rows
-    fresh: BoolArray  # (n,) points that are new
     added: FloatArray  # (n,) how disparities were corrected, px
 
 
@@ -245,10 +245,10 @@ class Tracker:
         fresh = np.arange(len(rows)) >= old
         self._renew(frame, place, rows, uv, depths, fresh)
         self.map.last_seen[rows] = place
-        self.map.views[rows[:old]] += 1
         self.rows, self.uv, self.shared = rows, uv, len(rows)
         added = self.alignment.disparity(uv)
-        content = Content(self.map.track_id[rows], uv, sigma, depths, fresh, added)
+        told = np.maximum(sigma, _TOLD_PX) if self.given else sigma
+        content = Content(self.map.track_id[rows], uv, told, depths, added)
         if self.options.stereo_align and depths.measures and frame.right is not None:
             self._learn(content)
         self._last = content, self.pose

@@ -15,15 +15,20 @@ from pathlib import Path
 import yaml
 from rclpy.utilities import remove_ros_args
 
-USAGE = """\
-usage: ba_node [--ros-args [-p NAME:=VALUE]... [--params-file FILE]... [-r FROM:=TO]... [--log-level LEVEL]]
-
-Bundle-adjustment back-end as a ROS 2 node: takes keyframes and feature tracks, publishes refined poses and points.
-`ba params` prints a FILE with all parameters; `-r __ns:=/robot` puts the node into a namespace.
-"""
+_ABOUT = {
+    "ba_node": "Bundle-adjustment back-end as a ROS 2 node: takes keyframes and feature tracks, publishes refined poses"
+    " and points.\n`ba params` prints a FILE with all parameters; `-r __ns:=/robot` puts the node into a namespace.",
+    "ba_front_end": "Front-end as a ROS 2 node: takes images, publishes keyframes and feature tracks.",
+}
 _HELP = {"-h", "--help"}
 _FILE_OPTION = "--params-file"
 _PARAMETERS = "ros__parameters"
+
+
+def usage(name: str) -> str:
+    """Return what there is to say of a program."""
+    words = "[-p NAME:=VALUE]... [--params-file FILE]... [-r FROM:=TO]... [--log-level LEVEL]"
+    return f"usage: {name} [--ros-args {words}]\n\n{_ABOUT[name]}\n"
 
 
 def asks_for_help(arguments: Sequence[str]) -> bool:

@@ -19,6 +19,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
 from ba_node.config import ConfigError
+from ba_node.front_end.records import FrontEndError
+from ba_node.io.rig_file import RigError
 from ba_node.ros import arguments
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
@@ -34,9 +36,16 @@ _SWITCH_INTERVAL_S = 0.0005
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit code, 2 if parameters or arguments are wrong.
+    """Run the node until SIGINT or SIGTERM; return the exit code, 2 if parameters or arguments are wrong."""
+    return run(NODE_NAME, BaNode, args)
+
+
+def run(name: str, make: Callable[[], Any], args: Sequence[str] | None) -> int:
+    """Run a managed node as a process until SIGINT or SIGTERM; return the exit code.
 
     Args:
+        name: of the program, which begins what it says.
+        make: makes the node, which starts, stops and sums up what it did.
         args: the program and its arguments; None for those of the process.
     """
     given = list(sys.argv if args is None else args)
@@ -45,23 +54,23 @@ def main(args: Sequence[str] | None = None) -> int:
             # rclpy's own handlers end the context at once: nobody who waits for an answer could be told any more.
             rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
         except ARGUMENT_ERRORS as error:
-            return _refuse(str(error))
+            return _refuse(name, str(error))
         try:
-            return _run(given, ended)
+            return _run(name, make, given, ended)
         finally:
             rclpy.try_shutdown()
 
 
-def _run(given: list[str], ended: Callable[[], bool]) -> int:
+def _run(name: str, make: Callable[[], Any], given: list[str], ended: Callable[[], bool]) -> int:
     if arguments.asks_for_help(given):
-        print(arguments.USAGE, end="")
+        print(arguments.usage(name), end="")
         return 0
     if reason := arguments.objection(given):
-        return _refuse(reason)
+        return _refuse(name, reason)
     try:
-        node = BaNode()
-    except (ConfigError, InvalidNodeNameException, InvalidNamespaceException) as error:
-        return _refuse(str(error))
+        node = make()
+    except (ConfigError, FrontEndError, RigError, InvalidNodeNameException, InvalidNamespaceException) as error:
+        return _refuse(name, str(error))
     executor = NodeExecutor()
     executor.add_node(node)
     for text in arguments.idle_files(given, node.get_fully_qualified_name()):
@@ -77,7 +86,7 @@ def _run(given: list[str], ended: Callable[[], bool]) -> int:
         node.stop()
         executor.shutdown()
         node.destroy_node()
-    print(f"stopped: {node.keyframes_refined} keyframes refined", flush=True)
+    print(f"stopped: {node.summary()}", flush=True)
     return 0
 
 
@@ -106,8 +115,8 @@ def _spin_once(executor: NodeExecutor, node: Any) -> bool:
     return True
 
 
-def _refuse(reason: str) -> int:
-    print(f"{NODE_NAME}: {' '.join(reason.split())}", file=sys.stderr)
+def _refuse(name: str, reason: str) -> int:
+    print(f"{name}: {' '.join(reason.split())}", file=sys.stderr)
     return USAGE_ERROR
 
 

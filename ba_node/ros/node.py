@@ -96,6 +96,10 @@ class BaNode(ManagedNode):
         """Return how many keyframes have been refined so far."""
         return self._refined_before + (self._host.worker.refined if self._host else 0)
 
+    def summary(self) -> str:
+        """Return in words what the node has done."""
+        return f"{self.keyframes_refined} keyframes refined"
+
     def start(self) -> None:
         """Configure and activate, if ``node.autostart`` says so; a failure is logged and leaves the node running."""
         if self._settings.config.node.autostart and self.request("configure"):
@@ -126,6 +130,7 @@ class BaNode(ManagedNode):
             raise RefusedError(str(error)) from error
         worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
         backend.setup.elsewhere = worker.check_elsewhere
+        backend.adjust_elsewhere = worker.adjust_elsewhere
         deferred = DeferredAnswers(self, lambda: worker.alive)
         self._host = host = Host(self, config, inbox, worker, deferred, self._log)
         host.at_cleanup.callback(deferred.close)

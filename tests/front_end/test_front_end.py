@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import cv2
 import numpy as np
 import pytest
 
@@ -159,6 +160,15 @@ def test_one_camera_with_odometry(truth: list[Transform]) -> None:
         assert np.array_equal(one.pose.translation, pose.translation)
     keyframes = [one for one in found if one.keyframe]
     assert len(keyframes) >= 3
+    # Lengths are the odometry's: a step of half a metre is told to a millimetre along and five across.
+    first, second = (one.keyframe for one in keyframes[:2])
+    assert first and second and not len(first.covariance)
+    before, step = (truth[found.index(one)] for one in keyframes[:2])
+    told = second.covariance.reshape(6, 6)[:3, :3]
+    moved = before.rotation.T @ (step.translation - before.translation)
+    length, across = float(np.linalg.norm(moved)), np.array([1.0, 0.0, 0.0])
+    assert np.sqrt(moved @ told @ moved) / length == pytest.approx(0.0005 + 0.001 * length, rel=1e-6)
+    assert np.sqrt(across @ told @ across) == pytest.approx(0.0005 + 0.01 * length, rel=0.1)
     shared = np.intersect1d(keyframes[0].tracks[0].track_id, keyframes[2].tracks[0].track_id)
     assert len(shared) > 20
 
@@ -199,11 +209,57 @@ def test_dark_images_leave_the_map(truth: list[Transform], stereo: list[Images])
     dark = follow(front_end, [world.without(one, grey=black) for one in stereo[4:6]])
     assert [one.state for one in dark] == [State.LOST] * 2
     assert "shows nothing" in dark[0].notes[0] and not dark[1].notes
-    assert np.trace(dark[1].covariance) > 0.01
+    sigma_m = [float(np.sqrt(one.covariance[0, 0])) for one in dark]
+    assert sigma_m == pytest.approx([0.2, 0.3])
     again = front_end.process(stereo[6])
     assert again.state is State.TRACKING and again.session_id == 1
     assert again.pose is not None
     assert np.linalg.norm(again.pose.translation - truth[6].translation) < 0.03
+    # The step across them is told with what it was unsure by, and no other.
+    assert again.keyframe is not None
+    assert np.sqrt(again.keyframe.covariance.reshape(6, 6)[0, 0]) == pytest.approx(0.3)
+    later = [one.keyframe for one in follow(front_end, stereo[7:]) if one.keyframe]
+    assert later and not any(len(one.covariance) for one in later)
+
+
+@pytest.mark.parametrize("spoil", ["dark", "blurred"])
+def test_what_is_not_found_again_begins_a_session(stereo: list[Images], spoil: str) -> None:
+    """Nothing to see for as long as max_lost says, then another place."""
+    front_end = FrontEnd(world.rig(), dataclasses.replace(PLAIN, max_lost=3))
+    before = [one.keyframe for one in follow(front_end, stereo[:4]) if one.keyframe]
+    bad = [
+        world.without(one, grey=tuple(cv2.blur(g, (61, 61)) if spoil == "blurred" else 0 * g for g in one.grey))
+        for one in stereo[4:7]
+    ]
+    told = follow(front_end, bad)
+    assert [(one.state, one.session_id) for one in told] == [(State.LOST, 1)] * 3
+    assert np.all(np.diff([one.covariance[0, 0] for one in told]) > 0.0)
+    assert sum(len(one.notes) for one in told) == 1, "said once"
+    far = Transform(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.array([0.3, 0.0, 15.0]))
+    other = front_end.process(world.images(world.rig(), far, 7))
+    assert other.session_id == 2 and other.keyframe is not None
+    assert other.notes[-1] == "session 2 begins: 4 images without a pose; the map of the one before stays as it is"
+    assert (before[0].session_id, other.keyframe.session_id) == (1, 2)
+    assert not len(other.keyframe.covariance), "no step leads to it"
+
+
+def test_an_odometry_that_ends_begins_a_session(truth: list[Transform]) -> None:
+    """Images alone have no scale to go on with: they are lost, then a session of its own, until it comes back."""
+    rig = world.rig(1)
+    front_end = FrontEnd(rig, dataclasses.replace(OPTIONS, max_lost=2))
+    frames = [world.images(rig, pose, i) for i, pose in enumerate(truth)]
+    found = follow(front_end, frames[:4], truth[:4])
+    assert found[-1].state is not State.LOST
+    lost = [front_end.process(one) for one in frames[4:7]]
+    assert [one.state for one in lost] == [State.LOST, State.LOST, State.STARTING]
+    assert "no odometry, which the session has its scale from" in lost[0].notes[0]
+    assert [one.session_id for one in lost] == [1, 1, 2]
+    assert "the scale is free" in lost[2].notes[-1]
+    again = follow(front_end, frames[7:], truth[7:])
+    assert again[0].session_id == 3 and again[0].keyframe is not None
+    assert "an odometry is there now" in again[0].notes[0]
+    assert again[-1].pose is not None
+    assert np.array_equal(again[-1].pose.translation, truth[-1].translation)
 
 
 def test_long_pause_begins_a_session_only_where_nothing_is_known(stereo: list[Images]) -> None:

@@ -156,6 +156,8 @@ class FrontEndNode(ManagedNode):
             kind, entity = self._entities.pop()
             getattr(self, f"destroy_{kind}")(entity)
 
+    stop = cleanup
+
     def _own(self, kind: str, *arguments: Any, **options: Any) -> Any:
         entity = getattr(self, f"create_{kind}")(*arguments, **options)
         self._entities.append((kind, entity))
