@@ -58,7 +58,7 @@ class Figure:
     direction: str = LOWER
     tolerance: float = 0.0
 
-    def judge(self, now: float | None) -> str:
+    def compare(self, now: float | None) -> str:
         """Return how a figure of now compares."""
         if now is None or not math.isfinite(now):
             return MISSING
@@ -127,7 +127,7 @@ def run(
         report = _report(path, case, clock)
         for figure in case.figures:
             now = value_of(report, figure.key)
-            rows.append(Row(case.recording, figure, now, figure.judge(now)))
+            rows.append(Row(case.recording, figure, now, figure.compare(now)))
     return rows
 
 
