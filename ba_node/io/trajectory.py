@@ -68,14 +68,12 @@ def read_rows(path: Path | str, parse: Callable[[list[str]], Row], separator: st
     """
     rows: list[Row] = []
     with opened(path, MAX_BYTES, TrajectoryError) as stream:
-        data = stream.read()
-    try:
-        lines = data.decode("utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: not a text file: {error}") from error
+        lines = stream.read().decode("utf-8", errors="replace").splitlines()
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
+        if "\N{REPLACEMENT CHARACTER}" in line:
+            raise TrajectoryError(f"{path}:{number}: not a text file")
         try:
             rows.append(parse(line.split(separator)))
         except ValueError as error:
