@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare how images stand to each other by their tracks with how they should by the rig and the poses.
+"""Compare relative poses of images by their tracks with those by the rig and the poses.
 
 First the relation is estimated from the tracks alone. Only where the given one explains clearly fewer of them are the
 usual mistakes tried, and the nearest is named.
