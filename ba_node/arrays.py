@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of the types of arrays; shape and unit stand beside each use."""
+"""Names of the types of arrays (shape and unit stand beside each use), and what numpy lacks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,3 +9,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 IdArray = NDArray[np.uint64]
+
+
+def ranges(begin: IntArray, end: IntArray) -> IntArray:
+    """Return the integers from each of ``begin`` (n,) up to its ``end``, one after the other."""
+    count = end - begin
+    return np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())

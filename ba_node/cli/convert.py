@@ -3,14 +3,14 @@
 """Convert recordings, maps, reconstructions and trajectories between formats, both ways.
 
   in:   recording (.mcap, .db3, folder), map (.npz), COLMAP model (folder, text or binary), Bundler (.out), BAL (.txt,
-        .bz2, .gz); poses as TUM, KITTI, EuRoC (.csv), g2o
-  out:  recording (.mcap), COLMAP model (folder), Bundler (.out), BAL (.txt, .bz2, .gz), points (.ply); poses as TUM
-        (.tum), KITTI (.kitti), g2o (.g2o)
+        .bz2, .gz), g2o (.g2o, bundle problem or pose graph); points (.ply); poses as TUM, KITTI, EuRoC (.csv)
+  out:  recording (.mcap), COLMAP model (folder), Bundler (.out), BAL (.txt, .bz2, .gz), g2o (.g2o; poses alone where
+        cameras have a distortion), points (.ply); poses as TUM (.tum), KITTI (.kitti)
 
 A recording comes out as the back-end refines it with its defaults, as in `ba replay`. A recording that is made has each
 image as a keyframe, 0.1 s apart, its points as landmark guesses and its ids as the indices in the file; pixels are
-float32 in the messages. Pixels of COLMAP count from the corner of the image, those here from the middle of the first
-pixel: half a pixel is added and taken away.
+float32 in the messages. Points alone become guesses of landmarks. Pixels of COLMAP count from the corner of the image,
+those here from the middle of the first pixel: half a pixel is added and taken away.
 
 With --from, IN is a recording of what another front-end published, and OUT its keyframes and tracks: openvins
 (loop_pose, loop_feats, loop_extrinsic, loop_intrinsics), vins_fusion (keyframe_pose, keyframe_point, extrinsic),

@@ -1,12 +1,12 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve a BAL file (.txt, .bz2, .gz), a scene of Bundler (.out) or a model of COLMAP (a folder) as a whole.
+"""Solve a BAL file (.txt, .bz2, .gz), a scene of Bundler (.out), a model of COLMAP (a folder) or a .g2o as a whole.
 
 BAL ("Bundle Adjustment in the Large") and Bundler: poses, points and each camera's f, k1, k2 are free. The defaults are
 those of the method: squared loss but for irls_*, points behind a camera keep their residual, as the published results
-count. COLMAP: poses, points, and what --refine names of the cameras, which stay shared as they are in the model; points
-that are behind their camera at the start are left out, as COLMAP does. Parameters of the node (solver.*) and
-options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
+count. COLMAP and g2o: poses, points, and what --refine names of the cameras, which stay shared as they are in the
+model; points that are behind their camera at the start are left out, as COLMAP does. Parameters of the node (solver.*)
+and options of the solver (loss, damping, trust_region, linear_solver, ...) are changed with --set.
 
 Exit code: 0 all is well, 2 nothing came of it, 3 the result has to be looked at: it is worse than the start, focal
 lengths are not positive, or many points lie behind their cameras.
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ba_node.offline.solve_bal import Solution
     from ba_node.offline.solve_model import ModelSolution
 
-SUMMARY = "solve a BAL, Bundler or COLMAP problem as a whole"
+SUMMARY = "solve a BAL, Bundler, COLMAP or g2o problem as a whole"
 EXAMPLE = (
     "ba solve problem-49-7776-pre.txt.bz2 --iterations 50 --json trace.json\n"
     "  ba solve sparse/0 --out refined --refine focal distortion"
@@ -80,8 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=(*_GROUPS, "none"),
         metavar="WHAT",
-        help=f"COLMAP: what of the cameras is refined, of {', '.join(_GROUPS)}, or none (default: focal distortion rig,"
-        " as COLMAP does)",
+        help=f"COLMAP, g2o: what of the cameras is refined, of {', '.join(_GROUPS)}, or none (default: of COLMAP focal"
+        " distortion rig, as it does itself; of g2o none)",
     )
 
 
@@ -153,9 +153,9 @@ def _start_ranks(args: argparse.Namespace) -> int:
 
 def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | None:
     """Solve as one of several ranks; whatever ends one of them ends all."""
-    from ba_node.offline.solve_ranks import Alone, Checkpoint, solve_on_ranks, started_as_ranks, world  # noqa: PLC0415
+    from ba_node.offline.solve_ranks import Checkpoint, solve_on_ranks, world  # noqa: PLC0415
 
-    communicator = world() if started_as_ranks() else Alone()
+    communicator = world()
     checkpoint = Checkpoint(args.checkpoint, max(1, args.every), args.resume) if args.checkpoint else None
     try:
         solution = solve_on_ranks(
@@ -192,16 +192,18 @@ def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:
     if args.resume and args.checkpoint is None:
         raise ConfigError("--resume needs --checkpoint FILE, from which to go on")
     on_ranks = args.checkpoint is not None or started_as_ranks()
-    if on_ranks and args.problem.is_dir():
-        raise ConfigError("ranks and checkpoints are for BAL and Bundler, not for models of COLMAP")
-    if not args.problem.is_dir():
+    is_model = args.problem.is_dir() or args.problem.suffix == ".g2o"
+    if on_ranks and is_model:
+        raise ConfigError("ranks and checkpoints are for BAL and Bundler, not for models of COLMAP or g2o")
+    if not is_model:
         if args.refine:
-            raise ConfigError("--refine is for models of COLMAP: BAL and Bundler have f, k1, k2 of each image free")
+            raise ConfigError("--refine is for COLMAP and g2o: BAL and Bundler have f, k1, k2 of each image free")
         options = solver_options(args.method, assignments)
         if on_ranks:
             return _on_ranks(args, options)
         return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
-    groups = [group for group in args.refine or DEFAULT_GROUPS if group != "none"]
+    usual = DEFAULT_GROUPS if args.problem.is_dir() else ()
+    groups = [group for group in args.refine or usual if group != "none"]
     # Cameras are refined without a region, which the default has; a method that is asked for by name is not changed.
     own = [*_OF_MODELS, "trust_region=none"] if groups and args.method == "auto" else _OF_MODELS
     options = solver_options(args.method, [*own, *assignments])

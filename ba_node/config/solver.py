@@ -218,14 +218,20 @@ class SolverOptions(SolverConfig):
         ),
     )
     preconditioner: str = option(
-        "schur_block",
+        "auto",
         "M of PCG, made in the scaled space.",
         choices=(
+            Choice("auto", "two_level where S has more than 3000 unknowns and is formed cheaply, else schur_block"),
             Choice("none", "M = I", "Table 3.9", ("I",)),
             Choice("schur_block", "diagonal blocks of S", "Table 3.9"),
             Choice("b_block", "blocks of B (of C where cameras are eliminated), damped", "Table 3.9", ("b",)),
             Choice("schur_diag", "diagonal of S", "Table 3.9"),
             Choice("b_diag", "diagonal of B (of C where cameras are eliminated), damped", "Table 3.9"),
+            Choice(
+                "two_level",
+                "S exactly inside clusters of keyframes that see the same points, and a coarse system of one similarity"
+                " (and common intrinsics) for each; S is formed, schur = points",
+            ),
             Choice(
                 "b_literal", "B as it stands, while PCG works on D^-1 S D^-1 with D = diag(H), not its root", "Alg. 7"
             ),
@@ -258,6 +264,10 @@ class SolverOptions(SolverConfig):
             raise ConfigError(
                 f"loss = {self.loss} with loss_scale_px = {self.loss_scale_px}: a robust loss needs the residual, in"
                 " sigmas, where it leaves the square; set loss_scale_px to a number > 0"
+            )
+        if self.preconditioner == "two_level" and self.schur != "points":
+            raise ConfigError(
+                f"preconditioner = two_level with schur = {self.schur}: clusters are of keyframes; take schur = points"
             )
         if self.annealing == "gnc" and self.loss not in PLATEAUS:
             raise ConfigError(

@@ -21,6 +21,8 @@ from ba_node.core.triangulation import Rays, Triangulation
 
 _MAX_PAIRS = 45
 _MAX_SINGLES = 8
+# So many rays and candidates are compared at once.
+_AT_ONCE = 200_000
 # Squared sine below which two rays do not meet.
 _LEAST_SINE2 = 1e-12
 
@@ -53,42 +55,56 @@ def agreeing(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -> B
     agrees = np.zeros(len(rays.point), bool)
     order = np.argsort(rays.point, kind="stable")
     begin = np.searchsorted(rays.point[order], np.arange(n_points + 1))
-    for p in np.flatnonzero(np.diff(begin)):
-        rows = order[begin[p] : begin[p + 1]]
-        agrees[rows] = _best(rays, rows, gate * gate) < gate * gate
+    views = np.diff(begin)
+    for n in np.unique(views[views > 0]).tolist():
+        first = begin[:-1][views == n]
+        some = max(1, _AT_ONCE // (n * (_MAX_PAIRS + 2 * _MAX_SINGLES)))
+        for k in range(0, len(first), some):
+            rows = order[first[k : k + some, None] + np.arange(n)]
+            agrees[rows] = _best(rays, rows, gate * gate) < gate * gate
     return agrees
 
 
 def _best(rays: Rays, rows: IntArray, gate2: float) -> FloatArray:
-    """Return the squared errors of a point's rays against its best candidate."""
-    centre, direction = rays.centre[rows], rays.direction[rows]
-    n = len(rows)
+    """Return the squared errors (g, n) of the rays of some points, of equally many each, against their best candidate.
+
+    ``rows`` are (g, n); a candidate that is none is NaN.
+    """
+    # Coordinates are apart, (3, g, n): numpy takes several times as long for a last axis of three.
+    centre, direction = (np.moveaxis(values[rows], 2, 0).copy() for values in (rays.centre, rays.direction))
+    n = rows.shape[1]
     single = np.arange(min(n, _MAX_SINGLES)) * n // min(n, _MAX_SINGLES)
-    measured = single[np.isfinite(rays.distance_m[rows[single]])]
-    ends = centre[measured] + rays.distance_m[rows[measured], None] * direction[measured]
-    places = np.concatenate([ends, _meetings(centre, direction)])
-    away = np.concatenate([np.tile(direction[single, None], (1, n, 1)), places[:, None] - centre])
-    dot = (away * direction).sum(axis=2)
-    across = np.cross(direction, away)
+    ends = centre[:, :, single] + rays.distance_m[rows[:, single]] * direction[:, :, single]
+    places = np.concatenate([ends, _meetings(centre, direction)], axis=2)
+    far = np.broadcast_to(direction[:, :, single, None], (3, len(rows), len(single), n))
+    away = np.concatenate([far, places[..., None] - centre[:, :, None]], axis=2)
+    direction = direction[:, :, None]
+    ahead = _dot(away, direction) > 0.0
+    across = np.stack([direction[i - 2] * away[i - 1] - direction[i - 1] * away[i - 2] for i in range(3)])
     with np.errstate(divide="ignore", invalid="ignore"):
-        error2 = rays.px_per_rad[rows] ** 2 * (across * across).sum(axis=2) / (away * away).sum(axis=2)
-    error2 = np.where(dot > 0.0, np.minimum(error2, gate2), gate2)
-    return np.asarray(error2[np.argmin(error2.sum(axis=1))])
+        error2 = rays.px_per_rad[rows][:, None] ** 2 * _dot(across, across) / _dot(away, away)
+    error2 = np.where(ahead, np.minimum(error2, gate2), gate2)
+    return np.asarray(np.take_along_axis(error2, np.argmin(error2.sum(axis=2), axis=1)[:, None, None], axis=1)[:, 0])
 
 
 def _meetings(centre: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return where pairs of rays are nearest to each other, by their angles, if it is in front of both; (m, 3)."""
-    i, j = _pairs(len(centre))
-    a, b, between = direction[i], direction[j], centre[j] - centre[i]
-    cosine, along_a, along_b = (a * b).sum(axis=1), (between * a).sum(axis=1), (between * b).sum(axis=1)
+    """Return where pairs of rays are nearest to each other, by their angles, (3, g, m); NaN unless in front of both."""
+    i, j = _pairs(centre.shape[2])
+    a, b, between = direction[:, :, i], direction[:, :, j], centre[:, :, j] - centre[:, :, i]
+    cosine, along_a, along_b = _dot(a, b), _dot(between, a), _dot(between, b)
     sine2 = 1.0 - cosine * cosine
     apart = sine2 > _LEAST_SINE2
     safe = np.where(apart, sine2, 1.0)
     s, t = (along_a - cosine * along_b) / safe, (cosine * along_a - along_b) / safe
     good = apart & (s > 0.0) & (t > 0.0)
-    i, j, a, b, s, t = (values[good] for values in (i, j, a, b, s, t))
-    share = (s * s / (s * s + t * t))[:, None]
-    return np.asarray((1.0 - share) * (centre[i] + s[:, None] * a) + share * (centre[j] + t[:, None] * b))
+    share = s * s / np.where(good, s * s + t * t, 1.0)
+    places = (1.0 - share) * (centre[:, :, i] + s * a) + share * (centre[:, :, j] + t * b)
+    return np.where(good, places, np.nan)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the products of vectors whose coordinates stand in the first axis."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _pairs(n: int) -> tuple[IntArray, IntArray]:

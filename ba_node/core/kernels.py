@@ -33,6 +33,7 @@ class LinearSolver(NamedTuple):
 
     kind: str
     text: str
+    preconditioner: str = "schur_block"  # of PCG, which goes to the boundary of a region for exact solvers too
 
 
 class System(Protocol):

@@ -31,10 +31,7 @@ def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Sol
     """Solve ``A x = b`` for symmetric positive definite A, dense (written over) or sparse; no solution if A is not."""
     try:
         if scipy.sparse.issparse(matrix):
-            factor = scipy.sparse.linalg.splu(
-                scipy.sparse.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-            )
-            x = factor.solve(rhs)
+            x = sparse_factor(matrix).solve(rhs)
         else:
             # The transpose of a symmetric matrix in C order is the same matrix in LAPACK's order: no copy.
             factor = scipy.linalg.cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
@@ -42,6 +39,13 @@ def cholesky(matrix: FloatArray | scipy.sparse.spmatrix, rhs: FloatArray) -> Sol
     except (np.linalg.LinAlgError, RuntimeError):
         return Solution(None)
     return Solution(x if np.isfinite(x).all() else None)
+
+
+def sparse_factor(matrix: scipy.sparse.spmatrix) -> scipy.sparse.linalg.SuperLU:
+    """Return the factor of a sparse, symmetric matrix; RuntimeError if it is singular."""
+    return scipy.sparse.linalg.splu(
+        scipy.sparse.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    )
 
 
 @dataclass(frozen=True)

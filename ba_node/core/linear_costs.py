@@ -20,6 +20,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ba_node.core.kernels import DENSE_LIMIT
+
 # Rates of one core, flop/s and byte/s: measured on an AMD EPYC (AVX2). Their ratios count.
 _FORM_FLOPS = 20e9
 _DENSE_FLOPS = 32e9
@@ -28,8 +30,9 @@ _SPARSE_FLOPS_LARGE = 10e9
 _BYTES = 12e9
 # Bytes that a column of the factor and its sources may take before the lower rate holds.
 _CACHE_BYTES = 5e6
-# Steps of PCG that an outer iteration is charged.
+# Steps of PCG that an outer iteration is charged: with block Jacobi, and with clusters and a coarse system.
 _PCG_STEPS = 60
+_TWO_LEVEL_STEPS = 20
 # From so many steps of PCG on for the cost of forming S PCG is tried first, for half as many.
 _WORTH_A_TRY = 15
 # No factor may take more memory than this.
@@ -86,6 +89,18 @@ def sparse_s(sizes: Sizes, factor: Factor) -> float:
 def pcg_s(sizes: Sizes) -> float:
     """Return the seconds of an iteration with conjugate gradients."""
     return _PCG_STEPS * 3.0 * 8.0 * sizes.block * sizes.edges / _BYTES
+
+
+def preconditioner(sizes: Sizes, schur_blocks: int) -> str:
+    """Return which preconditioner of PCG costs less; S has so many blocks on and above its diagonal.
+
+    With two levels S is formed, and is there as a whole beside its upper half, each with a copy while it is made.
+    """
+    size = 2.0 * 8.0 * sizes.block**2 * schur_blocks
+    if sizes.unknowns <= DENSE_LIMIT or 3.0 * size > MAX_BYTES:
+        return "schur_block"
+    two_level = _form_s(sizes) + (_TWO_LEVEL_STEPS + 3) * 2.0 * size / _BYTES
+    return "two_level" if two_level < pcg_s(sizes) else "schur_block"
 
 
 def pcg_tries(sizes: Sizes) -> int:

@@ -15,12 +15,13 @@ from ba_node.arrays import BoolArray, FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
 from ba_node.core.factors import FactorSum, FactorTerms, RelativePoses
-from ba_node.core.kernels import Kernels, LinearSolver, StepResult, System
+from ba_node.core.kernels import DENSE_LIMIT, Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import KeyframeFactors, Problem, State
+from ba_node.core.two_level import TwoLevel
 from ba_node.native._kernels import Kernel
 from ba_node.native._kernels import RelativePoses as CompiledPoses
 
@@ -80,14 +81,15 @@ class NativeKernels:
         self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
-        self._system = NativeSystem(self._kernel, self.size)
+        self._two_level = TwoLevel(np.flatnonzero(~problem.fixed))
+        self._system = NativeSystem(self._kernel, self.size, self._two_level)
         # Where steps lead, in turn: the state that a step starts from is one of them.
         self._states = [_like(problem.start), _like(problem.start)]
         self._stepped: StepResult | None = None
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        stepped, self._stepped = self._stepped, None
+        stepped, self._stepped, self._two_level.state = self._stepped, None, state
         # The inner iterations have seen all of it where they ended.
         if stepped is not None and state is stepped.state and self._kernel.linearise_prepared():
             value = stepped.objective
@@ -161,8 +163,8 @@ class NativeSystem:
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, kernel: Kernel, size: int) -> None:
-        self._kernel, self._size = kernel, size
+    def __init__(self, kernel: Kernel, size: int, two_level: TwoLevel) -> None:
+        self._kernel, self._size, self._two_level = kernel, size, two_level
         n = kernel.n_free * size
         self.rhs: FloatArray = np.empty(n)
         self.product = kernel.product
@@ -189,12 +191,13 @@ class NativeSystem:
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S, block-sparse."""
         blocks, columns, starts = self._kernel.sparse()
-        n, d = len(self.rhs), self._size
-        upper = scipy.sparse.bsr_matrix((blocks, columns, starts), shape=(n, n))
-        rows = np.repeat(np.arange(n // d), np.diff(starts))
-        own = rows == columns
-        diagonal = scipy.sparse.bsr_matrix((blocks[own], columns[own], np.arange(n // d + 1)), shape=(n, n))
-        return upper + upper.T - diagonal
+        n, rows = len(self.rhs), np.repeat(np.arange(self._kernel.n_free), np.diff(starts))
+        above = rows != columns
+        both = np.concatenate([rows, columns[above]]), np.concatenate([columns, rows[above]])
+        order = np.lexsort(both[::-1])
+        blocks = np.concatenate([blocks, np.swapaxes(blocks[above], 1, 2)])[order]
+        starts = np.searchsorted(both[0][order], np.arange(self._kernel.n_free + 1))
+        return scipy.sparse.bsr_matrix((blocks, both[1][order], starts), shape=(n, n))
 
     def sizes(self) -> Sizes:
         """Return what each linear solver would have to do."""
@@ -204,14 +207,23 @@ class NativeSystem:
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
         sizes = self.sizes()
-        if asked in ("dense", "pcg"):
+        if asked == "pcg":
+            return self._pcg(sizes)
+        if asked == "dense":
             return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), None, None))
         exact = asked == "cholesky"
         limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=exact)
         factor = self.factor_size(linear_costs.max_blocks(sizes.block), limit)
         if asked != "sparse" or not factor.complete:
             asked = linear_costs.cheapest(sizes, factor, exact=exact)
-        return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), sizes, factor))
+        if asked == "pcg":
+            return self._pcg(sizes)
+        formed = "two_level" if asked == "sparse" and len(self.rhs) > DENSE_LIMIT else "schur_block"
+        return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), sizes, factor), formed)
+
+    def _pcg(self, sizes: Sizes) -> LinearSolver:
+        text = linear_costs.describe("pcg", sizes.unknowns, None, None)
+        return LinearSolver("pcg", text, linear_costs.preconditioner(sizes, self._kernel.schur_blocks()))
 
     def pcg_tries(self) -> int:
         """Return how many steps of PCG to try before an exact solution."""
@@ -229,6 +241,8 @@ class NativeSystem:
 
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
+        if kind == "two_level":
+            return self._two_level.solve(self.sparse(), self.rhs, scale, limits)
         found, steps, on_boundary = self._kernel.pcg(scale, kind, limits, formed, self._x)
         return Solution(self._x if found else None, steps, on_boundary)
 

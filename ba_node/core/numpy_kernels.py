@@ -20,6 +20,7 @@ from ba_node.core.objective import Linearisation, Objective
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
 from ba_node.core.schur_cameras import CameraReduction, FullSystem
+from ba_node.core.two_level import TwoLevel
 
 Reduction = ReducedSystem | CameraReduction | FullSystem
 
@@ -48,6 +49,7 @@ class NumpyKernels:
         self._damping: tuple[FloatArray, FloatArray]
         # Where the last inner iterations ended: if the step is taken the rows there are asked for again.
         self._ended: InnerIterations | None = None
+        self._two_level = TwoLevel(self._free)
 
     def graduate(self, graduation: float) -> None:
         """Let a surrogate stand in for a truncated quadratic; infinite for the loss itself."""
@@ -55,6 +57,7 @@ class NumpyKernels:
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
+        self._two_level.state = state
         known = self._ended.rows if self._ended is not None and self._ended.state is state else None
         self._linearisation = self._objective.linearise(state, known)
         self._equations = normal_equations(self._structure, self._linearisation)
@@ -77,7 +80,7 @@ class NumpyKernels:
             side, factor = self._adapt(damping_c, damping_p)
         reduction = _SIDES[side](self._structure, self._equations, damping_c, damping_p)
         system = NumpySystem(reduction, self._structure, self._equations, self._linearisation)
-        system.radius_factor = factor
+        system.radius_factor, system.two_level = factor, self._two_level
         return system
 
     def damp(self, kind: str, mu: float) -> NumpySystem:
@@ -140,13 +143,18 @@ class NumpySystem:
     ) -> None:
         self._reduction, self._structure, self._equations = reduction, structure, equations
         self._linearisation = linearisation
+        self.two_level: TwoLevel
         self.rhs: FloatArray = reduction.rhs
         self.side = reduction.side
-        self.dense, self.sparse, self.gather = reduction.dense, reduction.sparse, reduction.gather
+        self.dense, self.gather = reduction.dense, reduction.gather
         self.diagonal_blocks, self.own_blocks = reduction.diagonal_blocks, reduction.own_blocks
         self._matrix: scipy.sparse.bsr_matrix | None = None
         if self.side == "points" and structure.form_schur and len(self.rhs) > DENSE_LIMIT:
             self._matrix = reduction.sparse()
+
+    def sparse(self) -> scipy.sparse.bsr_matrix:
+        """Return S, block-sparse."""
+        return self._matrix if self._matrix is not None else self._reduction.sparse()
 
     def solve_dense(self) -> FloatArray | None:
         """Return the solution by dense Cholesky; None if S is not positive definite."""
@@ -154,16 +162,9 @@ class NumpySystem:
 
     def solve_pcg(self, kind: str, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool) -> linear.Solution:
         """Return the solution by PCG in the space scaled by 1 / ``scale``."""
-        matrix = self.dense() if formed else None
-        if matrix is not None:
-            matrix *= scale[:, None]
-            matrix *= scale
-
-        def product(x: FloatArray) -> FloatArray:
-            return np.asarray(matrix @ x) if matrix is not None else scale * self.product(scale * x)
-
-        found = linear.pcg_steihaug(product, scale * self.rhs, preconditioner(kind, self, scale), limits)
-        return replace(found, x=None if found.x is None else scale * found.x)
+        if kind == "two_level":
+            return self.two_level.solve(self.sparse(), self.rhs, scale, limits)
+        return solve_pcg(self, preconditioner(kind, self, scale), scale, limits, formed=formed)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""
@@ -174,7 +175,8 @@ class NumpySystem:
         n = len(self.rhs)
         if asked in ("auto", "cholesky"):
             asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
-        return LinearSolver(asked, linear_costs.describe(asked, n, None, None))
+        formed = "two_level" if self._matrix is not None else "schur_block"
+        return LinearSolver(asked, linear_costs.describe(asked, n, None, None), formed)
 
     def pcg_tries(self) -> int:
         """Try no steps of PCG: in numpy they cost as much as an exact solution."""
@@ -197,6 +199,34 @@ class NumpySystem:
         if self._linearisation.factors is not None:
             curvature += self._linearisation.factors.curvature(step_c)
         return step_c, step_p, -float(slope) - 0.5 * curvature
+
+
+class _Operator(Protocol):
+    """A system of which products are known."""
+
+    rhs: FloatArray
+
+    def dense(self) -> FloatArray:
+        """Return S, (n, n)."""
+
+    def product(self, x: FloatArray) -> FloatArray:
+        """Return S x."""
+
+
+def solve_pcg(
+    system: _Operator, precondition: linear.Product, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool
+) -> linear.Solution:
+    """Return the solution by PCG in the space scaled by 1 / ``scale``; ``precondition`` works there."""
+    matrix = system.dense() if formed else None
+    if matrix is not None:
+        matrix *= scale[:, None]
+        matrix *= scale
+
+    def product(x: FloatArray) -> FloatArray:
+        return np.asarray(matrix @ x) if matrix is not None else scale * system.product(scale * x)
+
+    found = linear.pcg_steihaug(product, scale * system.rhs, precondition, limits)
+    return replace(found, x=None if found.x is None else scale * found.x)
 
 
 class _Blocks(Protocol):

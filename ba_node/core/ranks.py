@@ -11,34 +11,20 @@ where a factor pays. Factors between keyframes belong to rank 0.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import linear, linear_costs, native_kernels, scaling
+from ba_node.core.communicator import Communicator, total
 from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System
-from ba_node.core.numpy_kernels import preconditioner
+from ba_node.core.numpy_kernels import preconditioner, solve_pcg
 from ba_node.core.problem import Problem, ProblemError, State
+from ba_node.core.two_level import TwoLevel
 
-_PRECONDITIONERS = ("none", "schur_block", "schur_diag")
-
-
-class Communicator(Protocol):
-    """What ranks tell each other; every rank has to make the same calls in the same order."""
-
-    rank: int  # of this process, from 0
-    size: int  # number of ranks
-
-    def sum(self, values: FloatArray) -> FloatArray:
-        """Return the sum over ranks, bit by bit the same on all."""
-
-    def gather(self, value: Any) -> list[Any] | None:
-        """Return the values of all ranks on rank 0, None on others."""
-
-    def broadcast(self, value: Any) -> Any:
-        """Return the value of rank 0."""
+_PRECONDITIONERS = ("auto", "none", "schur_block", "schur_diag", "two_level")
 
 
 def deal(problem: Problem, rank: int, size: int) -> tuple[Problem, slice]:
@@ -91,12 +77,14 @@ class RankKernels:
             )
         self._local, self._communicator = native_kernels.make(part, options), communicator
         self.n_free, self.size = self._local.n_free, self._local.size
+        self._two_level = TwoLevel(np.flatnonzero(~part.fixed), communicator)
         self.gradient_norm = np.inf
         self._gradient: FloatArray
         self._diagonals: tuple[FloatArray, FloatArray]
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
+        self._two_level.state = state
         value = self._local.linearise(state)
         own, (d_c, d_p) = self._local.gradient(), self._local.diagonals()
         of_points = max(self._local.gradient_norm**2 - float(np.sum(own * own)), 0.0)
@@ -117,7 +105,7 @@ class RankKernels:
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> RankSystem:
         """Add damping to the diagonals and eliminate the points."""
         own = damping_c if self._communicator.rank == 0 else np.zeros_like(damping_c)
-        return RankSystem(self._local.reduce(own, damping_p), self._communicator, self.size)
+        return RankSystem(self._local.reduce(own, damping_p), self._communicator, self._two_level)
 
     def damp(self, kind: str, mu: float) -> RankSystem:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate the points."""
@@ -147,8 +135,8 @@ class RankSystem:
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, local: System, communicator: Communicator, size: int) -> None:
-        self.local, self._communicator, self._size = local, communicator, size
+    def __init__(self, local: System, communicator: Communicator, two_level: TwoLevel) -> None:
+        self.local, self._communicator, self._two_level = local, communicator, two_level
         self.rhs: FloatArray = communicator.sum(local.rhs)
 
     def choose(self, asked: str) -> LinearSolver:
@@ -157,7 +145,9 @@ class RankSystem:
         if asked in ("auto", "cholesky"):
             asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
         text = linear_costs.describe(asked, n, None, None)
-        return LinearSolver(asked, f"{text}, on {self._communicator.size} ranks")
+        choices = self._communicator.gather(self.local.choose("pcg").preconditioner)
+        preconditioner = self._communicator.broadcast(None if choices is None else min(choices))
+        return LinearSolver(asked, f"{text}, on {self._communicator.size} ranks", preconditioner)
 
     def pcg_tries(self) -> int:
         """Try no steps of PCG."""
@@ -176,27 +166,22 @@ class RankSystem:
         return x
 
     def sparse(self) -> Any:
-        """Return S, sparse, on rank 0."""
-        parts = self._communicator.gather(self.local.sparse())
-        return None if parts is None else sum(parts[1:], parts[0])
+        """Return S, sparse."""
+        return total(self._communicator, self.local.sparse())
 
     def solve_sparse(self) -> FloatArray | None:
         """Return the solution by scipy's sparse factorisation, on rank 0; None if S is not positive definite."""
         matrix = self.sparse()
         x: FloatArray | None = self._communicator.broadcast(
-            None if matrix is None else linear.cholesky(matrix, self.rhs).x
+            linear.cholesky(matrix, self.rhs).x if self._communicator.rank == 0 else None
         )
         return x
 
     def solve_pcg(self, kind: str, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool) -> linear.Solution:
         """Return the solution by PCG in the space scaled by 1 / ``scale``, with products summed over ranks."""
-        matrix = scale[:, None] * self.dense() * scale if formed else None
-
-        def product(x: FloatArray) -> FloatArray:
-            return np.asarray(matrix @ x) if matrix is not None else scale * self.product(scale * x)
-
-        found = linear.pcg_steihaug(product, scale * self.rhs, preconditioner(kind, self, scale), limits)
-        return dataclasses.replace(found, x=None if found.x is None else scale * found.x)
+        if kind == "two_level":
+            return self._two_level.solve(self.local.sparse(), self.rhs, scale, limits)
+        return solve_pcg(self, preconditioner(kind, self, scale), scale, limits, formed=formed)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x."""

@@ -26,8 +26,8 @@ from ba_node.core.kernels import DENSE_LIMIT, System
 
 Hessian = Callable[[], tuple[FloatArray, FloatArray]]
 
-# Where few steps of PCG are tried in the place of an exact solution, these go nearly as far.
-_TRIED_EPS = 0.01
+# Where steps of PCG cost next to nothing beside the rest of an iteration, they go nearly as far as an exact solution.
+_NEARLY = 0.01
 
 
 class ReducedSolver:
@@ -36,6 +36,7 @@ class ReducedSolver:
     def __init__(self, options: SolverOptions) -> None:
         self._options = options
         self.kind = ""  # dense, sparse or pcg; empty while none has been needed
+        self._preconditioner = options.preconditioner
         self.text = ""  # how the systems were solved, for the report, with what it costs
         # Steps of PCG to be tried before an exact solver; 0 once they did not get there; None before the first system.
         self._tries: int | None = None
@@ -65,8 +66,10 @@ class ReducedSolver:
             if not self._outside(x, system, hessian, radius):
                 return linear.Solution(x)
             t_eps = q_eps = 0.0
+        elif self._preconditioner == "two_level":
+            t_eps, q_eps = min(t_eps, _NEARLY), min(q_eps, _NEARLY)
         limits = linear.PcgLimits(t_eps, options.max_linear_iterations, radius, q_eps)
-        return self._pcg(system, hessian, limits, options.preconditioner, formed=len(system.rhs) <= DENSE_LIMIT)
+        return self._pcg(system, hessian, limits, self._preconditioner, formed=len(system.rhs) <= DENSE_LIMIT)
 
     def _outside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> bool:
         """Return True if a step lies outside the region."""
@@ -93,7 +96,7 @@ class ReducedSolver:
 
         M is made of B: Z, of which the blocks of S are made, would cost as much as the steps that it saves.
         """
-        t_eps, q_eps = (min(eps, _TRIED_EPS) for eps in (self._options.t_eps, self._options.q_eps))
+        t_eps, q_eps = (min(eps, _NEARLY) for eps in (self._options.t_eps, self._options.q_eps))
         return self._pcg(system, hessian, linear.PcgLimits(t_eps, steps, radius, q_eps), "b_block", formed=False)
 
     def _pcg(
@@ -106,4 +109,8 @@ class ReducedSolver:
 
     def _choose(self, system: System) -> None:
         """Settle on a linear solver."""
-        self.kind, self.text = system.choose(self._options.linear_solver)
+        self.kind, self.text, preconditioner = system.choose(self._options.linear_solver)
+        if self._preconditioner == "auto":
+            self._preconditioner = preconditioner
+        if self.kind == "pcg" and self._preconditioner == "two_level":
+            self.text += ", preconditioned on two levels"

@@ -61,18 +61,30 @@ class Reconstruction:
     point: IntArray  # (l,) the same
     uv: FloatArray  # (l, 2) px
     stamp_ns: IntArray  # (n,) of each frame
+    sigma_px: FloatArray | None = None  # (l,) of each observation, px; 1 if None
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Return the standard deviation of each observation, (l,) px."""
+        return np.ones(len(self.uv)) if self.sigma_px is None else self.sigma_px
+
+    def images(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
+        """Return frame and camera of each image (k, 2), its rotation and translation, and the image of observations."""
+        images, image = np.unique(np.stack([self.frame, self.camera], axis=1), axis=0, return_inverse=True)
+        frame, camera = images.T
+        place = (self.cameras.rotation[camera], self.cameras.translation[camera])
+        return images, *compose(*place, self.rotation[frame], self.translation[frame]), image.ravel()
 
     def problem(self) -> Problem:
         """Return the problem, of 6 parameters a frame, with nothing fixed."""
         order = np.argsort(self.point, kind="stable")
-        n = len(order)
         start = State(self.rotation, self.translation, self.points, np.empty((0, 3)))
         observations = Observations(
             keyframe=self.frame[order],
             camera=self.camera[order],
             point=self.point[order],
             uv=self.uv[order],
-            sigma_px=np.ones(n),
+            sigma_px=self.sigma[order],
             depth_m=np.empty(0),
             depth_sigma_m=np.empty(0),
         )
@@ -89,6 +101,7 @@ class Reconstruction:
         _, first = np.unique(np.stack([image, self.point], axis=1), axis=0, return_index=True)
         rows = np.sort(first)
         kept = replace(self, frame=self.frame[rows], camera=self.camera[rows], point=self.point[rows], uv=self.uv[rows])
+        kept = kept if self.sigma_px is None else replace(kept, sigma_px=self.sigma_px[rows])
         return kept, len(self.frame) - len(rows)
 
 
@@ -165,14 +178,11 @@ def to_bal(model: Reconstruction) -> BalProblem:
                 f"camera {number} ({model.lens[number]}): BAL and Bundler have cameras of f, k1 and k2 alone:"
                 f" fx = {params[FX]:g}, fy = {params[FY]:g}, other coefficients {params[6:].tolist()}"
             )
-    images, image = np.unique(np.stack([model.frame, model.camera], axis=1), axis=0, return_inverse=True)
-    frame, camera = images.T
-    place = (model.cameras.rotation[camera], model.cameras.translation[camera])
-    rotation, translation = compose(*place, model.rotation[frame], model.translation[frame])
+    images, rotation, translation, image = model.images()
     params = model.cameras.params
-    values = [so3_log(_OPTICAL @ rotation), translation @ _OPTICAL, params[camera][:, [FX, 4, 5]]]
+    values = [so3_log(_OPTICAL @ rotation), translation @ _OPTICAL, params[images[:, 1]][:, [FX, 4, 5]]]
     uv = (model.uv - params[model.camera][:, [CX, CY]]) * [1.0, -1.0]
-    return BalProblem(np.hstack(values), model.points, image.ravel(), model.point, uv)
+    return BalProblem(np.hstack(values), model.points, image, model.point, uv)
 
 
 def stamps(n: int) -> IntArray:

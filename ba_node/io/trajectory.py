@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read and write trajectories in the format of the TUM RGB-D benchmark: ``stamp x y z qx qy qz qw`` a line.
+"""Read and write trajectories as the TUM RGB-D benchmark has them, ``stamp x y z qx qy qz qw`` a line; write KITTI.
 
 Stamps are seconds with nine decimals, made from and read to integer nanoseconds without a float in between; the
 other numbers are written so that they read back as the same float64.
@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
+from ba_node.core.geometry import matrix_from_quaternion
 from ba_node.estimate import Poses
 from ba_node.io.files import opened, whole_file
 
@@ -79,6 +80,28 @@ def read_rows(path: Path | str, parse: Callable[[list[str]], Row], separator: st
         except ValueError as error:
             raise TrajectoryError(f"{path}:{number}: {error}") from None
     return rows
+
+
+def write_kitti(path: Path, poses: Poses) -> None:
+    """Write poses as KITTI's odometry benchmark has them: three rows of world from body a line, without stamps."""
+    rotation = matrix_from_quaternion(poses.orientation)
+    rows = np.concatenate([rotation, poses.position[:, :, None]], axis=2).reshape(-1, 12)
+    with whole_file(path) as stream:
+        stream.write("".join(f"{' '.join(map(repr, row))}\n" for row in rows.tolist()).encode())
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        TrajectoryError: it cannot be opened, or is no text.
+    """
+    with opened(path, MAX_BYTES, TrajectoryError) as stream:
+        data = stream.read()
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path}: not a text file: {error}") from error
 
 
 def format_stamp(stamp_ns: int) -> str:

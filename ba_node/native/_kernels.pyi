@@ -110,6 +110,9 @@ class Kernel:
     def sparse(self) -> tuple[Doubles, NDArray[np.int32], Ints]:
         """Return blocks (n_blocks, d, d), columns and row starts of the upper triangle of S."""
 
+    def schur_blocks(self) -> int:
+        """Return how many blocks S has on and above its diagonal."""
+
     def analyse(self, max_blocks: int, max_products: float) -> tuple[bool, int, float]:
         """Return whether the sparse factor meets the limits, its blocks, and products of blocks to find it."""
 

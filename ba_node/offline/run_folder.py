@@ -21,7 +21,7 @@ from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import Kind
 from ba_node.io.files import whole_file
 from ba_node.io.parameters import configure
-from ba_node.io.ply import read_ply_points
+from ba_node.io.ply import PlyError, read_ply
 from ba_node.io.trajectory import read_tum
 from ba_node.offline.session_record import SessionRecord
 
@@ -118,13 +118,13 @@ def read_run(folder: Path, name: str = "") -> Run:
             read_tum(folder / "trajectory_input.tum"),
             read_tum(folder / "trajectory.tum"),
             read_tum(truth) if truth.is_file() else None,
-            read_ply_points(folder / "points.ply"),
+            read_ply(folder / "points.ply")[0],
             "se3",
             report,
             details,
             dict(configure(folder / "effective.yaml", {}).values()),
         )
-    except (OSError, KeyError, json.JSONDecodeError) as error:
+    except (OSError, KeyError, PlyError, json.JSONDecodeError) as error:
         raise RunError(f"{folder}: no results of ba replay, or of an older version: {error}") from None
 
 

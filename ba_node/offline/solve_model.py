@@ -1,6 +1,9 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Solve a model of COLMAP as a whole: poses, points, and what is asked for of the cameras, shared as in the model."""
+"""Solve a model of COLMAP or a bundle problem of g2o as a whole.
+
+Free are poses, points, and what is asked for of the cameras, shared as in the model.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,10 @@ from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import Cameras, Problem, State
 from ba_node.core.result import Result
 from ba_node.core.solver import solve
-from ba_node.estimate import Iteration
+from ba_node.estimate import Iteration, Poses
 from ba_node.io.colmap import ColmapModel, read_colmap, write_colmap
-from ba_node.io.model import LENSES, Reconstruction
+from ba_node.io.g2o import read_g2o, write_g2o
+from ba_node.io.model import LENSES, ModelError, Reconstruction
 from ba_node.offline.solve_bal import middle_if_far, statistics
 
 # What of the cameras can be refined: columns of their parameters, and their places in a rig.
@@ -37,8 +41,9 @@ _MANY_BEHIND = 0.01
 class ModelSolution:
     """A solved model."""
 
-    source: str  # the folder
-    colmap: ColmapModel
+    source: str  # the folder or file
+    model: Reconstruction  # as it was read
+    colmap: ColmapModel | None  # the same as COLMAP has it; None for g2o
     problem: Problem  # in our terms, moved by minus the origin
     origin: FloatArray  # (3,) of the coordinates in which it was solved, in those of the model
     result: Result  # state and trace
@@ -50,17 +55,20 @@ class ModelSolution:
 
     def refined(self) -> Reconstruction:
         """Return the solution, in the coordinates of the model."""
-        return self.colmap.model.with_state(moved(self.result.state, self.origin), self.cameras)
+        return self.model.with_state(moved(self.result.state, self.origin), self.cameras)
 
     def write(self, path: Path) -> None:
-        """Write the model with the solution, binary as COLMAP does by itself; ids and all else are those read.
+        """Write the model with the solution in its own format; of COLMAP binary, ids and all else are those read.
 
         What was behind its camera at the start, and so took no part, is no observation there any more, as in COLMAP.
         """
+        if self.colmap is None:
+            write_g2o(path, self.refined())
+            return
         left_out = np.zeros(len(self.colmap.views), dtype=bool)
         if self.options.cheirality == "drop":
             behind = np.isnan(reprojection_errors(self.problem, self.problem.start)[:, 0])
-            left_out[np.argsort(self.colmap.model.point, kind="stable")] = behind
+            left_out[np.argsort(self.model.point, kind="stable")] = behind
         self.colmap.take(self.refined(), left_out)
         write_colmap(path, self.colmap.world)
 
@@ -82,11 +90,12 @@ class ModelSolution:
 
     def as_dict(self) -> dict[str, Any]:
         """Return statistics, options and trace for JSON."""
+        ids = range(len(self.model.lens)) if self.colmap is None else self.colmap.camera_ids
         return statistics(self.source, self._ends(), self.result, self.options) | {
             "origin": self.origin.tolist(),
             "attention": self.attention()[0],
             "camera_unknowns": len(self.unknowns),
-            "camera_models": dict(zip(map(str, self.colmap.camera_ids), self.colmap.model.lens, strict=True)),
+            "camera_models": dict(zip(map(str, ids), self.model.lens, strict=True)),
             "setup_s": self.setup_s,
             "solve_s": self.solve_s,
         }
@@ -114,11 +123,14 @@ def solve_model(
         ConfigError: cameras cannot be refined with these options.
     """
     began = clock()
-    colmap = read_colmap(path)
-    problem = colmap.model.problem()
+    colmap = read_colmap(path) if path.is_dir() else None
+    model = read_g2o(path) if colmap is None else colmap.model
+    if isinstance(model, Poses):
+        raise ModelError(f"{path}: a pose graph, without points and observations: there is nothing to adjust")
+    problem = model.problem()
     origin = middle_if_far(problem.start.points)
     problem = replace(problem, start=moved(problem.start, -origin))
-    unknowns = tuple(unknowns_of(colmap.model, groups))
+    unknowns = tuple(unknowns_of(model, groups))
     ready = clock()
     if unknowns:
         result, end = solve_shared(problem, Shared(unknowns), options, clock=clock, on_iteration=on_iteration)
@@ -126,7 +138,7 @@ def solve_model(
     else:
         result, cameras = solve(problem, options, clock=clock, on_iteration=on_iteration), problem.cameras
     return ModelSolution(
-        str(path), colmap, problem, origin, result, cameras, unknowns, options, ready - began, clock() - ready
+        str(path), model, colmap, problem, origin, result, cameras, unknowns, options, ready - began, clock() - ready
     )
 
 

@@ -20,8 +20,9 @@ import numpy as np
 from ba_node import __version__
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
+from ba_node.core.communicator import Alone, Communicator
 from ba_node.core.problem import Problem, State
-from ba_node.core.ranks import Communicator, RankKernels, deal
+from ba_node.core.ranks import RankKernels, deal
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
 from ba_node.io.files import whole_file
@@ -72,42 +73,19 @@ class MpiCommunicator:
         self._finalise()
 
 
-class Alone:
-    """The only rank."""
-
-    rank, size = 0, 1
-
-    def sum(self, values: FloatArray) -> FloatArray:
-        """Return the values."""
-        return values
-
-    def gather(self, value: Any) -> list[Any] | None:
-        """Return the only value."""
-        return [value]
-
-    def broadcast(self, value: Any) -> Any:
-        """Return the value."""
-        return value
-
-    def abort(self, code: int) -> None:
-        """End this process."""
-        sys.exit(code)
-
-    def finish(self) -> None:
-        """Wait for nobody."""
-
-
 def started_as_ranks(environ: Mapping[str, str] = os.environ) -> bool:
     """Tell whether this process is one of several that mpiexec has started."""
     return any(environ.get(name, "1").isdecimal() and int(environ.get(name, "1")) > 1 for name in _SIZES)
 
 
-def world() -> MpiCommunicator:
+def world() -> Communicator:
     """Return the ranks that this one was started with.
 
     Raises:
         RanksError: mpi4py or an MPI library is missing.
     """
+    if not started_as_ranks():
+        return Alone()
     try:
         from mpi4py import MPI  # noqa: PLC0415
     except (ImportError, RuntimeError) as error:

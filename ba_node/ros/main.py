@@ -24,7 +24,7 @@ from ba_node.io.rig_file import RigError
 from ba_node.ros import arguments
 from ba_node.ros.log import Severity, fault, log
 from ba_node.ros.node import NODE_NAME, BaNode
-from ba_node.ros.rclpy_compat.executor import NodeExecutor
+from ba_node.ros.rclpy_compat.executor import WAIT_S, make_executor
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS
 
 USAGE_ERROR = 2
@@ -40,13 +40,16 @@ def main(args: Sequence[str] | None = None) -> int:
     return run(NODE_NAME, BaNode, args)
 
 
-def run(name: str, make: Callable[[], Any], args: Sequence[str] | None) -> int:
+def run(
+    name: str, make: Callable[[], Any], args: Sequence[str] | None, executor: Callable[[], Any] = make_executor
+) -> int:
     """Run a managed node as a process until SIGINT or SIGTERM; return the exit code.
 
     Args:
         name: of the program, which begins what it says.
         make: makes the node, which starts, stops and sums up what it did.
         args: the program and its arguments; None for those of the process.
+        executor: makes what calls its callbacks.
     """
     given = list(sys.argv if args is None else args)
     with signals() as ended:
@@ -56,22 +59,21 @@ def run(name: str, make: Callable[[], Any], args: Sequence[str] | None) -> int:
         except ARGUMENT_ERRORS as error:
             return _refuse(name, str(error))
         try:
-            return _run(name, make, given, ended)
+            return _run(name, lambda: (make(), executor()), given, ended)
         finally:
             rclpy.try_shutdown()
 
 
-def _run(name: str, make: Callable[[], Any], given: list[str], ended: Callable[[], bool]) -> int:
+def _run(name: str, make: Callable[[], tuple[Any, Any]], given: list[str], ended: Callable[[], bool]) -> int:
     if arguments.asks_for_help(given):
         print(arguments.usage(name), end="")
         return 0
     if reason := arguments.objection(given):
         return _refuse(name, reason)
     try:
-        node = make()
+        node, executor = make()
     except (ConfigError, FrontEndError, RigError, InvalidNodeNameException, InvalidNamespaceException) as error:
         return _refuse(name, str(error))
-    executor = NodeExecutor()
     executor.add_node(node)
     for text in arguments.idle_files(given, node.get_fully_qualified_name()):
         log(node, Severity.WARNING, text)
@@ -90,7 +92,7 @@ def _run(name: str, make: Callable[[], Any], given: list[str], ended: Callable[[
     return 0
 
 
-def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
+def spin(executor: Any, node: Any, ended: Callable[[], bool]) -> None:
     """Run callbacks until a signal. One that raises, as rclpy's own do on a senseless request, is survived."""
     faults = 0
     while rclpy.ok() and not ended():
@@ -102,10 +104,10 @@ def spin(executor: NodeExecutor, node: Any, ended: Callable[[], bool]) -> None:
             raise RuntimeError(f"{faults} internal errors one after the other: giving up")
 
 
-def _spin_once(executor: NodeExecutor, node: Any) -> bool:
+def _spin_once(executor: Any, node: Any) -> bool:
     """Run one callback, after a wait that a signal may last out; return False if it raised."""
     try:
-        executor.spin_once()
+        executor.spin_once(WAIT_S)
     except Exception as error:
         # Whoever embeds the node may end the context at any moment, also between two messages of a callback.
         if isinstance(error, ExternalShutdownException) or not rclpy.ok():

@@ -79,8 +79,6 @@ class BaNode(ManagedNode):
         super().__init__(NODE_NAME, **node_options)
         self._settings = Parameters(self, self._reconfigure)
         self._throttle = Throttle(_LOG_PERIOD_S)
-        # Lives as long as the node: a worker that is still in its last iteration may trigger it after cleanup.
-        self._wake = self.create_guard_condition(self._distribute)
         self._host: Host | None = None
         self._components: list[Component] = []
         self._leaving: list[Worker] = []
@@ -128,10 +126,10 @@ class BaNode(ManagedNode):
             kept.load(backend)
         except KeptMapError as error:
             raise RefusedError(str(error)) from error
-        worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
+        deferred = DeferredAnswers(self, lambda: worker.alive)
+        worker = Worker(backend, inbox, config.node.settle_time_s, lambda: deferred.call(self._distribute))
         backend.setup.elsewhere = worker.check_elsewhere
         backend.adjust_elsewhere = worker.adjust_elsewhere
-        deferred = DeferredAnswers(self, lambda: worker.alive)
         self._host = host = Host(self, config, inbox, worker, deferred, self._log)
         host.at_cleanup.callback(deferred.close)
         worker.start()
@@ -225,7 +223,7 @@ class BaNode(ManagedNode):
                 component.take(outcome.estimate, outcome.estimate is newest)
         except Exception as error:
             if not self.context.ok():
-                raise  # a signal ended the context between two messages
+                return  # a signal ended the context between two messages
             name = type(component).__name__
             text = f"{name}, going on after an {fault(error)}\n{traceback.format_exc()}"
             self._log(Notice(f"failure {name}", text, is_error=True))

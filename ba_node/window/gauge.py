@@ -56,7 +56,7 @@ def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
     for part in np.unique(part_of):
         members = part_of == part
         free = np.flatnonzero(members & ~old)
-        scaled = bool(np.any(shows_scale & members.take(obs.keyframe)))
+        scaled = bool(np.any(shows_scale & members))
         needed = 1 if scaled or np.any(members & has_tie) else 2
         missing = needed - int(np.count_nonzero(members & old & strong))
         if not scaled and not np.any(members & old):
@@ -97,6 +97,8 @@ def agreeing_steps(measured: FloatArray, estimated: FloatArray) -> BoolArray:
 def _parts(problem: Problem, tied: BoolArray) -> IntArray:
     """Return for each keyframe the first keyframe that it is connected with over common points and ties."""
     obs, n_kf, n_points = problem.observations, problem.n_keyframes, problem.n_points
+    if tied.all():
+        return np.zeros(n_kf, np.intp)
     # A tie connects as a point does that both keyframes see.
     ties = np.flatnonzero(tied)
     keyframe = np.concatenate([obs.keyframe, ties, ties + 1])
@@ -115,21 +117,19 @@ def _parts(problem: Problem, tied: BoolArray) -> IntArray:
 
 
 def _shows_scale(problem: Problem) -> BoolArray:
-    """Return which observations fix the scale.
+    """Return which keyframes (n_kf,) see what fixes the scale.
 
-    Those with depth, and those of a point that another camera of the same keyframe sees from another place.
+    That is a depth, or a point that another of its cameras sees from another place.
     """
-    obs = problem.observations
-    scale = np.isfinite(obs.depth_m) if len(obs.depth_m) else np.zeros(len(obs), bool)
+    obs, cams = problem.observations, problem.cameras
+    found = np.zeros(problem.n_keyframes, bool)
+    if len(obs.depth_m):
+        found[obs.keyframe[np.isfinite(obs.depth_m)]] = True
+    centres = -(np.swapaxes(cams.rotation, -1, -2) @ cams.translation[:, :, None])[..., 0]
+    if np.linalg.norm(np.ptp(centres, axis=0)) <= _MIN_BASELINE_M:
+        return found
     # Rows are sorted by point, keyframe, camera: the views of one point from one keyframe are neighbours.
     second = 1 + np.flatnonzero((obs.point[1:] == obs.point[:-1]) & (obs.keyframe[1:] == obs.keyframe[:-1]))
-    if len(second):
-        centres = _camera_centres(problem)
-        baseline = centres[obs.camera[second]] - centres[obs.camera[second - 1]]
-        scale[second] |= np.linalg.norm(baseline, axis=1) > _MIN_BASELINE_M
-    return scale
-
-
-def _camera_centres(problem: Problem) -> FloatArray:
-    cams = problem.cameras
-    return np.asarray(-(np.swapaxes(cams.rotation, -1, -2) @ cams.translation[:, :, None])[..., 0])
+    baseline = centres.take(obs.camera[second], axis=0) - centres.take(obs.camera[second - 1], axis=0)
+    found[obs.keyframe[second[np.sum(baseline * baseline, axis=1) > _MIN_BASELINE_M**2]]] = True
+    return found

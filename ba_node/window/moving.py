@@ -96,17 +96,21 @@ def _off(problem: Problem, norms: FloatArray, unrefined: BoolArray) -> FloatArra
 
 def _times_noise(norms: FloatArray) -> float:
     """Return how many times as large as noise the better ones of some residuals are, 1 or more."""
-    known = norms[np.isfinite(norms)]
-    if len(known) < _KNOWN:
+    n = int(np.count_nonzero(np.isfinite(norms)))
+    rank = int(_RANK * n)
+    # To count takes a tenth of the time that it takes to find the one of this rank.
+    if n < _KNOWN or np.count_nonzero(norms <= _NOISE_AT_RANK) > rank:
         return 1.0
-    rank = int(_RANK * len(known))
-    return max(1.0, float(np.partition(known, rank)[rank]) / _NOISE_AT_RANK)
+    return max(1.0, float(np.partition(norms, rank)[rank]) / _NOISE_AT_RANK)
 
 
 def _leaves_more_than_noise(problem: Problem, norms: FloatArray) -> BoolArray:
-    rows, n = np.flatnonzero(norms < _MISMATCH), problem.n_points
-    point, norms = problem.observations.point.take(rows), norms.take(rows)
+    point, n = problem.observations.point, problem.n_points
+    large = np.bincount(point[(norms > _LARGE) & (norms < _MISMATCH)], minlength=n)
+    found = large >= _LEAST_LARGE
+    # Few have so many large residuals: the others need not be looked at.
+    rows = np.flatnonzero(found.take(point) & (norms < _MISMATCH))
+    point, norms = point.take(rows), norms.take(rows)
     total = np.bincount(point, np.minimum(norms, _BOUND) ** 2, n)
-    large = np.bincount(point[norms > _LARGE], minlength=n)
     count = np.bincount(point, minlength=n)
-    return np.asarray((total > _LARGE**2 * count) & (large >= np.maximum(_LEAST_LARGE, _LARGE_SHARE * count)))
+    return np.asarray(found & (total > _LARGE**2 * count) & (large >= _LARGE_SHARE * count))

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray, ranges
 from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import KeyframeFactors, Observations, Problem
@@ -248,9 +248,8 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     """
     table = scene.observations
     taking_part = window[~np.isin(window, without)] if len(without) else window
-    ranges = [np.arange(b.begin, b.end) for row in taking_part for b in scene.blocks[row]]
-    own = np.concatenate(ranges) if ranges else np.empty(0, np.intp)
-    landmarks = scene.distinct(table.landmark[own])
+    blocks = np.array([b[1:] for row in taking_part.tolist() for b in scene.blocks[row]], np.intp).reshape(-1, 2)
+    landmarks = scene.distinct(table.landmark[ranges(*blocks.T)])
     rows = scene.views_of(landmarks, _views_needed(scene, window, config.window.max_fixed_keyframes))
     keyframe = table.keyframe.take(rows)
     known = old_keyframes.memory(scene, config, window)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.arrays import FloatArray, IdArray, IntArray
+from ba_node.arrays import FloatArray, IdArray, IntArray, ranges
 from ba_node.core import native_kernels, triangulation
 from ba_node.core.cameras import FX, FY, rays
 from ba_node.core.problem import Observations, Problem, State
@@ -35,7 +35,6 @@ _BEHIND = 1e6
 # Sigmas that the mean may grow in any case.
 _SLACK = 0.05
 _HASH = np.uint64(0x9E3779B97F4A7C15)
-_NONE = np.empty(0, np.intp)
 
 
 def choose(track_id: IdArray, point: IntArray, wanted: int) -> tuple[IntArray, IntArray]:
@@ -83,14 +82,13 @@ class Trial:
         obs = problem.observations
         # Observations are sorted by point.
         begin, end = (np.searchsorted(obs.point, tried, side) for side in ("left", "right"))
-        rows = np.concatenate([np.arange(b, e) for b, e in zip(begin.tolist(), end.tolist(), strict=True)] or [_NONE])
-        self._rays(obs, rows, np.repeat(np.arange(len(tried)), end - begin))
+        self._rays(obs, ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin))
 
     def _rays(self, obs: Observations, rows: IntArray, group: IntArray) -> None:
         """Keep the rays of some observations, in the body, and to which track each belongs."""
         cams, n_kf = self._problem.cameras, self._problem.n_keyframes
         camera = obs.camera.take(rows)
-        ray = rays(obs.uv.take(rows, axis=0), cams.model[camera], cams.params[camera])
+        ray = rays(obs.uv.take(rows, axis=0), cams.model.take(camera), cams.params.take(camera, axis=0))
         good = np.isfinite(ray[:, 2])
         if not good.all():
             rows, group, camera, ray = rows[good], group[good], camera[good], ray[good]

@@ -216,10 +216,12 @@ def run(args: argparse.Namespace, case: Case, backend: str) -> list[str]:
     reports = [r for r in peer.reports if r.newest_keyframe_id >= args.warm_up]
     last = reports[-1]
     p50, p95, largest = (1e3 * q for q in (last.latency_p50_s, last.latency_p95_s, last.latency_max_s))
+    cpu_s = probe["cpu_s"]
+    threads = ", ".join(f"{name} {100 * spent / probe['wall_s']:.1f}" for name, spent in cpu_s.items())
     counts = (
         f"keyframes received {last.received}, solved {last.solved}, coalesced {last.coalesced}, dropped"
         f" {last.dropped_keyframes}, waiting {last.waiting}; CPU of the node"
-        f" {100 * probe['cpu_s'] / probe['wall_s']:.0f} % of a core"
+        f" {100 * sum(cpu_s.values()) / probe['wall_s']:.0f} % of a core ({threads})"
     )
     delays = [1e3 * (peer.received_s[k] - s) for k, s in steady.items() if k in peer.received_s]
     return [

@@ -1,12 +1,18 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run the node with a timer of 10 ms that notes how late it is called: so long is the executor blocked."""
+"""Run the node with a timer of 10 ms that notes how late it is called: so long is the executor blocked.
+
+Time on the processor is counted by thread, from when a window was refined: starting is another matter.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
+from collections import Counter
+from pathlib import Path
 from typing import Any
 
 from rclpy.clock import Clock
@@ -16,6 +22,8 @@ from ba_node.ros import main as node_main
 from ba_node.ros.node import BaNode
 
 _PERIOD_S = 0.01
+_WINDOW = 20
+_SAMPLE_S = 0.5
 
 
 class ProbedNode(BaNode):
@@ -26,21 +34,40 @@ class ProbedNode(BaNode):
         super().__init__(**options)
         self.late_ms: list[float] = []
         self._last_s = time.monotonic()
+        self._began: tuple[float, Counter[str]] | None = None
+        self._spent: tuple[float, Counter[str]] = (0.0, Counter())
         self._probe = self.create_timer(_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _tick(self) -> None:
         now = time.monotonic()
         self.late_ms.append(1e3 * max(0.0, now - self._last_s - _PERIOD_S))
         self._last_s = now
+        if self.keyframes_refined >= _WINDOW and now > self._spent[0] + _SAMPLE_S:
+            # Threads that have ended tell nothing any more.
+            self._spent = now, cpu_ns()
+            self._began = self._began or self._spent
 
     def destroy_node(self) -> None:
         """Say what was noted."""
-        times = {"cpu_s": time.process_time(), "wall_s": time.monotonic() - _BEGIN_S}
+        began_s, before = self._began or (0.0, Counter())
+        now_s, spent = self._spent
+        times: dict[str, Any] = {
+            "cpu_s": {name: 1e-9 * ns for name, ns in (spent - before).items()},
+            "wall_s": now_s - began_s,
+        }
         print(json.dumps({"late_ms": [round(ms, 2) for ms in self.late_ms[20:]], **times}), flush=True)
         super().destroy_node()
 
 
-_BEGIN_S = time.monotonic()
+def cpu_ns() -> Counter[str]:
+    """Return the time that the threads have had on a processor, ns: executor, solver, and all that are not Python's."""
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    spent: Counter[str] = Counter()
+    for task in Path("/proc/self/task").iterdir():
+        name = names.get(int(task.name), "others")
+        spent[name] += int((task / "schedstat").read_text().split()[0])
+    return spent
+
 
 if __name__ == "__main__":
     vars(node_main)["BaNode"] = ProbedNode

@@ -15,9 +15,13 @@ import pytest
 
 from ba_node.cli import solve as solve_command
 from ba_node.cli.main import main
+from ba_node.estimate import Poses
 from ba_node.io.bal import read_bal
 from ba_node.io.bundler import read_bundler
-from ba_node.io.pose_files import read_g2o
+from ba_node.io.g2o import read_g2o
+from ba_node.io.mcap import BagReader
+from ba_node.io.model import Reconstruction
+from ba_node.io.ply import read_ply
 from ba_node.io.reference import read_poses
 from ba_node.offline import solve_model
 from tests.models import LENSES, adjusted, make_model, objective, written
@@ -111,15 +115,67 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
     assert report["keyframes_refined"] == 8
     assert report["rms_px"]["refined"] < 1.02 * report["rms_px"]["input"]
     capsys.readouterr()
-    names = [tmp_path / name for name in ("p.tum", "p.kitti", "p.g2o", "points.ply")]
+    names = [tmp_path / name for name in ("p.tum", "p.kitti", "points.ply")]
     for name in names:
         assert main(["convert", str(bag), str(name)]) == 0
         assert capsys.readouterr().out.startswith(f"{name}: 8 keyframes, 2 cameras, ")
-    tum, kitti, graph = read_poses(names[0]), read_poses(names[1]), read_g2o(names[2])
+    assert main(["convert", str(names[0]), str(tmp_path / "p.g2o")]) == 0
+    tum, kitti, graph = read_poses(names[0]), read_poses(names[1]), read_g2o(tmp_path / "p.g2o")
+    assert isinstance(graph, Poses)
     assert len(tum) == len(kitti) == len(graph) == 8
     np.testing.assert_allclose(kitti.position, tum.position, atol=1e-12)
     np.testing.assert_array_equal(graph.position, tum.position)
     np.testing.assert_array_equal(graph.orientation, tum.orientation)
+
+
+def test_a_bundle_problem_of_g2o_is_solved_and_goes_both_ways(bag: Path, tmp_path: Path) -> None:
+    model, graph = tmp_path / "model", tmp_path / "scene.g2o"
+    for source, target in ((bag, model), (model, graph), (graph, tmp_path / "again.mcap"), (graph, tmp_path / "back")):
+        assert main(["convert", str(source), str(target)]) == 0
+    figures = solved(graph, tmp_path / "refined.g2o")
+    theirs = solved(model, tmp_path / "refined", "--refine", "none")
+    assert figures["objective_before"] == pytest.approx(theirs["objective_before"], rel=1e-9)
+    # Two images of a rig are free of each other in g2o.
+    assert figures["objective_after"] < theirs["objective_after"]
+    again = solved(tmp_path / "refined.g2o", tmp_path / "end.g2o")
+    assert again["objective_before"] == pytest.approx(figures["objective_after"], rel=1e-9)
+    assert objective(pycolmap.Reconstruction(tmp_path / "back")) == pytest.approx(figures["objective_before"], rel=1e-9)
+    assert main(["check", str(tmp_path / "again.mcap")]) == 0
+
+
+def test_the_two_forms_of_g2o_are_the_same_problem(tmp_path: Path) -> None:
+    """A camera at x = 2 that looks along z, and one at the origin; sigma is 2 px, so that the information is 0.25."""
+    (tmp_path / "cam.g2o").write_text(
+        "VERTEX_CAM 0 0 0 0 0 0 0 1 500 500 320 240 0\nVERTEX_CAM 1 2 0 0 0 0 0 1 500 500 320 240 0.1\nFIX 0\n"
+        "VERTEX_TRACKXYZ 5 1 0.5 10\nEDGE_PROJECT_P2MC 5 0 371 265 0.25 0 0.25\n"
+        "EDGE_PROJECT_P2MC 5 1 270 265 0.25 0 0.25\n"
+    )
+    (tmp_path / "expmap.g2o").write_text(
+        "PARAMS_CAMERAPARAMETERS 7 500 320 240 0.1\nVERTEX_SE3:EXPMAP 0 0 0 0 0 0 0 1\n"
+        "VERTEX_SE3:EXPMAP 1 2 0 0 0 0 0 1\nVERTEX_XYZ 5 1 0.5 10\n"
+        "EDGE_PROJECT_XYZ2UV:EXPMAP 5 0 7 371 265 0.25 0 0.25\nEDGE_PROJECT_XYZ2UV:EXPMAP 5 1 7 270 265 0.25 0 0.25\n"
+    )
+    for name in ("cam", "expmap"):
+        figures = solved(tmp_path / f"{name}.g2o", tmp_path / f"{name}_refined.g2o")
+        assert figures["objective_before"] == pytest.approx(0.5 * 0.25 * 1.0), "one pixel off in one of two images"
+        held = read_g2o(tmp_path / f"{name}_refined.g2o")
+        assert isinstance(held, Reconstruction)
+        assert held.lens == ("SIMPLE_PINHOLE",)
+        np.testing.assert_array_equal(held.sigma, 2.0)
+
+
+def test_points_become_guesses_and_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = "element vertex 2\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\nend_header\n"
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\n{text}1 2 3 40\n4 5 6 50\n")
+    for name in ("points.mcap", "model", "b.ply"):
+        assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / name)]) == 0
+    assert "0 keyframes, 0 cameras, 2 points" in capsys.readouterr().out
+    with BagReader(tmp_path / "points.mcap") as reader:
+        (guesses,) = (reader.decode(topic, data) for topic, _, _, data in reader.messages())
+    assert guesses.position.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    points = dict(sorted(pycolmap.Reconstruction(tmp_path / "model").points3D.items()))
+    assert [point.color.tolist() for point in points.values()] == [[40, 255, 255], [50, 255, 255]]
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply")[0], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
 
 
 @pytest.mark.parametrize(
@@ -127,7 +183,10 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
     [
         (("poses.tum", "model"), "poses alone are written as tum, kitti or g2o, not as colmap: there are no points"),
         (("empty.g2o", "a.tum"), "no VERTEX_SE3:QUAT in it"),
-        (("bad.g2o", "a.tum"), "bad.g2o:1: expected a new id and a pose"),
+        (("bad.g2o", "a.tum"), "bad.g2o: a pose has a quaternion of zeros"),
+        (("stereo.g2o", "a.tum"), "stereo.g2o:1: EDGE_PROJECT_P2SC: observations of two images in one are not read"),
+        (("bad.ply", "a.mcap"), "bad.ply: no point cloud: expected a PLY header"),
+        (("short.ply", "a.mcap"), "short.ply: cut off or damaged: 9 points are not in it"),
         (("none.txt", "a.tum"), "none.txt: cannot be opened"),
         (("empty", "a.tum"), "empty"),
     ],
@@ -137,6 +196,10 @@ def test_what_cannot_be_converted_is_one_line(
 ) -> None:
     (tmp_path / "poses.tum").write_text("1.0 0 0 0 0 0 0 1\n")
     (tmp_path / "empty.g2o").write_text("FIX 0\n")
+    (tmp_path / "stereo.g2o").write_text("EDGE_PROJECT_P2SC 0 1 2 3 4 1 0 0 1 0 1\n")
+    (tmp_path / "bad.ply").write_text("1 2 3\n")
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "short.ply").write_text(f"ply\nformat binary_little_endian 1.0\nelement vertex 9\n{axes}end_header\n0")
     (tmp_path / "bad.g2o").write_text("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 0\n")
     (tmp_path / "empty").mkdir()
     source, target = arguments

@@ -138,7 +138,7 @@ def test_a_loss_with_a_plateau_is_led_up_to_unless_that_is_not_wanted(loss: str)
         ("damping=X", "choose one of none, identity, diag, inc"),
         ("damping_policy=X", "choose one of nielsen, fast"),
         ("linear_solver=X", "choose one of auto, cholesky, dense, sparse, pcg"),
-        ("preconditioner=X", "choose one of none, schur_block, b_block, schur_diag, b_diag, b_literal"),
+        ("preconditioner=X", "choose one of auto, none, schur_block, b_block, schur_diag, b_diag, two_level"),
         ("parameterisation=X", "choose one of local, global"),
     ],
 )

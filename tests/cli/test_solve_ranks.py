@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ba_node.core.communicator import Alone
 from ba_node.io.bal import BalProblem, write_bal
 from ba_node.offline.solve_bal import solve_file
-from ba_node.offline.solve_ranks import Alone, Checkpoint, RanksError, solve_on_ranks, started_as_ranks
+from ba_node.offline.solve_ranks import Checkpoint, RanksError, solve_on_ranks, started_as_ranks
 from ba_node.offline.solver_settings import solver_options
 
 _ASK = [sys.executable, "-c", "from mpi4py import MPI"]

@@ -55,7 +55,7 @@ class Threads:
     def sum(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         parts = self.gather(np.array(values))
         total: NDArray[np.float64] = self.broadcast(None if parts is None else np.sum(parts, axis=0))
-        return total
+        return total.copy()
 
 
 def on_ranks(problem: Problem, options: SolverOptions, size: int) -> tuple[Sequence[Result], State]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import bz2
+import dataclasses
 import functools
 import gzip
 import io
@@ -27,13 +28,14 @@ from ba_node.io import model, ros_types
 from ba_node.io.bal import BalProblem, read_bal, write_bal
 from ba_node.io.bundler import from_bal, read_bundler, write_bundler
 from ba_node.io.colmap import read_colmap, to_colmap, write_colmap
+from ba_node.io.g2o import read_g2o, write_g2o
 from ba_node.io.map_file import load_map, write_map
 from ba_node.io.mcap import BagReader
 from ba_node.io.parameters import configure, parameters_yaml
-from ba_node.io.pose_files import read_g2o, write_g2o, write_kitti
+from ba_node.io.ply import read_ply, write_ply
 from ba_node.io.reference import read_poses
 from ba_node.io.rig_file import FORMS, read_rig, rig_yaml
-from ba_node.io.trajectory import read_tum, write_tum
+from ba_node.io.trajectory import read_tum, write_kitti, write_tum
 from ba_node.messages.adapters import SOURCES, AdapterOptions
 from ba_node.offline.adapt import adapt
 from ba_node.offline.recording import read_truth, record
@@ -133,6 +135,7 @@ READERS: dict[str, Reader] = {
     "bal_bz2_raw": lambda path: read_bal(path.rename(path.with_suffix(".bz2"))),
     "bundler": read_bundler,
     "g2o": read_g2o,
+    "ply": read_ply,
     "poses": read_poses,
     "rig": read_rig,
     **{f"colmap_{part}": _colmap(part) for part in COLMAP},
@@ -169,6 +172,9 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
     write_bal(folder / "a.txt", bal)
     write_bundler(folder / "a.out", from_bal(bal, np.full(bal.points.shape, 255)))
     write_g2o(folder / "a.g2o", estimate.trajectory)
+    pinhole = dataclasses.replace(bal, cameras=bal.cameras * (np.arange(9) < 7))
+    write_g2o(folder / "b.g2o", model.from_bal(pinhole))
+    write_ply(folder / "a.ply", estimate.cloud, "map")
     for name, text in (("model", False), ("text", True)):
         write_colmap(folder / name, to_colmap(model.from_bal(bal)), text=text)
     write_kitti(folder / "a.kitti", estimate.trajectory)
@@ -186,7 +192,8 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
         "bal_gz": [read["txt"]],
         "bal_bz2_raw": [bz2.compress(read["txt"])],
         "bundler": [(folder / "a.out").read_bytes()],
-        "g2o": [(folder / "a.g2o").read_bytes()],
+        "g2o": [(folder / "a.g2o").read_bytes(), (folder / "b.g2o").read_bytes()],
+        "ply": [(folder / "a.ply").read_bytes()],
         "poses": [(folder / "a.kitti").read_bytes(), read["tum"], read["tum"].replace(b" ", b",")],
         "rig": [rig_yaml(world.rig(), form)[0].encode() for form in FORMS],
         **{f"colmap_{part}": [(folder / "model" / f"{part}.bin").read_bytes()] for part in COLMAP},

@@ -23,7 +23,7 @@ from ba_node.io.trajectory import read_tum
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.outputs import POINT_DTYPE
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
-from ba_node.offline.model_timeline import timeline
+from ba_node.offline.convert import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate

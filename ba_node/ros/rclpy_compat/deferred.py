@@ -45,7 +45,6 @@ class DeferredAnswers:
         self._lock = threading.Lock()
         self.open = True
         self.left_waiting = 0  # clients that were answered because of a cleanup, when that was
-        self._guard = node.create_guard_condition(self._run)
         # Silence is no reason not to look, and /clock may stand still.
         self._timer = node.create_timer(_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -67,8 +66,8 @@ class DeferredAnswers:
             if not self.open:
                 return
             self._actions.append(action)
-            with contextlib.suppress(RCLError):  # then the timer finds it
-                self._guard.trigger()
+            with contextlib.suppress(Exception):  # nobody spins the node, or it ends; else the timer finds it
+                self.node.executor.create_task(self._run)
 
     def close(self) -> None:
         """Answer all who still wait, and go."""
@@ -77,7 +76,6 @@ class DeferredAnswers:
         self._run()
         self.left_waiting = len(self._expected)
         self._give_up(CLEANED_UP)
-        self.node.destroy_guard_condition(self._guard)
         self.node.destroy_timer(self._timer)
 
     def _run(self) -> None:

@@ -5,7 +5,6 @@
 They were found in rclpy 7.1 (Jazzy). What the node does without them:
 
 ==========================================  =====================================================================
-``Executor._guard``, ``_tasks``             waits end twice a callback, as rclpy's do
 ``LifecycleNode._state_machine``            a refused transition is told without the state and what is possible
 ``Node._parameter_overrides``               rclpy reads the overrides, and a name that does not exist goes unnoticed
 ``ActionServer._result_futures``, ...       a goal is a coroutine, which the executor asks again and again

@@ -40,6 +40,7 @@ _POLL_S = 0.02
 # Fast DDS asks for acknowledgements every 3 s.
 _ACK_TIMEOUT_S = 10.0
 _LATCHED_DEPTH = 10
+_LINGER_S = 0.5
 _playing: list[Any] = []
 # What a user calls the fields of PlayOptions that are numbers.
 _OPTIONS = {"rate": "--rate", "wait_s": "--wait", "start_s": "--start", "rounds": "--loop", "clock_hz": "--clock"}
@@ -148,8 +149,18 @@ def publish_rig(rig: CameraRig, namespace: str, said: Callable[[str], None]) -> 
 
 def take_leave() -> None:
     """Let subscribers know that the play is over: the process is about to end in the middle of it."""
-    for node in _playing:
+    nodes = list(_playing)
+    for node in nodes:
+        # A publisher in the middle of a message, where a signal is taken up most often, is not destroyed before it is
+        # through, and now it never will be.
+        for publisher in node.publishers:
+            with contextlib.suppress(RuntimeError):
+                publisher.handle.__exit__(None, None, None)
         node.destroy_node()
+    # That writers are gone is repeated until others have it; that the participant is gone is said once, and lost where
+    # a socket is still full of what was played.
+    time.sleep(_LINGER_S if nodes else 0.0)
+    for node in nodes:
         rclpy.try_shutdown(context=node.context)
 
 

@@ -1,182 +1,72 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executor runs what rclpy's runs, but does not wait for events of publishers and subscriptions every time."""
+"""The executor of events serves the node; where rclpy has none, the one with wait sets does."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import rclpy
-from rclpy.event_handler import EventHandler, PublisherEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
-from rclpy.task import Future
 from std_msgs.msg import Empty
 
-from ba_node.ros.rclpy_compat.executor import EVENT_PERIOD_S, NodeExecutor
+from ba_node.ros.rclpy_compat import executor as made_here
+
+pytestmark = pytest.mark.dds
 
 
-class Spun:
-    """A node whose executor counts in how many of its waits there were events."""
-
-    def __init__(self) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context)
-        self.node = Node("spun", context=self.context, start_parameter_services=False, enable_rosout=False)
-        self.now_s = 100.0
-        self.executor = NodeExecutor(self.context, clock=lambda: self.now_s)
-        self.executor.add_node(self.node)
-
-    def waits_for_events(self) -> bool:
-        """Spin once, woken at once; return True if the wait was one for events too."""
-        asked: list[bool] = []
-        inherited = type(self.executor).can_execute
-
-        def spy(entity: Any) -> bool:
-            can = inherited(self.executor, entity)
-            if isinstance(entity, EventHandler):
-                asked.append(can)
-            return can
-
-        setattr(self.executor, "can_execute", spy)  # noqa: B010 (mypy does not let a method be assigned)
-        self.executor.spin_once(timeout_sec=0.0)
-        assert asked, "the node has no events"
-        assert len(set(asked)) == 1, f"some events were left out of a wait and others not: {asked}"
-        return asked[0]
-
-    def until(self, condition: Callable[[], Any]) -> None:
-        end_s = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < end_s, "timed out"
-            self.executor.spin_once(timeout_sec=0.01)
-
-
-@pytest.fixture
-def spun(domain: int) -> Iterator[Spun]:  # noqa: ARG001
-    made = Spun()
-    yield made
-    made.executor.shutdown()
-    made.node.destroy_node()
-    rclpy.try_shutdown(context=made.context)
-
-
-def test_waits_for_events_once_a_period(spun: Spun) -> None:
-    spun.node.create_publisher(Empty, "topic", 1)
-    assert spun.waits_for_events()
-    assert [spun.waits_for_events() for _ in range(3)] == [False] * 3
-    spun.now_s += 0.9 * EVENT_PERIOD_S
-    assert not spun.waits_for_events()
-    spun.now_s += 0.2 * EVENT_PERIOD_S
-    assert spun.waits_for_events()
-    assert not spun.waits_for_events()
-
-
-def test_an_event_that_came_between_is_delivered_then(spun: Spun) -> None:
-    events: list[Any] = []
-    callbacks = PublisherEventCallbacks(matched=events.append)
-    publisher = spun.node.create_publisher(Empty, "topic", 1, event_callbacks=callbacks)
-    spun.waits_for_events()
-    spun.node.create_subscription(Empty, "topic", lambda _: None, 1)
-    spun.until(publisher.get_subscription_count)
-    for _ in range(5):
-        assert not spun.waits_for_events()
-    assert events == []
-    spun.now_s += 2.0 * EVENT_PERIOD_S
-    spun.until(lambda: events)
-    assert events[0].current_count == 1
-
-
-def test_messages_are_taken_in_waits_without_events(spun: Spun) -> None:
-    publisher = spun.node.create_publisher(Empty, "topic", 1)
-    messages: list[Any] = []
-    spun.node.create_subscription(Empty, "topic", messages.append, 1)
-    spun.until(publisher.get_subscription_count)
-    spun.waits_for_events()
-    assert not spun.waits_for_events()
-    publisher.publish(Empty())
-    spun.until(lambda: messages)
-    assert len(messages) == 1
-
-
-@pytest.fixture
-def alarms(spun: Spun, monkeypatch: pytest.MonkeyPatch) -> list[GuardCondition]:
-    """Return a list into which the executor's alarm is put each time that it goes off."""
-    gone_off: list[GuardCondition] = []
-    trigger = GuardCondition.trigger
-
-    def spy(guard: GuardCondition) -> None:
-        if guard is spun.executor._guard:
-            gone_off.append(guard)
-        trigger(guard)
-
-    monkeypatch.setattr(GuardCondition, "trigger", spy)
-    return gone_off
-
-
-def test_a_callback_does_not_end_the_wait_after_it(spun: Spun, alarms: list[GuardCondition]) -> None:
-    calls: list[int] = []
-    guard = spun.node.create_guard_condition(lambda: calls.append(1))
-    spun.until(lambda: not guard.trigger() and len(calls) >= 5)
-    alarms.clear()
-    spun.until(lambda: not guard.trigger() and len(calls) >= 10)
-    assert alarms == []
-
-
-def test_other_threads_end_a_wait(spun: Spun, alarms: list[GuardCondition]) -> None:
-    done: list[str] = []
-    thread = threading.Thread(target=lambda: spun.executor.create_task(lambda: done.append("task")))
-    thread.start()
-    thread.join()
-    assert alarms
-    spun.until(lambda: done)
-
-
-def test_a_coroutine_that_waits_is_looked_at_after_every_callback(spun: Spun, alarms: list[GuardCondition]) -> None:
-    future, done = Future(), list[str]()
-
-    async def wait() -> None:
-        await future
-        done.append("waited")
-
-    spun.executor.create_task(wait)
-    calls: list[int] = []
-    guard = spun.node.create_guard_condition(lambda: calls.append(1))
-    spun.until(lambda: not guard.trigger() and calls)
-    assert not done
-    alarms.clear()
-    calls.clear()
-    spun.until(lambda: not guard.trigger() and calls)
-    assert alarms
-    future.set_result(None)
-    spun.until(lambda: done)
-
-
-@pytest.mark.usefixtures("domain")
-def test_an_rclpy_made_otherwise_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = SingleThreadedExecutor.__init__
-
-    def other(self: Any, **kwargs: Any) -> None:
-        plain(self, **kwargs)
-        self._guard = Alien(self._guard)
-
-    class Alien:
-        def __init__(self, inner: Any) -> None:
-            self.inner = inner
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(self.inner, name)
-
-    monkeypatch.setattr(SingleThreadedExecutor, "__init__", other)
+@pytest.fixture(params=["events", "wait_sets"])
+def spun(domain: int, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Node, Any]]:  # noqa: ARG001
+    """Return a node and the executor that it is in."""
+    if request.param == "wait_sets":
+        monkeypatch.setattr(made_here, "EventsExecutor", None)
     context = rclpy.Context()
     rclpy.init(args=[], context=context)
-    executor = NodeExecutor(context)
-    try:
-        assert isinstance(executor._guard, Alien)
-    finally:
-        executor.shutdown()
-        rclpy.try_shutdown(context=context)
+    node = Node("spun", context=context, start_parameter_services=False, enable_rosout=False)
+    executor = made_here.make_executor(context)
+    assert isinstance(executor, SingleThreadedExecutor) == (request.param == "wait_sets")
+    executor.add_node(node)
+    yield node, executor
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def test_messages_events_and_tasks_of_other_threads_are_run(spun: tuple[Node, Any]) -> None:
+    node, executor = spun
+    seen: list[str] = []
+    callbacks = PublisherEventCallbacks(matched=lambda _: seen.append("matched"))
+    publisher = node.create_publisher(Empty, "topic", 1, event_callbacks=callbacks)
+    node.create_subscription(Empty, "topic", lambda _: seen.append("message"), 1)
+    thread = threading.Thread(target=lambda: node.executor.create_task(lambda: seen.append("task")))
+    thread.start()
+    end_s = time.monotonic() + 20.0
+    while set(seen) != {"matched", "message", "task"}:
+        assert time.monotonic() < end_s, f"only {seen} within 20 s"
+        if publisher.get_subscription_count() and "message" not in seen:
+            publisher.publish(Empty())
+        executor.spin_once(0.01)
+    thread.join()
+    assert seen.count("matched") == seen.count("task") == 1
+
+
+def test_what_a_callback_raises_comes_out_of_the_spin(spun: tuple[Node, Any]) -> None:
+    node, executor = spun
+
+    def fail() -> None:
+        raise ValueError("as asked")
+
+    node.create_timer(0.01, fail)
+    with pytest.raises(ValueError, match="as asked"):
+        spin_for_a_while(executor)
+
+
+def spin_for_a_while(executor: Any) -> None:
+    for _ in range(100):
+        executor.spin_once(0.1)

@@ -91,13 +91,12 @@ def test_deactivate_holds_the_map_and_cleanup_drops_it(
     peer.publish(scene.rig)
     peer.publish_keyframes(scene, *range(4))
     peer.until(lambda: reports and reports[-1].newest_keyframe_id == 3, "keyframe 3")
+    _await_taken(peer)  # a keyframe may be solved before the last of its tracks has come
 
     assert peer.change_state("deactivate")
     n_reports = len(reports)
     peer.publish_keyframes(scene, *range(4, 5))
-    peer.until(peer.all_acknowledged, "the node to have got what it ignores")
-    for _ in range(6):  # the executor takes one message of each topic between two answers
-        assert _state(peer) == INACTIVE
+    _await_taken(peer)
     assert peer.change_state("activate")
     peer.publish_keyframes(scene, *range(5, 6))
     peer.until(lambda: reports[-1].newest_keyframe_id == 5, "keyframe 5")
@@ -109,6 +108,9 @@ def test_deactivate_holds_the_map_and_cleanup_drops_it(
     assert peer.change_state("deactivate")
     assert peer.change_state("cleanup")
     peer.until(lambda: "/ba_node/report" not in _node_topics(peer), "the outputs to go")
+    # Who has not heard yet that the inputs are gone takes them for those that come.
+    inputs = peer.publishers.values()
+    peer.until(lambda: not any(one.get_subscription_count() for one in inputs), "the inputs to go")
     assert peer.change_state("configure")
     assert peer.change_state("activate")
     peer.connect()
@@ -118,6 +120,13 @@ def test_deactivate_holds_the_map_and_cleanup_drops_it(
     peer.until(lambda: _refined(peer) == [6, 7], "a map that was empty")
     assert node.stop() == 0
     assert node.out.endswith("stopped: 7 keyframes refined\n"), "those before the cleanup count too"
+
+
+def _await_taken(peer: Any) -> None:
+    """Wait until the node has taken all that was sent: one message of each topic, at least, between two answers."""
+    peer.until(peer.all_acknowledged, "the node to have got what was sent")
+    for _ in range(6):
+        _state(peer)
 
 
 def _refined(peer: Any) -> list[int]:

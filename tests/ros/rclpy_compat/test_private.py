@@ -17,7 +17,7 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 
 from ba_node.ros import parameters
-from ba_node.ros.rclpy_compat import actions, executor, lifecycle, private
+from ba_node.ros.rclpy_compat import actions, lifecycle, private
 from ba_node.ros.rclpy_compat.private import part
 from ba_node.synthetic import SyntheticOptions, generate
 
@@ -38,7 +38,7 @@ def test_a_part_that_is_missing_is_said_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def forget_private_parts() -> None:
-    for module in (actions, executor, lifecycle, parameters):
+    for module in (actions, lifecycle, parameters):
         vars(module)["part"] = lambda *_: None
 
 

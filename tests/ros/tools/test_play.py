@@ -23,7 +23,7 @@ from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.model import from_bal
 from ba_node.messages import conversion
 from ba_node.messages.topics import CAMERAS, INPUT_TYPES
-from ba_node.offline.model_timeline import timeline
+from ba_node.offline.convert import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.ros import qos
@@ -279,25 +279,14 @@ def test_a_loop_goes_on_until_it_is_interrupted(bag: Path, scene: SyntheticData,
     words = ["play", str(bag), "--rate", "0", "--loop"]
     command = ["env", "--default-signal=INT", sys.executable, "-m", "ba_node.cli.main", *words]
 
-    def leaves_with_a_word() -> bool:
-        """Play until the fourth round, interrupt, and tell whether the publishers are gone before they expire."""
-        others, begun = players(), len(received["keyframes"])
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-            wanted = begun + 3 * len(scene.keyframes)
-            peer.until(lambda: len(received["keyframes"]) > wanted, "the fourth round")
-            peer.until(lambda: players() - others, "the publishers to be known")
-            own = players() - others
-            process.send_signal(signal.SIGINT)
-            _, error = process.communicate(timeout=30)
-        assert (process.returncode, error) == (130, "ba: interrupted\n")
-        # Those that end without a word are known for 20 s.
-        end = time.monotonic() + 15.0
-        while own & players() and time.monotonic() < end:
-            time.sleep(0.05)
-        return not own & players()
-
-    # The last datagram of a process may get lost, but not every time.
-    assert any(leaves_with_a_word() for _ in range(3))
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        peer.until(lambda: len(received["keyframes"]) > 3 * len(scene.keyframes), "the fourth round")
+        peer.until(players, "the publishers to be known")
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=30)
+    assert (process.returncode, error) == (130, "ba: interrupted\n")
+    # Those that end without a word are known for 20 s.
+    peer.until(lambda: not players(), "the publishers to be gone", timeout_s=10.0)
 
 
 def test_a_start_after_the_end_is_refused(bag: Path) -> None:

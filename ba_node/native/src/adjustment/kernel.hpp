@@ -113,6 +113,7 @@ class KernelOf final : public Kernel {
   void rhs(double* out) const override { reduced_.rhs(out); }
   void dense(double* out) override { reduced_.dense(out); }
   bool solve(double* x) override { return reduced_.solve(x); }
+  std::int64_t schur_blocks() override { return reduced_.schur_blocks(); }
   const Fill& analyse(const FillLimits& limits) override { return reduced_.analyse(limits); }
   bool solve_sparse(double* x) override { return reduced_.solve_sparse(x); }
   const Rows32& assemble() override { return reduced_.assemble().pattern(); }

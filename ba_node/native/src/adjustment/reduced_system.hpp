@@ -113,6 +113,9 @@ class ReducedSystem {
     return all_finite(x, n);
   }
 
+  // Blocks of S on and above its diagonal.
+  std::int64_t schur_blocks() { return static_cast<std::int64_t>(schur().pattern().index.size()); }
+
   // The size of the sparse factor, found once if it meets the limits.
   const Fill& analyse(const FillLimits& limits) {
     if (!factor_ || !factor_->fill().complete) factor_ = std::make_unique<SparseCholesky<D>>(schur().pattern(), limits);

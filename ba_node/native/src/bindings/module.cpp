@@ -214,6 +214,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              return without_gil([&] { return k.solve(x); });
            })
       .def("sparse", &sparse)
+      .def("schur_blocks", [](Kernel& k) { return without_gil([&] { return k.schur_blocks(); }); })
       .def("analyse",
            [](Kernel& k, std::int64_t max_blocks, double max_products) {
              const Fill& fill = *without_gil([&] { return &k.analyse({max_blocks, max_products}); });

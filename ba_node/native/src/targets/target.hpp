@@ -61,6 +61,8 @@ class Kernel {
   virtual void product(const double* x, double* out) = 0;
   virtual void diagonal_blocks(double* out) = 0;
 
+  // Blocks of S on and above its diagonal.
+  virtual std::int64_t schur_blocks() = 0;
   // Solve S x = rhs by dense Cholesky, or by sparse Cholesky after analyse; false if S is not positive definite.
   virtual bool solve(double* x) = 0;
   virtual const Fill& analyse(const FillLimits& limits) = 0;
