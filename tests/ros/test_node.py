@@ -166,7 +166,9 @@ class TestPlayed:
         with contextlib.closing(Peer()) as late:
             late.listen("points", "path")
             late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
-            assert late.received["points"][0].width == played[1].received["points"][-1].width
+            peer, width = played[1], late.received["points"][0].width
+            # A solve may have followed that the first one has not heard of yet.
+            peer.until(lambda: peer.received["points"][-1].width == width, f"a map of {width} points")
 
     def test_a_node_that_ends_says_what_it_has_done(self, played: tuple[NodeProcess, Peer]) -> None:
         node, _ = played
