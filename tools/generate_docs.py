@@ -18,8 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ba_node.config import Config, Parameter, SolverOptions, Value, declared
-from ba_node.config.front_end import FrontEndOptions
-from ba_node.config.front_end_node import FrontEndNodeOptions
+from ba_node.config.front_end import FrontEndNodeOptions, FrontEndOptions
 from ba_node.core.methods import METHODS
 from ba_node.io.parameters import parameters_markdown, parameters_yaml, plain_yaml
 from ba_node.messages.topics import ACTIONS, INTERFACE_VERSION, SERVICES, TOPICS, Command, Direction, Topic

@@ -21,7 +21,7 @@ BA_NODE_TARGETS=baseline BA_NODE_WERROR=1 CFLAGS=$flags CXXFLAGS=$flags \
   LDFLAGS="-fsanitize=address,undefined" "$python" setup.py -q build_ext --inplace
 # Without them the tests would pass by themselves.
 nm ba_node/native/*.so | grep -q __asan
-[ $# -gt 0 ] || set -- tests/core/test_kernels.py tests/core/test_threads.py tests/core/test_linear_solvers.py
+[ $# -gt 0 ] || set -- tests/core/test_kernels.py tests/core/test_inner_iterations.py tests/core/test_threads.py tests/core/test_linear_solvers.py
 # Python itself leaks on purpose, and loads the sanitizers' library only if told to.
 LD_PRELOAD="$(g++ -print-file-name=libasan.so) $(g++ -print-file-name=libstdc++.so.6)" \
   ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 "$python" -m pytest -q -p no:cacheprovider "$@"

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate how two images stand to each other from the rays that they share, and tell how well a pose explains them.
+"""Estimate the relative pose of two images from the rays that they share, and tell how well a pose explains them.
 
 With ``x_b = R x_a + t`` every pair of rays fulfils ``b' [t]x R a = 0``. Its residual is Sampson's distance, in units of
 the rays. OpenCV gives the essential matrix by consensus of samples (USAC, one thread, fixed seed), which a robust

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from typing import Any, get_type_hints
@@ -49,7 +50,7 @@ class Parameter:
     kind: type  # bool, int, float or str
     default: Value  # value when nothing is set
     doc: str  # what it does, one sentence
-    unit: str = ""  # physical unit, empty if it has none
+    unit: str = ""  # physical unit, empty if it has none; by default that in which the name ends
     minimum: float | None = None  # smallest allowed number, None if unbounded
     maximum: float | None = None  # largest allowed number, None if unbounded
     allowed: tuple[Choice, ...] = ()  # what it may be, if it is chosen by name; empty if not
@@ -121,7 +122,7 @@ def option(
 ) -> Any:
     """Declare a field of a dataclass as an option; ``details`` are attributes of Parameter, ``within`` two of them.
 
-    ``node`` among them says that the option is a parameter of the node too, and which attributes differ there.
+    ``node`` among them says which attributes differ where the option is a parameter of the node.
     """
     allowed = tuple(Choice(choice) if isinstance(choice, str) else choice for choice in choices)
     if within is not None:
@@ -139,12 +140,23 @@ def declared(cls: type, group: str = "") -> tuple[Parameter, ...]:
     for item in fields(cls):
         if not item.metadata:
             continue
-        details = dict(item.metadata)
+        details = {"unit": _unit_of(item.name), **item.metadata}
         of_node = details.pop("node", {})
         if group:
             details |= of_node
         found.append(Parameter(name=f"{group}.{item.name}" if group else item.name, kind=kinds[item.name], **details))
     return tuple(found)
+
+
+# Units that names end in, and how they are written where it is otherwise.
+_UNIT = re.compile(r"_((?:m|s|px|rad|deg|ms|hz|mb)(?:_per_(?:m|rad))?)$")
+_WRITTEN = {"hz": "Hz", "mb": "MB"}
+
+
+def _unit_of(name: str) -> str:
+    """Return the unit in which a name ends, empty if in none: m/m for ``sigma_m_per_m``."""
+    found = _UNIT.search(name)
+    return _WRITTEN.get(found[1], found[1].replace("_per_", "/")) if found else ""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,6 @@ class SceneConfig:
         10.0,
         "Keyframes whose stamps are further than this before the newest begin a new session, as when the clock is set"
         " back, and one alone is rejected; closer ones are sorted in. One this far ahead waits for the next. 0: never.",
-        unit="s",
         within=(0.0, 1e9),
     )
     max_pending: int = option(
@@ -76,21 +75,18 @@ class TracksConfig:
     min_parallax_deg: float = option(
         1.0,
         "Smallest angle between two viewing rays of a track for it to be triangulated.",
-        unit="deg",
         within=(0.0, 90.0),
         tune=Tune(0.1, 5.0),
     )
     max_triangulation_px: float = option(
         12.0,
         "Largest reprojection error, in sigmas, of a view that agrees where a point begins; half of it for two views.",
-        unit="px",
         within=(0.1, 1e6),
         tune=Tune(3.0, 40.0),
     )
     outlier_px: float = option(
         6.0,
         "Observations beyond this many sigmas (at least 4.4 x the median) sit out the next solve; 0 keeps all.",
-        unit="px",
         within=(0.0, 1e6),
         tune=Tune(1.5, 20.0),
     )
@@ -110,29 +106,23 @@ class OdometryConfig:
     sigma_m: float = option(
         0.001,
         "Standard deviation of a step's translation along each axis at rest.",
-        unit="m",
         within=(0.0, 1e6),
         tune=Tune(1e-4, 0.1, ()),
     )
     sigma_m_per_m: float = option(
-        0.01, "The same, added for each metre of the step.", unit="m/m", within=(0.0, 1e6), tune=Tune(1e-3, 0.3)
+        0.01, "The same, added for each metre of the step.", within=(0.0, 1e6), tune=Tune(1e-3, 0.3)
     )
     sigma_rad: float = option(
         0.001,
         "Standard deviation of a step's rotation about each axis at rest.",
-        unit="rad",
         within=(0.0, 1e3),
         tune=Tune(1e-4, 0.1, ()),
     )
     sigma_rad_per_m: float = option(
-        0.003, "The same, added for each metre of the step.", unit="rad/m", within=(0.0, 1e3), tune=Tune(3e-4, 0.1)
+        0.003, "The same, added for each metre of the step.", within=(0.0, 1e3), tune=Tune(3e-4, 0.1)
     )
     sigma_rad_per_rad: float = option(
-        0.01,
-        "The same, added for each radian of the step.",
-        unit="rad/rad",
-        within=(0.0, 1e3),
-        tune=Tune(1e-3, 0.3, ()),
+        0.01, "The same, added for each radian of the step.", within=(0.0, 1e3), tune=Tune(1e-3, 0.3, ())
     )
     max_inflation: float = option(
         10.0,
@@ -158,16 +148,15 @@ class FactorsConfig:
         within=(1e-3, 1e6),
     )
     gnss_sigma_m: float = option(
-        5.0, "Standard deviation of a fix of GNSS that tells no covariance.", unit="m", within=(1e-4, 1e6)
+        5.0, "Standard deviation of a fix of GNSS that tells no covariance.", within=(1e-4, 1e6)
     )
-    antenna_x_m: float = option(0.0, "Where the antenna is on the body.", unit="m", within=(-1e3, 1e3))
-    antenna_y_m: float = option(0.0, "The same, y.", unit="m", within=(-1e3, 1e3))
-    antenna_z_m: float = option(0.0, "The same, z.", unit="m", within=(-1e3, 1e3))
+    antenna_x_m: float = option(0.0, "Where the antenna is on the body.", within=(-1e3, 1e3))
+    antenna_y_m: float = option(0.0, "The same, y.", within=(-1e3, 1e3))
+    antenna_z_m: float = option(0.0, "The same, z.", within=(-1e3, 1e3))
     align_m: float = option(
         10.0,
         "How far the path has to spread (standard deviation) before map and world are aligned by positions alone; at"
         " least five times the noise of these. With measured orientations at once.",
-        unit="m",
         within=(0.0, 1e6),
     )
     adjust_max_keyframes: int = option(
@@ -176,10 +165,7 @@ class FactorsConfig:
         within=(0, 10_000_000),
     )
     adjust_m: float = option(
-        0.3,
-        "A loop or priors that move a keyframe further begin a solve of everything; 0: never.",
-        unit="m",
-        within=(0.0, 1e6),
+        0.3, "A loop or priors that move a keyframe further begin a solve of everything; 0: never.", within=(0.0, 1e6)
     )
 
 
@@ -203,13 +189,13 @@ class CalibrationConfig:
         0.05, "Standard deviation of the given coefficients of distortion.", within=(1e-6, 10.0)
     )
     rotation_sigma_rad: float = option(
-        0.03, "Standard deviation of the given rotation of a camera on the body.", unit="rad", within=(1e-6, 1.0)
+        0.03, "Standard deviation of the given rotation of a camera on the body.", within=(1e-6, 1.0)
     )
     position_sigma_m: float = option(
-        0.03, "Standard deviation of the given position of a camera on the body.", unit="m", within=(1e-6, 10.0)
+        0.03, "Standard deviation of the given position of a camera on the body.", within=(1e-6, 10.0)
     )
     time_sigma_s: float = option(
-        0.05, "Standard deviation of an offset of the stamps of the images.", unit="s", within=(1e-6, 10.0)
+        0.05, "Standard deviation of an offset of the stamps of the images.", within=(1e-6, 10.0)
     )
 
     @property
@@ -233,16 +219,15 @@ class GuardConfig:
     step_sigma_m: float = option(
         0.03,
         "What the front-end's step between two keyframes is off at least: standard deviation along each axis.",
-        unit="m",
         within=(1e-6, 1e6),
     )
     step_sigma_share: float = option(
         0.1, "The same, as a share of the length of the step, on top of it.", within=(1e-6, 10.0)
     )
-    turn_sigma_rad: float = option(0.02, "The same for its turn, about each axis.", unit="rad", within=(1e-6, 1.0))
+    turn_sigma_rad: float = option(0.02, "The same for its turn, about each axis.", within=(1e-6, 1.0))
     turn_sigma_share: float = option(0.1, "The same, as a share of the turn, on top of it.", within=(1e-6, 10.0))
     turn_sigma_rad_per_m: float = option(
-        0.02, "The same, for each metre of the step, on top of it.", unit="rad/m", within=(0.0, 10.0)
+        0.02, "The same, for each metre of the step, on top of it.", within=(0.0, 10.0)
     )
     max_sigmas: float = option(
         5.0,

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ba_node.config.declaration import Checked, option
+from ba_node.config.declaration import Checked, Choice, option
 
 
 @dataclass(frozen=True)
@@ -16,18 +16,14 @@ class FrontEndOptions(Checked):
     max_features: int = option(800, "Most features that are followed at a time.", within=(50, 10_000))
     patch_px: int = option(21, "Side of the square of pixels that is compared around a feature.", within=(7, 63))
     max_error_px: float = option(
-        2.0,
-        "A feature farther than this from where its point should appear is an outlier.",
-        unit="px",
-        within=(0.1, 100.0),
+        2.0, "A feature farther than this from where its point should appear is an outlier.", within=(0.1, 100.0)
     )
     sigma_px: float = option(
-        0.15, "Least standard deviation of a feature; noise and blur come on top.", unit="px", within=(0.01, 10.0)
+        0.15, "Least standard deviation of a feature; noise and blur come on top.", within=(0.01, 10.0)
     )
     keyframe_parallax_px: float = option(
         16.0,
         "An image becomes a keyframe when features have moved this far since the last one (median), turning left out.",
-        unit="px",
         within=(1.0, 1000.0),
     )
     keyframe_min_shared: float = option(
@@ -42,14 +38,10 @@ class FrontEndOptions(Checked):
     max_gap_s: float = option(
         2.0,
         "A new session begins where stamps are further apart and what was seen before is not found again.",
-        unit="s",
         within=(0.01, 1e6),
     )
     max_skew_s: float = option(
-        0.005,
-        "Left and right image, or image and depth, whose stamps differ by more are no pair.",
-        unit="s",
-        within=(0.0, 1.0),
+        0.005, "Left and right image, or image and depth, whose stamps differ by more are no pair.", within=(0.0, 1.0)
     )
     stereo_align: bool = option(
         True,
@@ -57,17 +49,43 @@ class FrontEndOptions(Checked):
         " disparity), and correct what it sees by that.",
     )
     stereo_yaw_px: float = option(
-        0.0, "What to begin with: all disparities are too small by this.", unit="px", within=(-20.0, 20.0)
+        0.0, "What to begin with: all disparities are too small by this.", within=(-20.0, 20.0)
     )
     stereo_roll_px: float = option(
-        0.0,
-        "Likewise, times the distance below the image's centre by the focal length.",
-        unit="px",
-        within=(-20.0, 20.0),
+        0.0, "Likewise, times the distance below the image's centre by the focal length.", within=(-20.0, 20.0)
     )
-    min_depth_m: float = option(
-        0.2, "Depths of a depth camera nearer than this are not taken.", unit="m", within=(1e-3, 1e3)
-    )
+    min_depth_m: float = option(0.2, "Depths of a depth camera nearer than this are not taken.", within=(1e-3, 1e3))
     max_depth_m: float = option(
-        0.0, "Depths of a depth camera beyond this are not taken; 0 takes all.", unit="m", within=(0.0, 1e4)
+        0.0, "Depths of a depth camera beyond this are not taken; 0 takes all.", within=(0.0, 1e4)
     )
+
+
+MODES = (
+    Choice("auto", "by the first image topics that are there"),
+    Choice("stereo", "left/image_raw, right/image_raw"),
+    Choice("rgbd", "rgb/image_raw, depth/image_raw"),
+    Choice("mono", "image_raw"),
+)
+
+
+@dataclass(frozen=True)
+class FrontEndNodeOptions(Checked):
+    """Options of the node. A value of the wrong type or out of range raises ConfigError."""
+
+    mode: str = option("auto", "What images there are.", choices=MODES)
+    rectified: bool = option(
+        False, "Images are rectified: p of camera_info is their camera; so it is for topics image_rect."
+    )
+    rig_file: str = option("", "YAML of the rig, in any form of ba rig, in place of camera_info and /tf_static.")
+    base_frame: str = option("", "Body frame, to which /tf_static tells the way; empty: the first camera.")
+    odom_frame: str = option("odom", "Fixed frame of the keyframes, and of the odometry where it comes by TF.")
+    odometry: str = option(
+        "none",
+        "Steps from elsewhere: topic odometry, or TF from odom_frame.",
+        choices=("none", "topic", "tf"),
+    )
+    publish_tf: bool = option(True, "Publish odom_frame -> body, unless the odometry comes from elsewhere.")
+    mask_file: str = option("", "Picture of the first camera's size, black where nothing is to be looked at.")
+    mask_topic: bool = option(False, "Wait for a mask of each image on the topic mask (mono8, 0: do not look).")
+    queue_depth: int = option(50, "Images of a topic that may wait.", within=(2, 1000))
+    autostart: bool = option(True, "Configure and activate at start.")

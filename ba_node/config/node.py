@@ -37,26 +37,21 @@ class FramesConfig:
     publish_period_s: float = option(
         0.05,
         "How often map -> odom is repeated, between solves too; 0: after solves only.",
-        unit="s",
         within=(0.0, 60.0),
         live=False,
     )
     gate_m: float = option(
         1.0,
         "A solve that moves the newest keyframe further is held back from /tf until others confirm it; 0: never.",
-        unit="m",
         within=(0.0, 1e9),
     )
-    gate_rad: float = option(
-        0.2, "The same for a solve that turns it further; 0: never.", unit="rad", within=(0.0, 4.0)
-    )
+    gate_rad: float = option(0.2, "The same for a solve that turns it further; 0: never.", within=(0.0, 4.0))
     gate_confirmations: int = option(
         2, "Solves in a row that have to agree with a correction beyond a gate.", within=(1, 1000)
     )
     smoothing_s: float = option(
         0.0,
         "Time constant, by the stamps of keyframes, with which map -> odom follows corrections; 0: at once.",
-        unit="s",
         within=(0.0, 3600.0),
     )
 
@@ -71,9 +66,9 @@ class OutputConfig:
     markers_max_links: int = option(
         500, "Lines in ~/markers between keyframes; those with most common points are kept.", within=(0, 100_000)
     )
-    markers_frustum_m: float = option(0.2, "Depth of the frusta in ~/markers.", unit="m", within=(1e-3, 1e3))
+    markers_frustum_m: float = option(0.2, "Depth of the frusta in ~/markers.", within=(1e-3, 1e3))
     markers_rms_px: float = option(
-        2.0, "Reprojection error of a keyframe that ~/markers draws in red; 0 is green.", unit="px", within=(1e-3, 1e6)
+        2.0, "Reprojection error of a keyframe that ~/markers draws in red; 0 is green.", within=(1e-3, 1e6)
     )
 
 
@@ -107,26 +102,22 @@ class NodeConfig:
         10.0,
         "With no keyframes or tracks for this long, log and /diagnostics name the topics and who publishes there;"
         " 0: never.",
-        unit="s",
         within=(0.0, 86_400.0),
     )
     log_period_s: float = option(
         5.0,
         "How often one line in the log tells rate, residuals, latency, and what became of the solutions; 0: never.",
-        unit="s",
         within=(0.0, 86_400.0),
     )
     latency_budget_ms: float = option(
         0.0,
         "Time from arrival of a keyframe to its result that the solver may use up: it ends after an iteration"
         " when another would take longer, but makes one always. 0: no limit. Without effect offline.",
-        unit="ms",
         within=(0.0, 1e6),
     )
     settle_time_s: float = option(
         0.5,
         "With no new message for this long, the newest keyframe is solved with what has arrived.",
-        unit="s",
         within=(0.01, 3600.0),
         live=False,
     )
@@ -136,23 +127,17 @@ class NodeConfig:
 class DiagnosticsConfig:
     """When /diagnostics warns. See docs/diagnostics.md."""
 
-    recent_s: float = option(
-        10.0, "What was dropped or turned away counts for this long.", unit="s", within=(1.0, 3600.0)
-    )
+    recent_s: float = option(10.0, "What was dropped or turned away counts for this long.", within=(1.0, 3600.0))
     queue_warn_share: float = option(
         0.5, "Share of node.inbox_size that waits from which on the queue warns.", within=(0.0, 1.0)
     )
-    latency_warn_s: float = option(
-        0.2, "95th percentile from arrival to publication that warns.", unit="s", within=(0.0, 1e6)
-    )
-    latency_error_s: float = option(1.0, "The same as an error.", unit="s", within=(0.0, 1e6))
-    rms_warn_px: float = option(
-        2.0, "Root mean square residual after a solve that warns.", unit="px", within=(0.0, 1e6)
-    )
-    rms_error_px: float = option(10.0, "The same as an error.", unit="px", within=(0.0, 1e6))
+    latency_warn_s: float = option(0.2, "95th percentile from arrival to publication that warns.", within=(0.0, 1e6))
+    latency_error_s: float = option(1.0, "The same as an error.", within=(0.0, 1e6))
+    rms_warn_px: float = option(2.0, "Root mean square residual after a solve that warns.", within=(0.0, 1e6))
+    rms_error_px: float = option(10.0, "The same as an error.", within=(0.0, 1e6))
     inliers_warn_share: float = option(
         0.7, "Share of inliers among the observations below which it warns.", within=(0.0, 1.0)
     )
     inliers_error_share: float = option(0.3, "The same as an error.", within=(0.0, 1.0))
-    memory_warn_mb: float = option(2000.0, "Memory of the process (resident) that warns.", unit="MB", within=(0.0, 1e9))
-    memory_error_mb: float = option(8000.0, "The same as an error.", unit="MB", within=(0.0, 1e9))
+    memory_warn_mb: float = option(2000.0, "Memory of the process (resident) that warns.", within=(0.0, 1e9))
+    memory_error_mb: float = option(8000.0, "The same as an error.", within=(0.0, 1e9))

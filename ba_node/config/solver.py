@@ -51,7 +51,7 @@ PLATEAUS = ("truncated_quadratic", "geman_mcclure")
 class SolverConfig:
     """How a window is solved: the options that are parameters of the node."""
 
-    method: str = option("auto", "Named method. See docs/methods.md.", choices=METHODS, node={})
+    method: str = option("auto", "Named method. See docs/methods.md.", choices=METHODS)
     linear_solver: str = option(
         "auto",
         "How the reduced system S p = rhs is solved; an exact step that leaves the trust region is cut off by pcg.",
@@ -64,7 +64,6 @@ class SolverConfig:
             Choice("sparse", "exactly: S by blocks, sparse Cholesky"),
             Choice("pcg", "by conjugate gradients (Steihaug): an inexact Newton step", "Alg. 1, 3, 4"),
         ),
-        node={},
     )
     kernels: str = option(
         "auto",
@@ -75,14 +74,12 @@ class SolverConfig:
             Choice("numpy", "numpy and scipy: everything"),
         ),
         aliases=("backend",),
-        node={},
     )
     threads: int = option(
         1,
         "Threads of the C++ kernels, 0 for one a core. Results are the same, bit for bit, for any number;"
         " one leaves the other cores to the front-end.",
         within=(0, 256),
-        node={},
     )
     loss: str = option(
         "squared",
@@ -97,7 +94,6 @@ class SolverConfig:
     loss_scale_px: float = option(
         1.0,
         "Residual, in units of sigma, where the robust loss leaves the square.",
-        unit="px",
         within=(1e-6, 1e6),
         aliases=("loss_scale", "gamma"),
         node={"default": 2.0},
@@ -111,7 +107,7 @@ class SolverConfig:
         tune=Tune(2, 50, ("accuracy", "latency")),
     )
     max_linear_iterations: int = option(
-        500, "Cap on PCG steps in one outer iteration.", within=(1, 1_000_000), aliases=("cap",), node={}
+        500, "Cap on PCG steps in one outer iteration.", within=(1, 1_000_000), aliases=("cap",)
     )
     function_tolerance: float = option(
         1e-6,
@@ -124,9 +120,7 @@ class SolverConfig:
             " (auto), 1e-5 of all others, whose first steps are small.",
         },
     )
-    gradient_tolerance: float = option(
-        1e-9, "Stop when the norm of the gradient falls below this.", within=(0.0, 1e12), node={}
-    )
+    gradient_tolerance: float = option(1e-9, "Stop when the norm of the gradient falls below this.", within=(0.0, 1e12))
     cheirality: str = option(
         "keep",
         "Points on or behind the camera plane: keep their plain residual, give them a constant cost, or drop them.",

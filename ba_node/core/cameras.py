@@ -172,6 +172,8 @@ def project_jacobian(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Project points, with derivatives; arrays as of :func:`project`, those by f, k1 and k2 if they are wanted.
 
+    The pixels are those of :func:`project` to rounding: the lenses stand once, and here one division by z serves both.
+
     Returns:
         uv: (n, 2) px; d uv / d x_cam: (n, 2, 3) px/m; d uv / d (f, k1, k2): (n, 2, 3) where f scales fx and fy
         alike (fx = fy = f when the camera's own fx and fy are 1), or (n, 2, 0) where it is not wanted.

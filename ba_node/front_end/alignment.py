@@ -28,7 +28,7 @@ from ba_node.front_end.rectify import IdealRig
 # What a calibration is trusted to, px: yaw and roll.
 _PRIOR_PX = np.array([1.0, 1.0])
 # Roll is seen across rows by those who calibrate, and is seldom off: of what is found, so many standard deviations are
-# not believed (the mode under Laplace's prior, which is 0 unless the data insist).
+# not trusted (the mode under Laplace's prior, which is 0 unless the data insist).
 _DOUBT = 2.0
 # Pairs of keyframes share points and errors of their place: each counts for less than its numbers say.
 _WORTH = 0.05

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find corners, spread over the image, and follow them to the next image."""
+"""Detect corners, spread over the image, and track them to the next image."""
 
 from __future__ import annotations
 

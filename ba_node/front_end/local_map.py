@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Remember points that were seen: a patch each, in the keyframe that it was cut from, and how far away it was there.
 
-A point hangs on its keyframe (its anchor): it moves with it when that is refined. Its distance is kept as inverse depth
+A point is anchored to a keyframe: it moves with it when that is refined. Its distance is kept as inverse depth
 ``w = 1 / Z``, in which errors of disparities are Gaussian and infinity is an ordinary value, with the slant of its
 surface, which is linear in the image too: ``w(p) = w + s_x p_x + s_y p_y`` is a plane. So where a patch appears in
 another camera (R, t from the anchor) is a homography, which matters: a road seen from a car that has moved by 2 m is

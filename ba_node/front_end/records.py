@@ -22,7 +22,7 @@ class FrontEndError(ValueError):
 
 
 class State(enum.Enum):
-    """How the front-end fares with the images that it gets."""
+    """How tracking goes with the images that come."""
 
     STARTING = "starting"  # one camera alone has not moved enough yet; or nothing to see since the start
     TRACKING = "tracking"  # the pose of the last image is known

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""See the images of a rig as those of ideal cameras: without distortion, side by side, rows on rows.
+"""Rectify the images of a rig, as ideal cameras see them: without distortion, side by side, rows on rows.
 
 The ideal cameras turn with the first one, their x axis along the baseline (Fusiello et al., *A compact algorithm for
 rectification of stereo pairs*, 2000), and have one focal length f and one centre. A point at depth Z is in both in the

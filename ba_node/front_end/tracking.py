@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Follow points from image to image, find the camera's pose by them, and measure them anew at keyframes.
+"""Track points from image to image, estimate the camera's pose by them, and measure them anew at keyframes.
 
 Between keyframes features are followed from image to image, which is quick. At a keyframe each is aligned with the
 patch that it was first seen as, warped to how it should look from here, so that no error is handed on; points of the

@@ -94,16 +94,16 @@ def _find_one(path: Path) -> BagFiles:
             return _listed(path, _metadata(path))
         except YamlError as error:
             files = _in_folder(path)
-            text = f"{path / METADATA}: {error}: all recordings in its folder are taken"
+            text = f"{error}: all recordings in its folder are taken"
             return BagFiles(files, False, {"metadata": text})
     return BagFiles(_in_folder(path), False, {})
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    content = read_yaml(folder / METADATA)
+    content = read_yaml(folder / METADATA, YamlError)
     facts = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(facts, dict) or not isinstance(facts.get("relative_file_paths"), list):
-        raise YamlError("no rosbag2_bagfile_information with relative_file_paths")
+        raise YamlError(f"{folder / METADATA}: no rosbag2_bagfile_information with relative_file_paths")
     return facts
 
 
@@ -116,7 +116,7 @@ def _names(folder: Path) -> list[str]:
     """Return the files that the metadata.yaml of a folder lists, none where there is none that can be read."""
     try:
         return _names_in(_metadata(folder))
-    except (YamlError, OSError):
+    except YamlError:
         return []
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from mcap.writer import CompressionType, Writer
@@ -48,8 +47,8 @@ class BagWriter:
         self._path, self._streaming = Path(path), streaming
         self._stack = contextlib.ExitStack()
         self._types: dict[str, tuple[str, bool]] = {}
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
 
     def __enter__(self) -> BagWriter:
@@ -58,18 +57,15 @@ class BagWriter:
         # The name of the library must not bring a version, and with it other bytes, into the file.
         self._writer = Writer(stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="ba_node")
+        self._stack.push(self._finish)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if error is None:
-            try:
-                self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
-            except BaseException as failure:
-                self._stack.__exit__(type(failure), failure, failure.__traceback__)
-                raise
-        self._stack.__exit__(kind, error, traceback)
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
+
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
 
     def write(self, topic: str, type_name: str, message: Any, log_time_ns: int, latched: bool = False) -> None:
         """Add a message made with ``ROSBAGS_FACTORY``, at a time of recording, ns, that players and readers go by.
@@ -92,38 +88,30 @@ class BagWriter:
             data = ros_types.encode(type_name, message)
         except Exception as error:  # generated encoders raise whatever a wrong value leads them to
             raise BagError(f"{self._path}: topic {topic}: message does not fit {type_name}: {error}") from error
-        self._add(self._channel(topic, type_name, latched), log_time_ns, data)
+        if (topic, type_name) not in self._channels:
+            text, about = ros_types.schema_text(type_name), {"topic_type_hash": ros_types.type_hash(type_name)}
+            self._register(BagChannel(0, topic, type_name, ("cdr", "ros2msg"), text, None, latched), about)
+        self._add(self._channels[topic, type_name], log_time_ns, data)
 
     def copy(self, channel: BagChannel, log_time_ns: int, data: bytes) -> None:
         """Add a message of another recording as it is, with the definition that it had there."""
-        key = f"{channel.topic} {channel.type_name}"
-        if key not in self._channels:
-            kind, encoding = channel.encoding
-            schema = f"{channel.type_name} {channel.definition}"
-            if schema not in self._schemas:
-                text = channel.definition.encode()
-                self._schemas[schema] = self._writer.register_schema(channel.type_name, encoding, text)
-            about = {"offered_qos_profiles": _qos(channel.is_latched)}
-            self._channels[key] = self._writer.register_channel(channel.topic, kind, self._schemas[schema], about)
-        self._add(self._channels[key], log_time_ns, data)
+        if (channel.topic, channel.type_name) not in self._channels:
+            self._register(channel, {})
+        self._add(self._channels[channel.topic, channel.type_name], log_time_ns, data)
 
     def _add(self, channel: int, log_time_ns: int, data: bytes) -> None:
         sequence = self._sequences.get(channel, 0)
         self._sequences[channel] = sequence + 1
         self._writer.add_message(channel, log_time_ns, data, publish_time=log_time_ns, sequence=sequence)
 
-    def _channel(self, topic: str, type_name: str, latched: bool) -> int:
-        if topic not in self._channels:
-            if type_name not in self._schemas:
-                text = ros_types.schema_text(type_name).encode()
-                self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text)
-            self._channels[topic] = self._writer.register_channel(
-                topic,
-                "cdr",
-                self._schemas[type_name],
-                {"offered_qos_profiles": _qos(latched), "topic_type_hash": ros_types.type_hash(type_name)},
-            )
-        return self._channels[topic]
+    def _register(self, channel: BagChannel, about: dict[str, str]) -> None:
+        (kind, encoding), schema = channel.encoding, (channel.type_name, channel.definition)
+        if schema not in self._schemas:
+            text = channel.definition.encode()
+            self._schemas[schema] = self._writer.register_schema(channel.type_name, encoding, text)
+        about = {"offered_qos_profiles": _qos(channel.is_latched), **about}
+        number = self._writer.register_channel(channel.topic, kind, self._schemas[schema], about)
+        self._channels[channel.topic, channel.type_name] = number
 
 
 def _qos(latched: bool) -> str:

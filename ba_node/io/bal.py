@@ -27,7 +27,7 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core.cameras import Model
 from ba_node.core.geometry import so3_exp, so3_log
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.files import opened, whole_file
 from ba_node.io.unpack import TooLargeError, limit_for, unpack
 
 _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
@@ -155,13 +155,8 @@ def from_state(bal: BalProblem, state: State) -> BalProblem:
 
 
 def _unpack(path: Path) -> bytes:
-    try:
-        with open_regular(path, MAX_BYTES) as stream:
-            data = stream.read()
-    except FileKindError as error:
-        raise BalError(str(error)) from None
-    except OSError as error:
-        raise BalError(f"{path}: cannot be opened: {error.strerror}") from error
+    with opened(path, MAX_BYTES, BalError) as stream:
+        data = stream.read()
     if path.suffix not in (".bz2", ".gz"):
         return data
     try:

@@ -21,7 +21,7 @@ import numpy as np
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.core.geometry import so3_exp, so3_log
 from ba_node.io.bal import MAX_BYTES, BalProblem
-from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.files import opened, whole_file
 from ba_node.io.model import ModelError
 
 _HEAD = b"# Bundle file v0.3"
@@ -117,20 +117,15 @@ def from_bal(bal: BalProblem, colour: IntArray) -> BundlerScene:
 def is_bundler(path: Path) -> bool:
     """Return True if a file begins as a scene of Bundler."""
     try:
-        with open_regular(path, MAX_BYTES) as stream:
+        with opened(path, MAX_BYTES, ModelError) as stream:
             return stream.read(13) == _HEAD[:13]
-    except (FileKindError, OSError):
+    except ModelError:
         return False
 
 
 def _numbers(path: Path) -> FloatArray:
-    try:
-        with open_regular(path, MAX_BYTES) as stream:
-            head, text = stream.readline(100), stream.read()
-    except FileKindError as error:
-        raise ModelError(str(error)) from None
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be opened: {error.strerror}") from error
+    with opened(path, MAX_BYTES, ModelError) as stream:
+        head, text = stream.readline(100), stream.read()
     if not head.startswith(_HEAD[:13]):
         raise ModelError(f"{path}: expected {_HEAD.decode()!r} in the first line")
     try:

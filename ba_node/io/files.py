@@ -134,6 +134,18 @@ def open_regular(path: Path | str, max_bytes: int) -> IO[bytes]:
     return os.fdopen(descriptor, "rb")
 
 
+@contextmanager
+def opened(path: Path | str, max_bytes: int, raised: type[ValueError]) -> Iterator[IO[bytes]]:
+    """Open a file to read as :func:`open_regular` does, and raise ``raised``, naming it, where that cannot be."""
+    try:
+        with open_regular(path, max_bytes) as stream:
+            yield stream
+    except FileKindError as error:
+        raise raised(str(error)) from None
+    except OSError as error:
+        raise raised(f"{path}: cannot be opened: {error.strerror or error}") from error
+
+
 def write_json(path: Path | str, content: Mapping[str, Any]) -> None:
     """Write JSON that every reader takes: null for infinity and NaN, which JSON does not have."""
     with whole_file(path) as stream:

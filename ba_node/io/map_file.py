@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ba_node import __version__
 from ba_node.backend import MapContent, MapError, archive
 from ba_node.config import SceneConfig
-from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.files import opened, whole_file
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for
 
 FORMAT = "ba_node map"
@@ -65,15 +65,11 @@ def read_map(path: Path | str) -> MapContent:
     Raises:
         MapFileError: it cannot be opened, is no map or damaged, or has a newer format.
     """
-    try:
-        with open_regular(path, MAX_BYTES) as stream:
+    with opened(path, MAX_BYTES, MapFileError) as stream:
+        try:
             return _read(stream)
-    except FileKindError as error:
-        raise MapFileError(str(error)) from None
-    except OSError as error:
-        raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except MapFileError as error:
-        raise MapFileError(f"{path}: {error}") from None
+        except MapFileError as error:
+            raise MapFileError(f"{path}: {error}") from None
 
 
 def map_name(name: Path | str) -> Path:
@@ -85,11 +81,11 @@ def map_name(name: Path | str) -> Path:
 def is_map(path: Path | str) -> bool:
     """Return True for a file that says to be a map, of whatever version; its arrays are not looked at."""
     try:
-        with open_regular(path, MAX_BYTES) as stream, zipfile.ZipFile(stream) as file:
+        with opened(path, MAX_BYTES, MapFileError) as stream, zipfile.ZipFile(stream) as file:
             if file.getinfo(_HEAD).file_size > _MAX_HEAD_BYTES:
                 return False
             head = json.loads(file.read(_HEAD))
-    except (OSError, FileKindError, RecursionError, *_DAMAGE):
+    except (RecursionError, *_DAMAGE):
         return False
     return isinstance(head, dict) and head.get("format") == FORMAT
 

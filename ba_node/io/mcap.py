@@ -9,7 +9,7 @@ import pickle
 import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from itertools import chain, combinations
+from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import Any
 
@@ -165,17 +165,21 @@ class BagReader:
         raw = self._raw(numbers)
         if first is not None:
             raw = chain([first], _without(raw, first))
-        for number, log_time, data in raw:
-            channel = self._channels[number]
-            place = counts[channel.topic]
-            counts[channel.topic] += 1
+        for message in raw:
+            topic = self._channels[message.channel].topic
+            place = counts[topic]
+            counts[topic] += 1
             try:
-                measurement = measurement_from_message(channel.type_name, self._decoder(number)(data))
+                measurement = self._measurement(message)
             except Exception as error:  # as in decode: whatever the bytes are, the next message may be sound
-                words = f"topic {channel.topic}, message {place}: {type(error).__name__}: {error}"
+                words = f"topic {topic}, message {place}: {type(error).__name__}: {error}"
                 self._reject(self.path, "undecodable", words)
                 continue
-            yield channel.topic, log_time, measurement
+            yield topic, message.log_time, measurement
+
+    def _measurement(self, message: Message) -> Measurement:
+        decoded = self._decoder(message.channel)(message.data)
+        return measurement_from_message(self._channels[message.channel].type_name, decoded)
 
     def _first_cameras(self, numbers: Collection[int]) -> Message | None:
         """Return the first message of some channels that holds cameras that can be read."""
@@ -183,8 +187,7 @@ class BagReader:
         try:
             for raw in self._raw(numbers):
                 with contextlib.suppress(Exception):  # what cannot be read is counted in its turn
-                    kind = self._channels[raw.channel].type_name
-                    found = measurement_from_message(kind, self._decoder(raw.channel)(raw.data))
+                    found = self._measurement(raw)
                     if isinstance(found, CameraRig) and not found.malformed:
                         return raw
         except BagError:
@@ -216,9 +219,7 @@ class BagReader:
 
     def _first_messages(self, topic: str) -> Iterator[Any]:
         numbers = [n for n in self._numbers([topic]) if self._channels[n].type_name in INPUT_TYPES.values()]
-        for count, raw in enumerate(self._raw(numbers)):
-            if count == _LOOKED_AT:
-                return
+        for raw in islice(self._raw(numbers), _LOOKED_AT):
             with contextlib.suppress(Exception):  # as in _first_cameras
                 yield raw.channel, self._decoder(raw.channel)(raw.data)
 
@@ -347,9 +348,7 @@ class BagReader:
             own = {id(channel) for channel in source.channels if channel.topic == topic}
             first = self._first_cameras({n for n, channel in enumerate(self._channels) if id(channel) in own})
             if first is not None:
-                channel = self._channels[first.channel]
-                content = measurement_from_message(channel.type_name, self._decoder(first.channel)(first.data))
-                found.add(pickle.dumps(content))
+                found.add(pickle.dumps(self._measurement(first)))
         return len(found) > 1
 
 

@@ -4,16 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import groupby
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from ba_node.config import Config, ConfigError, Parameter, Value, declarations
-from ba_node.io.files import FileKindError
-from ba_node.io.yaml_file import YamlError, read_yaml
+from ba_node.io.yaml_file import read_yaml
 
 NODE_NAME = "ba_node"
 _ROS_KEY = "ros__parameters"
@@ -29,13 +27,7 @@ def read_parameters(path: Path | str) -> dict[str, object]:
     Raises:
         ConfigError: the file cannot be read, is not YAML, or holds no mapping of parameters.
     """
-    try:
-        content = read_yaml(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be opened: {error.strerror}") from error
-    except (YamlError, FileKindError) as error:
-        text = str(error)
-        raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error
+    content = read_yaml(path, ConfigError)
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -59,36 +51,46 @@ def configure(path: Path | str | None, changes: Mapping[str, object]) -> Config:
         try:
             config = config.with_values(read_parameters(path))
         except ConfigError as error:
-            text = str(error)
-            raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+            raise ConfigError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     return config.with_values(changes)
 
 
 def parameters_yaml(config: Config, *, comments: bool = True) -> str:
     """Return all parameters as a file that ``--ros-args --params-file`` and :func:`read_parameters` take."""
-    lines = ["/**:", f"  {_ROS_KEY}:"]
     values = config.values()
-    for group, parameters in groupby(declarations(), key=lambda p: p.name.split(".")[0]):
-        lines.append(f"    {group}:")
-        for parameter in parameters:
-            if comments:
-                lines += [f"      # {parameter.doc}", f"      # {_facts(parameter)}"]
-            lines.append(f"      {parameter.name.split('.')[1]}: {_scalar(values[parameter.name])}")
-    return "\n".join(lines) + "\n"
+    return _yaml((one, values[one.name], _comments(one) if comments else (), "") for one in declarations())
 
 
 def changes_yaml(config: Config) -> str:
     """Return the parameters that differ from their defaults as such a file, the default behind each."""
-    lines = ["/**:", f"  {_ROS_KEY}:"]
     values = config.values()
     changed = [one for one in declarations() if values[one.name] != one.default]
-    for group, parameters in groupby(changed, key=lambda p: p.name.split(".")[0]):
-        lines.append(f"    {group}:")
-        lines += [
-            f"      {one.name.split('.')[1]}: {_scalar(values[one.name])}  # default {_scalar(one.default)}"
-            for one in parameters
-        ]
-    return "\n".join(lines if changed else ["{}  # all parameters have their defaults"]) + "\n"
+    rows = ((one, values[one.name], (), f"  # default {_scalar(one.default)}") for one in changed)
+    return _yaml(rows) if changed else "{}  # all parameters have their defaults\n"
+
+
+def plain_yaml(parameters: Sequence[Parameter]) -> str:
+    """Return parameters without groups, with their defaults, as a file for ``--params-file``."""
+    return _yaml((one, one.default, _comments(one), "") for one in parameters)
+
+
+def _yaml(rows: Iterable[tuple[Parameter, Value, Sequence[str], str]]) -> str:
+    """Return parameters with their values, comments above and what stands behind them."""
+    lines, last = ["/**:", f"  {_ROS_KEY}:"], ""
+    for parameter, value, above, behind in rows:
+        group, _, key = parameter.name.rpartition(".")
+        if group != last:
+            lines.append(f"    {group}:")
+            last = group
+        indent = " " * (6 if group else 4)
+        lines += [*(f"{indent}# {line}" for line in above), f"{indent}{key}: {_scalar(value)}{behind}"]
+    return "\n".join(lines) + "\n"
+
+
+def _comments(parameter: Parameter) -> tuple[str, str]:
+    unit = f"[{parameter.unit}] " if parameter.unit else ""
+    change = "takes effect at the next solve" if parameter.live else "takes effect at start only"
+    return parameter.doc, f"{unit}{_allowed(parameter)}; default {_scalar(parameter.default)}; {change}"
 
 
 def parameters_markdown(parameters: Sequence[Parameter] = declarations()) -> str:
@@ -97,15 +99,6 @@ def parameters_markdown(parameters: Sequence[Parameter] = declarations()) -> str
     for p in parameters:
         change = "next solve" if p.live else "restart"
         lines.append(f"| `{p.name}` | {_scalar(p.default)} | {p.unit} | {_allowed(p)} | {change} | {p.doc} |")
-    return "\n".join(lines) + "\n"
-
-
-def plain_yaml(parameters: Sequence[Parameter]) -> str:
-    """Return parameters without groups, with their defaults, as a file for ``--params-file``."""
-    lines = ["/**:", f"  {_ROS_KEY}:"]
-    for parameter in parameters:
-        lines += [f"    # {parameter.doc}", f"    # {_facts(parameter)}"]
-        lines.append(f"    {parameter.name}: {_scalar(parameter.default)}")
     return "\n".join(lines) + "\n"
 
 
@@ -157,26 +150,13 @@ def _scalar(value: Value) -> str:
     return str(value)
 
 
-def _facts(parameter: Parameter) -> str:
-    facts = [f"[{parameter.unit}]"] if parameter.unit else []
-    facts.append(f"{_allowed(parameter)};")
-    facts.append(f"default {_scalar(parameter.default)};")
-    facts.append("takes effect at the next solve" if parameter.live else "takes effect at start only")
-    return " ".join(facts)
-
-
 def _allowed(parameter: Parameter) -> str:
     if parameter.choices:
         return ", ".join(parameter.choices)
     if parameter.kind is bool:
         return "true, false"
-    low, high = (_limit(parameter, bound) for bound in (parameter.minimum, parameter.maximum))
+    show = "{:.0f}" if parameter.kind is int else "{:g}"
+    low, high = ("" if bound is None else show.format(bound) for bound in (parameter.minimum, parameter.maximum))
     if low and high:
         return f"{low} to {high}"
     return f"at least {low}" if low else f"at most {high}" if high else "any"
-
-
-def _limit(parameter: Parameter, bound: float | None) -> str:
-    if bound is None:
-        return ""
-    return str(int(bound)) if parameter.kind is int else f"{bound:g}"

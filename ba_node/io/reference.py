@@ -17,9 +17,9 @@ import numpy as np
 
 from ba_node.core.geometry import quaternion_from_matrix
 from ba_node.estimate import Poses
-from ba_node.io.files import open_regular
+from ba_node.io.files import opened
 from ba_node.io.mcap import BagError, BagReader
-from ba_node.io.trajectory import MAX_BYTES, TrajectoryError, read_tum
+from ba_node.io.trajectory import MAX_BYTES, TrajectoryError, numbered, read_rows, read_tum
 from ba_node.messages.factory import stamp_ns_from_message
 
 # Topics of these types hold poses; what gives the stamped poses of a message.
@@ -81,38 +81,35 @@ def _read(path: Path, topic: str) -> tuple[Poses, bool]:
 def first_line(path: Path) -> str:
     """Return the first line of a file that is no comment, empty if it has none or cannot be read."""
     try:
-        with open_regular(path, MAX_BYTES) as stream:
+        with opened(path, MAX_BYTES, TrajectoryError) as stream:
             lines = (line.decode(errors="replace").strip() for line in itertools.islice(stream, 1000))
             return next((line for line in lines if line and not line.startswith("#")), "")
-    except (OSError, ValueError):
+    except TrajectoryError:
         return ""  # read_tum says what is wrong
 
 
 def _read_table(path: Path, separator: str | None, width: int, expected: str) -> Poses:
-    with open_regular(path, MAX_BYTES) as stream:
-        lines = stream.read().decode(errors="replace").splitlines()
-    rows: list[list[float]] = []
-    stamps: list[int] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        words = line.split(separator)
+    def row(words: list[str]) -> tuple[int, list[float]]:
+        shown = (separator or " ").join(words)[:60]
         try:
-            stamps.append(int(words[0]) if separator else _SECOND_NS * len(stamps))
-            rows.append([float(word) for word in words[:width]])
+            stamp_ns, values = int(words[0]) if separator else 0, [float(word) for word in words[:width]]
         except ValueError:
-            raise TrajectoryError(f"{path}:{number}: {line[:60]!r} is no row of numbers: expected {expected}") from None
-        if len(rows[-1]) < width or (separator is None and len(words) > width) or not np.isfinite(rows[-1]).all():
-            raise TrajectoryError(f"{path}:{number}: expected {width} finite numbers: {expected}")
+            raise ValueError(f"{shown!r} is no row of numbers: expected {expected}") from None
+        if len(values) < width or (separator is None and len(words) > width) or not np.isfinite(values).all():
+            raise ValueError(f"expected {width} finite numbers: {expected}")
+        return stamp_ns, values
+
+    stamps, rows = zip(*read_rows(path, row, separator), strict=True)
     values = np.array(rows)
     if separator:
-        position, orientation = values[:, 1:4], values[:, [5, 6, 7, 4]]
+        stamp_ns, position, orientation = np.array(stamps, np.int64), values[:, 1:4], values[:, [5, 6, 7, 4]]
     else:
         matrix = values.reshape(-1, 3, 4)
-        position, orientation = matrix[:, :, 3], quaternion_from_matrix(matrix[:, :, :3])
+        stamp_ns, position = _SECOND_NS * np.arange(len(rows)), matrix[:, :, 3]
+        orientation = quaternion_from_matrix(matrix[:, :, :3])
     if (np.linalg.norm(orientation, axis=1) == 0.0).any():
         raise TrajectoryError(f"{path}: a quaternion is zero: expected {expected}")
-    return Poses(np.arange(len(rows), dtype=np.uint64), np.array(stamps, dtype=np.int64), position, orientation)
+    return numbered(stamp_ns, position, orientation)
 
 
 def _read_topic(path: Path, topic: str) -> Poses:
@@ -133,5 +130,4 @@ def _read_topic(path: Path, topic: str) -> Poses:
     if not poses:
         raise BagError(f"{path}: topic {wanted[0]} holds no pose")
     values = np.array(list(poses.values()))
-    stamps = np.array(list(poses), dtype=np.int64)
-    return Poses(np.arange(len(stamps), dtype=np.uint64), stamps, values[:, :3], values[:, 3:])
+    return numbered(np.array(list(poses), np.int64), values[:, :3], values[:, 3:])

@@ -31,13 +31,13 @@ import yaml
 
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
-from ba_node.io.files import FileKindError
-from ba_node.io.yaml_file import YamlError, read_yaml
+from ba_node.io.yaml_file import read_yaml
 from ba_node.measurements import CameraRig
 from ba_node.messages.factory import ConversionError
 from ba_node.messages.rig import rig_from_infos
 
 FORMS = ("own", "kalibr", "camera_info")
+_OWN = ("intrinsics", "distortion", "image_size", "position", "orientation")
 # Kalibr's names of distortions, and ROS's.
 _KALIBR = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": ""}
 
@@ -95,12 +95,7 @@ def rig_yaml(rig: CameraRig, form: str = "own", beside: Sequence[Mapping[str, An
 
 
 def _content(path: Path | str) -> dict[Any, Any]:
-    try:
-        content = read_yaml(path)
-    except OSError as error:
-        raise RigError(f"{path}: cannot be opened: {error.strerror}") from error
-    except (YamlError, FileKindError) as error:
-        raise RigError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    content = read_yaml(path, RigError)
     if not isinstance(content, dict) or not content:
         raise RigError(f"{path}: expected a mapping with a rig, got {type(content).__name__}")
     return content
@@ -189,11 +184,7 @@ def _own_row(rig: CameraRig, i: int) -> dict[str, Any]:
     return {
         "name": rig.names[i],
         "distortion_model": rig.models[i],
-        "intrinsics": rig.intrinsics[i].tolist(),
-        "distortion": rig.distortion[i].tolist(),
-        "image_size": rig.image_size[i].tolist(),
-        "position": rig.position[i].tolist(),
-        "orientation": rig.orientation[i].tolist(),
+        **{name: getattr(rig, name)[i].tolist() for name in _OWN},
     }
 
 

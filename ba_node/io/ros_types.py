@@ -47,9 +47,7 @@ class RosbagsFactory:
         """Return the array itself."""
         return np.ascontiguousarray(values)
 
-    def fixed(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the array itself."""
-        return np.ascontiguousarray(values)
+    fixed = array
 
 
 ROSBAGS_FACTORY = RosbagsFactory()

@@ -8,19 +8,23 @@ other numbers are written so that they read back as the same float64.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from decimal import ROUND_HALF_EVEN, Decimal, DecimalException, InvalidOperation, localcontext
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core.geometry import matrix_from_quaternion
 from ba_node.estimate import Poses
-from ba_node.io.files import FileKindError, open_regular, whole_file
+from ba_node.io.files import opened, whole_file
 
 # A million poses.
 MAX_BYTES = 2**27
 _NS = 1_000_000_000
 _COLUMNS = "stamp x y z qx qy qz qw"
+Row = TypeVar("Row")
 
 
 class TrajectoryError(ValueError):
@@ -45,23 +49,37 @@ def read_tum(path: Path | str) -> Poses:
         TrajectoryError: the file cannot be opened or holds no pose; a line has not eight finite numbers, a stamp beyond
             int64 nanoseconds, or a quaternion of zeros. Names the line.
     """
-    path = Path(path)
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            stamps.append(parse_stamp(words[0]))
-            rows.append(_parse_pose(words))
-        except ValueError as error:
-            raise TrajectoryError(f"{path}:{number}: {error}") from None
+    rows = read_rows(path, lambda words: (parse_stamp(words[0]), _parse_pose(words)))
     if not rows:
         raise TrajectoryError(f"{path}: no pose in it: expected lines with {_COLUMNS}")
-    values = np.array(rows)
-    ids = np.arange(len(rows), dtype=np.uint64)
-    return Poses(ids, np.array(stamps, dtype=np.int64), values[:, :3], values[:, 3:])
+    stamps, values = zip(*rows, strict=True)
+    return numbered(np.array(stamps, np.int64), np.array(values)[:, :3], np.array(values)[:, 3:])
+
+
+def numbered(stamp_ns: IntArray, position: FloatArray, orientation: FloatArray) -> Poses:
+    """Return poses whose ids count from 0."""
+    return Poses(np.arange(len(stamp_ns), dtype=np.uint64), stamp_ns, position, orientation)
+
+
+def read_rows(path: Path | str, parse: Callable[[list[str]], Row], separator: str | None = None) -> list[Row]:
+    """Return what is made of the words of each line; empty lines and those with # are passed over.
+
+    Raises:
+        TrajectoryError: the file cannot be opened, is no text, or ``parse`` raises ValueError; names the line.
+    """
+    rows: list[Row] = []
+    with opened(path, MAX_BYTES, TrajectoryError) as stream:
+        lines = stream.read().decode("utf-8", errors="replace").splitlines()
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if "\N{REPLACEMENT CHARACTER}" in line:
+            raise TrajectoryError(f"{path}:{number}: not a text file")
+        try:
+            rows.append(parse(line.split(separator)))
+        except ValueError as error:
+            raise TrajectoryError(f"{path}:{number}: {error}") from None
+    return rows
 
 
 def write_kitti(path: Path, poses: Poses) -> None:
@@ -78,13 +96,10 @@ def read_text(path: Path) -> str:
     Raises:
         TrajectoryError: it cannot be opened, or is no text.
     """
+    with opened(path, MAX_BYTES, TrajectoryError) as stream:
+        data = stream.read()
     try:
-        with open_regular(path, MAX_BYTES) as stream:
-            return stream.read().decode("utf-8")
-    except FileKindError as error:
-        raise TrajectoryError(str(error)) from None
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be opened: {error.strerror}") from error
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise TrajectoryError(f"{path}: not a text file: {error}") from error
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from ba_node.io.files import open_regular
+from ba_node.io.files import opened
 
 MAX_BYTES = 2**20
 # Of a value without quotes, which may be a number: to read one takes a time that grows with the square of its length.
@@ -34,22 +34,21 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def read_yaml(path: Path | str) -> Any:
+def read_yaml(path: Path | str, raised: type[ValueError]) -> Any:
     """Return the content of a file.
 
     Raises:
-        YamlError: it is not YAML, nested too deep, has aliases, or a number without end.
-        FileKindError: it is no regular file, or larger than 1 MB.
-        OSError: it cannot be read.
+        ``raised``: it cannot be opened, is no regular file or larger than 1 MB, is not YAML, is nested too deep, or has
+            aliases or a number without end; names the file.
     """
-    with open_regular(path, MAX_BYTES) as stream:
+    with opened(path, MAX_BYTES, raised) as stream:
         data = stream.read()
     try:
         return yaml.load(data.decode("utf-8"), _Loader)
     except RecursionError:
-        raise YamlError("nested too deep") from None
+        raise raised(f"{path}: nested too deep") from None
+    except YamlError as error:
+        raise raised(f"{path}: {error}") from error
+    # Wrong dates and numbers are ValueErrors of Python.
     except (yaml.YAMLError, ValueError, OverflowError) as error:
-        if isinstance(error, YamlError):
-            raise
-        # Wrong dates and numbers are ValueErrors of Python.
-        raise YamlError(f"not YAML: {' '.join(str(error).split())}") from error
+        raise raised(f"{path}: not YAML: {' '.join(str(error).split())}") from error

@@ -13,6 +13,7 @@ The distortion belongs to the rays and stays. ``r`` and ``p`` speak of rectified
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.arrays import FloatArray
+from ba_node.measurements import CameraRig
 from ba_node.messages.factory import ConversionError
 
 # What no camera has: of a matrix in other units, or of another thing.
@@ -65,6 +67,22 @@ def lens_of(info: Any) -> Lens:
     intrinsics[2:] -= begin
     intrinsics /= np.tile(binning, 2)
     return Lens(intrinsics, np.array(info.d, dtype=np.float64).reshape(-1), image_size // binning, note)
+
+
+def unplaced(frame_id: str, names: Sequence[str], models: Sequence[str], lenses: Sequence[Lens]) -> CameraRig:
+    """Return a rig with all its cameras at the origin of the body."""
+    n = len(names)
+    return CameraRig(
+        frame_id=frame_id,
+        names=tuple(names),
+        models=tuple(models),
+        intrinsics=np.array([lens.intrinsics for lens in lenses]).reshape(-1, 4),
+        distortion=tuple(lens.distortion for lens in lenses),
+        image_size=np.array([lens.image_size for lens in lenses], np.int64).reshape(-1, 2),
+        position=np.zeros((n, 3)),
+        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+        notes=tuple(f"camera {i} ({names[i]!r}): {lens.note}" for i, lens in enumerate(lenses) if lens.note),
+    )
 
 
 def _intrinsics(k: FloatArray) -> FloatArray:

@@ -10,6 +10,8 @@ holds on to the buffer of a message or of a file.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,14 +32,16 @@ from ba_node.measurements import (
     RelativePose,
     TrackMerge,
 )
-from ba_node.messages.camera_info import Lens, lens_of
+from ba_node.messages.camera_info import Lens, lens_of, unplaced
 from ba_node.messages.factory import (
     ConversionError,
     MessageFactory,
     float32,
     header_message,
+    numbers_message,
     pose_message,
     stamp_ns_from_message,
+    uncertain_pose_message,
 )
 from ba_node.messages.topics import INPUT_TYPES
 
@@ -59,145 +63,92 @@ def measurement_from_message(type_name: str, msg: Any) -> Measurement:
     raise ConversionError(f"type {type_name!r} is not an input: expected one of {', '.join(INPUT_TYPES.values())}")
 
 
-def _array(values: Any, dtype: Any) -> NDArray[Any]:
+def _array(values: Any, dtype: Any = np.float64) -> NDArray[Any]:
     return np.array(values, dtype=dtype).reshape(-1)
 
 
+def _integers(msg: Any, *names: str) -> dict[str, Any]:
+    return {name: int(getattr(msg, name)) for name in names}
+
+
+def _header(msg: Any) -> dict[str, Any]:
+    return {"stamp_ns": stamp_ns_from_message(msg.header.stamp), "frame_id": str(msg.header.frame_id)}
+
+
+def _pose(msg: Any) -> dict[str, Any]:
+    """Return what a ``geometry_msgs/PoseWithCovariance`` says."""
+    pose, covariance = msg.pose.pose, _array(getattr(msg.pose, "covariance", ()))
+    return {"position": _xyz(pose.position), "orientation": _xyzw(pose.orientation), "covariance": covariance}
+
+
+def _of_tracks(msg: Any, optional: tuple[str, ...] = (), **shapes: tuple[int, ...]) -> dict[str, Any]:
+    """Return session, track ids, and columns with a row of a shape for each of them.
+
+    Where one has another length all are empty, and ``malformed`` says so. Optional ones may be empty alone.
+    """
+    read = {name: _array(getattr(msg, name), np.uint64 if name in _IDS else np.float64) for name in shapes}
+    track_id, wrong = _array(msg.track_id, np.uint64), []
+    for name, values in read.items():
+        width = math.prod(shapes[name])
+        if len(values) != width * len(track_id) and (len(values) or name not in optional):
+            each = f": expected {width} for each track" if width > 1 else ""
+            wrong.append(f"{name} has {len(values)} entries, track_id {len(track_id)}{each}")
+    end = 0 if wrong else None
+    columns = {name: values[:end].reshape(-1, *shapes[name]) for name, values in read.items()}
+    return {"track_id": track_id[:end], **columns, "malformed": "; ".join(wrong)} | _integers(msg, "session_id")
+
+
 def _keyframe(msg: Any) -> Keyframe:
-    pose = msg.pose.pose
-    return Keyframe(
-        session_id=int(msg.session_id),
-        keyframe_id=int(msg.keyframe_id),
-        stamp_ns=stamp_ns_from_message(msg.header.stamp),
-        frame_id=str(msg.header.frame_id),
-        position=_xyz(pose.position),
-        orientation=_xyzw(pose.orientation),
-        covariance=_known(getattr(msg.pose, "covariance", ())),
-    )
-
-
-def _known(covariance: Any) -> FloatArray:
-    """Return a covariance, empty where all is zero, which stands for unknown."""
-    values = _array(covariance, np.float64)
-    return values if values.any() else np.empty(0)
+    pose = _pose(msg)
+    # All zeros stand for unknown.
+    pose["covariance"] = pose["covariance"] if pose["covariance"].any() else np.empty(0)
+    return Keyframe(**_integers(msg, "session_id", "keyframe_id"), **_header(msg), **pose)
 
 
 def _tracks(msg: Any) -> FeatureTracks:
-    track_id = _array(msg.track_id, np.uint64)
-    n = len(track_id)
-    columns = {name: _array(getattr(msg, name), np.float64) for name in ("u", "v", "sigma_px", "depth_m")}
-    wrong = [
-        f"{name} has {len(column)} entries, track_id {n}"
-        for name, column in columns.items()
-        if len(column) != n and not (name in ("sigma_px", "depth_m") and len(column) == 0)
-    ]
-    if wrong:
-        track_id = track_id[:0]
-        columns = {name: np.empty(0) for name in columns}
-    return FeatureTracks(
-        session_id=int(msg.session_id),
-        keyframe_id=int(msg.keyframe_id),
-        camera_index=int(msg.camera_index),
-        track_id=track_id,
-        uv=np.stack([columns["u"], columns["v"]], axis=1),
-        sigma_px=columns["sigma_px"],
-        depth_m=columns["depth_m"],
-        malformed="; ".join(wrong),
-    )
-
-
-def _guesses(msg: Any) -> LandmarkGuesses:
-    track_id = _array(msg.track_id, np.uint64)
-    position = _array(msg.position, np.float64)
-    malformed = ""
-    if len(position) != 3 * len(track_id):
-        malformed = (
-            f"position has {len(position)} entries, track_id {len(track_id)}: expected three coordinates for each track"
-        )
-        track_id, position = track_id[:0], position[:0]
-    return LandmarkGuesses(int(msg.session_id), track_id, position.reshape(-1, 3), malformed)
+    read = _of_tracks(msg, ("sigma_px", "depth_m"), u=(), v=(), sigma_px=(), depth_m=())
+    uv = np.stack([read.pop("u"), read.pop("v")], axis=1)
+    return FeatureTracks(**_integers(msg, "keyframe_id", "camera_index"), uv=uv, **read)
 
 
 def _relative(msg: Any) -> RelativePose:
-    pose = msg.pose.pose
-    return RelativePose(
-        int(msg.session_id),
-        int(msg.from_keyframe_id),
-        int(msg.to_keyframe_id),
-        int(msg.kind) == _LOOP,
-        _xyz(pose.position),
-        _xyzw(pose.orientation),
-        _array(msg.pose.covariance, np.float64),
-    )
+    ids = _integers(msg, "session_id", "from_keyframe_id", "to_keyframe_id")
+    return RelativePose(**ids, is_loop=int(msg.kind) == _LOOP, **_pose(msg))
 
 
 def _priors(msg: Any) -> LandmarkPriors:
-    track_id = _array(msg.track_id, np.uint64)
-    n, position, covariance = len(track_id), _array(msg.position, np.float64), _array(msg.covariance, np.float64)
-    malformed = ""
-    if len(position) != 3 * n or len(covariance) != 9 * n:
-        malformed = f"{n} tracks, {len(position)} coordinates and {len(covariance)} covariances: expected n, 3n, 9n"
-        track_id, position, covariance = track_id[:0], position[:0], covariance[:0]
-    rows = position.reshape(-1, 3), covariance.reshape(-1, 3, 3)
-    return LandmarkPriors(int(msg.session_id), str(msg.header.frame_id), track_id, *rows, malformed)
-
-
-def _merge(msg: Any) -> TrackMerge:
-    track_id, same_as = _array(msg.track_id, np.uint64), _array(msg.same_as, np.uint64)
-    malformed = ""
-    if len(track_id) != len(same_as):
-        malformed = f"track_id has {len(track_id)} entries, same_as {len(same_as)}: expected as many"
-        track_id, same_as = track_id[:0], same_as[:0]
-    return TrackMerge(int(msg.session_id), track_id, same_as, malformed)
+    return LandmarkPriors(frame_id=str(msg.header.frame_id), **_of_tracks(msg, position=(3,), covariance=(3, 3)))
 
 
 def _gravity(msg: Any) -> GravityDirection:
-    return GravityDirection(int(msg.session_id), int(msg.keyframe_id), _xyz(msg.down), float(msg.sigma_rad))
-
-
-def _pose_prior(msg: Any) -> PosePrior:
-    pose = msg.pose.pose
-    values = _xyz(pose.position), _xyzw(pose.orientation), _array(msg.pose.covariance, np.float64)
-    return PosePrior(stamp_ns_from_message(msg.header.stamp), str(msg.header.frame_id), *values)
+    ids = _integers(msg, "session_id", "keyframe_id")
+    return GravityDirection(**ids, down=_xyz(msg.down), sigma_rad=float(msg.sigma_rad))
 
 
 def _fix(msg: Any) -> GlobalFix:
+    geodetic = np.array([msg.latitude, msg.longitude, msg.altitude], dtype=np.float64)
     return GlobalFix(
-        stamp_ns_from_message(msg.header.stamp),
-        str(msg.header.frame_id),
-        np.array([msg.latitude, msg.longitude, msg.altitude], dtype=np.float64),
-        _array(msg.position_covariance, np.float64),
-        int(msg.status.status) >= 0,
+        **_header(msg),
+        geodetic=geodetic,
+        covariance=_array(msg.position_covariance),
+        is_fix=int(msg.status.status) >= 0,
     )
 
 
 def rig_from_parts(frame_id: str, cameras: Sequence[Any], poses: Sequence[Any] | None) -> CameraRig:
     """Return the rig; without poses the cameras sit at the origin of the body."""
-    n = len(cameras)
-    names = tuple(str(info.header.frame_id) for info in cameras)
-    read = [_lens(info) for info in cameras]
-    lenses, wrong = [lens for lens, _ in read], ""
-    if poses is not None and len(poses) != n:
-        wrong = f"cameras has {n} entries, body_from_camera {len(poses)}: expected one pose for each camera"
-    for i, (_, why) in enumerate(read):
-        if why:
-            wrong = wrong or f"camera {i} ({names[i]!r}): {why}"
-    position, orientation = np.zeros((n, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    if poses and not wrong:
-        position = np.array([_xyz(pose.position) for pose in poses])
-        orientation = np.array([_xyzw(pose.orientation) for pose in poses])
-    return CameraRig(
-        frame_id=frame_id,
-        names=names,
-        models=tuple(str(info.distortion_model) for info in cameras),
-        intrinsics=np.array([lens.intrinsics for lens in lenses]).reshape(-1, 4),
-        distortion=tuple(lens.distortion for lens in lenses),
-        image_size=np.array([lens.image_size for lens in lenses], dtype=np.int64).reshape(-1, 2),
-        position=position,
-        orientation=orientation,
-        malformed=wrong,
-        notes=tuple(f"camera {i} ({names[i]!r}): {lens.note}" for i, lens in enumerate(lenses) if lens.note),
-    )
+    names, read = [str(info.header.frame_id) for info in cameras], [_lens(info) for info in cameras]
+    wrong = [f"camera {i} ({names[i]!r}): {why}" for i, (_, why) in enumerate(read) if why]
+    if poses is not None and len(poses) != len(cameras):
+        counts = f"cameras has {len(cameras)} entries, body_from_camera {len(poses)}"
+        wrong.insert(0, f"{counts}: expected one pose for each camera")
+    rig = unplaced(frame_id, names, [str(info.distortion_model) for info in cameras], [lens for lens, _ in read])
+    if wrong:
+        return dataclasses.replace(rig, malformed=wrong[0])
+    if not poses:
+        return rig
+    position, orientation = zip(*((_xyz(pose.position), _xyzw(pose.orientation)) for pose in poses), strict=True)
+    return dataclasses.replace(rig, position=np.array(position), orientation=np.array(orientation))
 
 
 def _lens(info: Any) -> tuple[Lens, str]:
@@ -216,55 +167,55 @@ def _xyzw(quaternion: Any) -> FloatArray:
     return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
 
 
-def keyframe_message(factory: MessageFactory, keyframe: Keyframe) -> Any:
-    """Return a ``ba_msgs/Keyframe``."""
-    pose = factory.make(
-        "geometry_msgs/msg/PoseWithCovariance",
-        pose=pose_message(factory, keyframe.position, keyframe.orientation),
-        covariance=factory.fixed(keyframe.covariance if len(keyframe.covariance) else np.zeros(36)),
-    )
-    return factory.make(
-        INPUT_TYPES["keyframes"],
-        header=header_message(factory, keyframe.stamp_ns, keyframe.frame_id),
-        session_id=keyframe.session_id,
-        keyframe_id=keyframe.keyframe_id,
-        pose=pose,
-    )
+def input_message(
+    factory: MessageFactory, measurement: Measurement, stamp_ns: int = 0, frame_id: str = ""
+) -> tuple[str, Any]:
+    """Return the input and the message of a measurement.
+
+    ``stamp_ns`` and ``frame_id`` are for those that name none: tracks are in the optical frame of their camera, guesses
+    in the fixed frame.
+    """
+    name, fields = _WRITERS[type(measurement)]
+    stamp_ns, frame_id = getattr(measurement, "stamp_ns", stamp_ns), getattr(measurement, "frame_id", frame_id)
+    header = header_message(factory, stamp_ns, frame_id)
+    return name, factory.make(INPUT_TYPES[name], header=header, **fields(factory, measurement, stamp_ns))
 
 
-def tracks_message(factory: MessageFactory, tracks: FeatureTracks, stamp_ns: int, frame_id: str) -> Any:
-    """Return a ``ba_msgs/FeatureTracks``; ``frame_id`` is the optical frame of the camera."""
+def _plain(factory: MessageFactory, what: Any, *but: str) -> dict[str, Any]:
+    """Return the fields that a message has by the same name: integers, numbers, and flat arrays."""
+    values = {name: value for name, value in vars(what).items() if name not in (*_SAID_BY_HEADER, *but)}
+    return {name: factory.array(v.reshape(-1)) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+
+
+def _with_pose(factory: MessageFactory, what: Keyframe | RelativePose | PosePrior, *_: Any) -> dict[str, Any]:
+    covariance = what.covariance if len(what.covariance) else np.zeros(36)
+    pose = uncertain_pose_message(factory, what.position, what.orientation, covariance)
+    fields = _plain(factory, what, "position", "orientation", "covariance", "is_loop")
+    return fields | {"pose": pose} | ({"kind": int(what.is_loop)} if isinstance(what, RelativePose) else {})
+
+
+def _tracks_fields(factory: MessageFactory, tracks: FeatureTracks, *_: Any) -> dict[str, Any]:
     columns = {"u": tracks.uv[:, 0], "v": tracks.uv[:, 1], "sigma_px": tracks.sigma_px, "depth_m": tracks.depth_m}
-    return factory.make(
-        INPUT_TYPES["feature_tracks"],
-        header=header_message(factory, stamp_ns, frame_id),
-        session_id=tracks.session_id,
-        keyframe_id=tracks.keyframe_id,
-        camera_index=tracks.camera_index,
-        track_id=factory.array(tracks.track_id),
-        **{name: factory.array(float32(column)) for name, column in columns.items()},
-    )
+    return _plain(factory, tracks, "uv") | {name: factory.array(float32(column)) for name, column in columns.items()}
 
 
-def guesses_message(factory: MessageFactory, guesses: LandmarkGuesses, stamp_ns: int, frame_id: str) -> Any:
-    """Return a ``ba_msgs/LandmarkGuesses``; ``frame_id`` is the fixed frame."""
-    return factory.make(
-        INPUT_TYPES["landmark_guesses"],
-        header=header_message(factory, stamp_ns, frame_id),
-        session_id=guesses.session_id,
-        track_id=factory.array(guesses.track_id),
-        position=factory.array(guesses.position.reshape(-1)),
-    )
+def _gravity_fields(factory: MessageFactory, what: GravityDirection, *_: Any) -> dict[str, Any]:
+    return _plain(factory, what) | {"down": numbers_message(factory, "geometry_msgs/msg/Vector3", what.down)}
 
 
-def rig_message(factory: MessageFactory, rig: CameraRig, stamp_ns: int) -> Any:
-    """Return a ``ba_msgs/CameraRig``."""
-    return factory.make(
-        INPUT_TYPES["camera_rig"],
-        header=header_message(factory, stamp_ns, rig.frame_id),
-        cameras=[_camera_info(factory, rig, index, stamp_ns) for index in range(len(rig))],
-        body_from_camera=[pose_message(factory, p, q) for p, q in zip(rig.position, rig.orientation, strict=True)],
-    )
+def _fix_fields(factory: MessageFactory, fix: GlobalFix, *_: Any) -> dict[str, Any]:
+    return {
+        **dict(zip(("latitude", "longitude", "altitude"), fix.geodetic.tolist(), strict=True)),
+        "status": factory.make("sensor_msgs/msg/NavSatStatus", status=0 if fix.is_fix else -1, service=1),
+        "position_covariance": factory.fixed(fix.covariance),
+        "position_covariance_type": 3,
+    }
+
+
+def _rig_fields(factory: MessageFactory, rig: CameraRig, stamp_ns: int) -> dict[str, Any]:
+    poses = [pose_message(factory, p, q) for p, q in zip(rig.position, rig.orientation, strict=True)]
+    cameras = [_camera_info(factory, rig, index, stamp_ns) for index in range(len(rig))]
+    return {"cameras": cameras, "body_from_camera": poses}
 
 
 def _camera_info(factory: MessageFactory, rig: CameraRig, index: int, stamp_ns: int) -> Any:
@@ -287,44 +238,6 @@ def _camera_info(factory: MessageFactory, rig: CameraRig, index: int, stamp_ns: 
     )
 
 
-def side_message(factory: MessageFactory, what: Measurement, stamp_ns: int = 0, frame_id: str = "") -> tuple[str, Any]:
-    """Return the input and the message of what is known beside pixels; ``frame_id`` is that of the body.
-
-    Raises:
-        ConversionError: it is none of these.
-    """
-    if isinstance(what, PosePrior | GlobalFix):
-        stamp_ns, frame_id = what.stamp_ns, what.frame_id
-    elif isinstance(what, LandmarkPriors):
-        frame_id = what.frame_id
-    fields = {"header": header_message(factory, stamp_ns, frame_id)}
-    if isinstance(what, RelativePose | PosePrior):
-        fields["pose"] = factory.make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=pose_message(factory, what.position, what.orientation),
-            covariance=factory.fixed(what.covariance),
-        )
-    if isinstance(what, PosePrior):
-        return _made(factory, "pose_prior", fields)
-    if isinstance(what, GlobalFix):
-        status = factory.make("sensor_msgs/msg/NavSatStatus", status=0 if what.is_fix else -1, service=1)
-        names = dict(zip(("latitude", "longitude", "altitude"), what.geodetic.tolist(), strict=True))
-        known = {"position_covariance": factory.fixed(what.covariance), "position_covariance_type": 3}
-        return _made(factory, "gnss", fields | {"status": status} | names | known)
-    if isinstance(what, RelativePose):
-        ends = {"from_keyframe_id": what.from_keyframe_id, "to_keyframe_id": what.to_keyframe_id}
-        return _made(factory, "relative_poses", fields | ends | _session(what) | {"kind": int(what.is_loop)})
-    if isinstance(what, LandmarkPriors | TrackMerge):
-        named = {key: factory.array(v.reshape(-1)) for key, v in vars(what).items() if isinstance(v, np.ndarray)}
-        name = "track_merges" if isinstance(what, TrackMerge) else "landmark_priors"
-        return _made(factory, name, fields | _session(what) | named)
-    if isinstance(what, GravityDirection):
-        down = factory.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", what.down.tolist(), strict=True)))
-        rest = {"keyframe_id": what.keyframe_id, "down": down, "sigma_rad": what.sigma_rad}
-        return _made(factory, "gravity", fields | _session(what) | rest)
-    raise ConversionError(f"{type(what).__name__} is not known beside pixels")
-
-
 class InputMessages:
     """Makes the messages of a stream: tracks name the cameras of the rig before them, guesses the fixed frame."""
 
@@ -335,40 +248,46 @@ class InputMessages:
 
     def of(self, measurement: Measurement, stamp_ns: int) -> tuple[str, Any]:
         """Return the input and the message of a measurement."""
+        frame_id = ""
         if isinstance(measurement, CameraRig):
             self._names = measurement.names
-            return "camera_rig", rig_message(self._factory, measurement, stamp_ns)
-        if isinstance(measurement, Keyframe):
+        elif isinstance(measurement, Keyframe):
             self._fixed_frame = measurement.frame_id
-            return "keyframes", keyframe_message(self._factory, measurement)
-        if isinstance(measurement, LandmarkGuesses):
-            return "landmark_guesses", guesses_message(self._factory, measurement, stamp_ns, self._fixed_frame)
-        if isinstance(measurement, FeatureTracks):
-            name = self._names[measurement.camera_index]
-            return "feature_tracks", tracks_message(self._factory, measurement, stamp_ns, name)
-        return side_message(self._factory, measurement, stamp_ns)
-
-
-def _made(factory: MessageFactory, name: str, fields: dict[str, Any]) -> tuple[str, Any]:
-    return name, factory.make(INPUT_TYPES[name], **fields)
-
-
-def _session(what: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> dict[str, Any]:
-    return {"session_id": what.session_id}
+        elif isinstance(measurement, LandmarkGuesses):
+            frame_id = self._fixed_frame
+        elif isinstance(measurement, FeatureTracks):
+            frame_id = self._names[measurement.camera_index]
+        return input_message(self._factory, measurement, stamp_ns, frame_id)
 
 
 # ``ba_msgs/RelativePose.LOOP``.
 _LOOP = 1
+_IDS = ("same_as",)
+# What messages hold in their header, or not at all.
+_SAID_BY_HEADER = ("stamp_ns", "frame_id", "malformed")
 _READERS: dict[str, Callable[[Any], Measurement]] = {
     INPUT_TYPES["keyframes"]: _keyframe,
     INPUT_TYPES["feature_tracks"]: _tracks,
-    INPUT_TYPES["landmark_guesses"]: _guesses,
+    INPUT_TYPES["landmark_guesses"]: lambda msg: LandmarkGuesses(**_of_tracks(msg, position=(3,))),
     INPUT_TYPES["relative_poses"]: _relative,
     INPUT_TYPES["landmark_priors"]: _priors,
-    INPUT_TYPES["track_merges"]: _merge,
+    INPUT_TYPES["track_merges"]: lambda msg: TrackMerge(**_of_tracks(msg, same_as=())),
     INPUT_TYPES["gravity"]: _gravity,
-    INPUT_TYPES["pose_prior"]: _pose_prior,
+    INPUT_TYPES["pose_prior"]: lambda msg: PosePrior(**_header(msg), **_pose(msg)),
     INPUT_TYPES["gnss"]: _fix,
     INPUT_TYPES["camera_rig"]: lambda msg: rig_from_parts(str(msg.header.frame_id), msg.cameras, msg.body_from_camera),
     INPUT_TYPES["camera_info"]: lambda msg: rig_from_parts(str(msg.header.frame_id), [msg], None),
+}
+# Input of each kind of measurement, and the fields of its message but for the header.
+_WRITERS: dict[type, tuple[str, Callable[[MessageFactory, Any, int], dict[str, Any]]]] = {
+    Keyframe: ("keyframes", _with_pose),
+    FeatureTracks: ("feature_tracks", _tracks_fields),
+    LandmarkGuesses: ("landmark_guesses", lambda factory, what, _: _plain(factory, what)),
+    RelativePose: ("relative_poses", _with_pose),
+    LandmarkPriors: ("landmark_priors", lambda factory, what, _: _plain(factory, what)),
+    TrackMerge: ("track_merges", lambda factory, what, _: _plain(factory, what)),
+    GravityDirection: ("gravity", _gravity_fields),
+    PosePrior: ("pose_prior", _with_pose),
+    GlobalFix: ("gnss", _fix_fields),
+    CameraRig: ("camera_rig", _rig_fields),
 }

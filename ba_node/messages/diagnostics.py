@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge how the node fares, and say so in a ``diagnostic_msgs/DiagnosticArray``.
+"""Find out how the node is doing, and say so in a ``diagnostic_msgs/DiagnosticArray``.
 
 There is one status for each subject: inputs, queue, solver, latency, map, memory. Its level is that of the worst
 finding, its message names all of them. docs/diagnostics.md lists keys and thresholds.

@@ -57,13 +57,22 @@ def header_message(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any
 
 def pose_message(factory: MessageFactory, position: FloatArray, orientation: FloatArray) -> Any:
     """Return a ``geometry_msgs/Pose`` of (3,) m and (4,) x y z w."""
-    x, y, z = position.tolist()
-    qx, qy, qz, qw = orientation.tolist()
-    return factory.make(
-        "geometry_msgs/msg/Pose",
-        position=factory.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-        orientation=factory.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    )
+    at = numbers_message(factory, "geometry_msgs/msg/Point", position)
+    turn = numbers_message(factory, "geometry_msgs/msg/Quaternion", orientation)
+    return factory.make("geometry_msgs/msg/Pose", position=at, orientation=turn)
+
+
+def uncertain_pose_message(
+    factory: MessageFactory, position: FloatArray, orientation: FloatArray, covariance: FloatArray
+) -> Any:
+    """Return a ``geometry_msgs/PoseWithCovariance``, of a covariance of 36 numbers."""
+    pose, known = pose_message(factory, position, orientation), factory.fixed(covariance.ravel())
+    return factory.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=known)
+
+
+def numbers_message(factory: MessageFactory, type_name: str, values: FloatArray) -> Any:
+    """Return a message of the fields x, y, z and, of four numbers, w."""
+    return factory.make(type_name, **dict(zip("xyzw", values.tolist(), strict=False)))
 
 
 def float32(values: FloatArray) -> NDArray[np.float32]:

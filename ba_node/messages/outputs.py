@@ -15,7 +15,7 @@ from ba_node.config import OutputConfig
 from ba_node.estimate import Cloud, Estimate, World
 from ba_node.measurements import GlobalFix
 from ba_node.messages.cdr import cloud_message, path_message, pose_messages
-from ba_node.messages.conversion import side_message
+from ba_node.messages.conversion import input_message
 from ba_node.messages.factory import MessageFactory, float32, header_message, pose_message
 from ba_node.messages.report import Report, report_message
 from ba_node.messages.topics import OUTPUT_TYPES
@@ -88,7 +88,7 @@ def _world(factory: MessageFactory, estimate: Estimate, world: World) -> Iterato
     yield "map_in_world", factory.make(OUTPUT_TYPES["map_in_world"], header=header, pose=pose)
     if world.geodetic is not None:
         fix = GlobalFix(estimate.stamp_ns, world.frame_id, world.geodetic, np.zeros(9), is_fix=True)
-        yield "world_origin", side_message(factory, fix)[1]
+        yield "world_origin", input_message(factory, fix)[1]
 
 
 def _points(estimate: Estimate, limit: int) -> bytes:

@@ -21,7 +21,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.measurements import CameraRig
-from ba_node.messages.camera_info import lens_of
+from ba_node.messages.camera_info import lens_of, unplaced
 from ba_node.messages.factory import ConversionError
 from ba_node.messages.transforms import StaticTree
 
@@ -54,17 +54,8 @@ def rig_from_infos(
             f"p of {names[0]!r}, the first camera, has the baseline {-shifts[0]:g} m, which is that of the right one:"
             " left and right are swapped"
         )
-    rig = CameraRig(
-        frame_id=names[0],
-        names=names,
-        models=tuple("plumb_bob" if rectified else str(info.distortion_model) for info in infos),
-        intrinsics=np.array([lens.intrinsics for lens in lenses]).reshape(-1, 4),
-        distortion=tuple(lens.distortion for lens in lenses),
-        image_size=np.array([lens.image_size for lens in lenses], np.int64).reshape(-1, 2),
-        position=np.zeros((len(infos), 3)),
-        orientation=np.tile([0.0, 0.0, 0.0, 1.0], (len(infos), 1)),
-        notes=tuple(f"camera {name!r}: {lens.note}" for name, lens in zip(names, lenses, strict=True) if lens.note),
-    )
+    models = ["plumb_bob" if rectified else str(info.distortion_model) for info in infos]
+    rig = unplaced(names[0], names, models, lenses)
     if all(shift != 0.0 for shift in shifts[1:]):
         return _placed(_spread(rig, infos, shifts, rectified), tree, base)
     placed, missing = tree.place(rig, base or names[0]) if tree is not None else (rig, names[1:])

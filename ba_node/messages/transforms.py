@@ -13,26 +13,23 @@ from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Estimate, Transform
 from ba_node.measurements import CameraRig
-from ba_node.messages.factory import MessageFactory, header_message, pose_message
+from ba_node.messages.factory import MessageFactory, header_message, numbers_message, uncertain_pose_message
 from ba_node.messages.topics import TF, TOPICS
 
 # Variance of what is not known, m^2 and rad^2.
 _UNKNOWN = 1e6
+_VECTOR = "geometry_msgs/msg/Vector3"
 
 
 def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:
     """Return a ``tf2_msgs/TFMessage`` with map -> odom."""
-    (x, y, z), (qx, qy, qz, qw) = correction.position.tolist(), correction.orientation.tolist()
-    transform = factory.make(
-        "geometry_msgs/msg/Transform",
-        translation=factory.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=factory.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    )
+    translation = numbers_message(factory, _VECTOR, correction.position)
+    rotation = numbers_message(factory, "geometry_msgs/msg/Quaternion", correction.orientation)
     stamped = factory.make(
         "geometry_msgs/msg/TransformStamped",
         header=header_message(factory, stamp_ns, map_frame),
         child_frame_id=correction.odom_frame,
-        transform=transform,
+        transform=factory.make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation),
     )
     return factory.make(TOPICS[TF].type_name, transforms=[stamped])
 
@@ -45,11 +42,7 @@ def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any
         factory.make(
             TOPICS["pose_with_covariance"].type_name,
             header=header_message(factory, int(poses.stamp_ns[k]), estimate.frame_id),
-            pose=factory.make(
-                "geometry_msgs/msg/PoseWithCovariance",
-                pose=pose_message(factory, poses.position[k], poses.orientation[k]),
-                covariance=factory.fixed(covariance[k].ravel()),
-            ),
+            pose=uncertain_pose_message(factory, poses.position[k], poses.orientation[k], covariance[k]),
         )
         for k in range(len(poses))
     ]
@@ -71,23 +64,15 @@ def odometry_message(factory: MessageFactory, estimate: Estimate, base_frame: st
         twist = np.concatenate([step, geometry.so3_log(rotation[0].T @ rotation[1])]) / lapse_s
         seen = np.kron(np.eye(2), rotation[1].T)
         sigma = seen @ known.sum(axis=0) @ seen.T / lapse_s**2
-    x, y, z, turn_x, turn_y, turn_z = twist.tolist()
+    linear, angular = (numbers_message(factory, _VECTOR, part) for part in (twist[:3], twist[3:]))
     return factory.make(
         TOPICS["odometry"].type_name,
         header=header_message(factory, int(poses.stamp_ns[-1]), estimate.frame_id),
         child_frame_id=base_frame,
-        pose=factory.make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=pose_message(factory, position[-1], poses.orientation[-1]),
-            covariance=factory.fixed(_or_unknown(known[-1])),
-        ),
+        pose=uncertain_pose_message(factory, position[-1], poses.orientation[-1], _or_unknown(known[-1])),
         twist=factory.make(
             "geometry_msgs/msg/TwistWithCovariance",
-            twist=factory.make(
-                "geometry_msgs/msg/Twist",
-                linear=factory.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                angular=factory.make("geometry_msgs/msg/Vector3", x=turn_x, y=turn_y, z=turn_z),
-            ),
+            twist=factory.make("geometry_msgs/msg/Twist", linear=linear, angular=angular),
             covariance=factory.fixed(_or_unknown(sigma)),
         ),
     )

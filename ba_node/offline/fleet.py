@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Do the same for many recordings: one after the other, in processes of this machine, or on a cluster of Dask.
+"""Run the same work on many recordings: one after the other, in processes of this machine, or on a cluster of Dask.
 
 What is done is a function of a module, and what it is given and returns are plain values: workers import it by name. A
 worker that dies costs the time of what it was doing, which another one begins again.

@@ -152,20 +152,20 @@ def _held_out_error(
 def _residuals(session: SessionRecord, held_out: list[Measurement], frames: FramesConfig) -> FloatArray:
     """Return bounded residuals (n,) of held-out tracks, sigmas, points triangulated from the poses of a session."""
     # A back-end that never solves: the refined poses are its input, and everything else has its default.
-    judge = Backend(dataclasses.replace(Config(), frames=frames))
+    without_solves = Backend(dataclasses.replace(Config(), frames=frames))
     poses = session.trajectory
     known = {key: row for row, key in enumerate(poses.keyframe_id.tolist())}
     for one in held_out:
         if isinstance(one, CameraRig):
-            judge.add(one)
+            without_solves.add(one)
     for key, row in known.items():
         stamp, frame = int(poses.stamp_ns[row]), session.last.frame_id
-        judge.add(Keyframe(session.session_id, key, stamp, frame, poses.position[row], poses.orientation[row]))
+        without_solves.add(Keyframe(session.session_id, key, stamp, frame, poses.position[row], poses.orientation[row]))
     for one in held_out:
         if isinstance(one, FeatureTracks) and one.session_id == session.session_id and one.keyframe_id in known:
-            judge.add(one)
-    judge.flush(final=True)
-    seen = judge.map.summary().observed
+            without_solves.add(one)
+    without_solves.flush(final=True)
+    seen = without_solves.map.summary().observed
     norms = np.linalg.norm(seen.error, axis=1) / seen.sigma_px
     return np.asarray(np.minimum(np.nan_to_num(norms, nan=_BOUND), _BOUND))
 

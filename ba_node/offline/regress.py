@@ -27,7 +27,7 @@ import yaml
 
 from ba_node.config import Config
 from ba_node.io.files import whole_file
-from ba_node.io.yaml_file import YamlError, read_yaml
+from ba_node.io.yaml_file import read_yaml
 from ba_node.offline.replay import Watch
 from ba_node.offline.replay import replay as run_replay
 
@@ -58,7 +58,7 @@ class Figure:
     direction: str = LOWER
     tolerance: float = 0.0
 
-    def judge(self, now: float | None) -> str:
+    def compare(self, now: float | None) -> str:
         """Return how a figure of now compares."""
         if now is None or not math.isfinite(now):
             return MISSING
@@ -94,10 +94,7 @@ def read_baseline(path: Path) -> list[Case]:
     Raises:
         RegressError: it is no baseline, or a figure of it is not one.
     """
-    try:
-        content = read_yaml(path)
-    except YamlError as error:
-        raise RegressError(f"{path}: {error}") from None
+    content = read_yaml(path, RegressError)
     if not isinstance(content, dict) or not isinstance(content.get("recordings"), list) or not content["recordings"]:
         raise RegressError(f"{path}: expected a list of recordings, as `ba regress FILE --new RECORDING...` writes")
     return [_case(path, entry) for entry in content["recordings"]]
@@ -130,7 +127,7 @@ def run(
         report = _report(path, case, clock)
         for figure in case.figures:
             now = value_of(report, figure.key)
-            rows.append(Row(case.recording, figure, now, figure.judge(now)))
+            rows.append(Row(case.recording, figure, now, figure.compare(now)))
     return rows
 
 

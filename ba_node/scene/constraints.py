@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hold what is known beside pixels in one session: relative poses, priors of poses and points, gravity.
 
-Each is judged by itself as it comes; what it names (keyframes, tracks) may come later. Covariances are kept by the
+Each is checked by itself as it comes; what it names (keyframes, tracks) may come later. Covariances are kept by the
 order of the tangent, rotation (rad) before translation (m), see ``core/geometry.py``. All that is absolute, poses and
 positions by stamp and landmark priors, is in one frame fixed to the world, the first that is named; fixes of a
 receiver are in east, north, up about the first of them (or ``priors.origin_*``).
@@ -234,7 +234,7 @@ class Constraints:
         self._insert(Absolute(fix.stamp_ns, position, None, covariance, of_antenna=True))
 
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
-        """Drop what hangs on keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
+        """Drop what belongs to keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
         gone = set(keyframes.tolist())
         self._drop([key for key in self.relative if not gone.isdisjoint(key)])
         self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge measurements by themselves, before anything that is known: shapes, numbers, ranges.
+"""Check measurements by themselves, before anything that is known: shapes, numbers, ranges.
 
 Bad rows are dropped one by one, good rows stay. Everything that is dropped is counted in a RejectionLog.
 """

@@ -9,6 +9,8 @@ What contradicts or cannot be used is counted in ``log`` and leaves the scene as
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +37,16 @@ from ba_node.scene.constraints import Constraints
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
+
+# What takes in each kind of what is known beside pixels.
+_CONSTRAINTS: dict[type, Callable[[Constraints, Any, RejectionLog], None]] = {
+    RelativePose: Constraints.add_relative,
+    GravityDirection: Constraints.add_gravity,
+    LandmarkPriors: Constraints.add_landmarks,
+    TrackMerge: Constraints.add_merge,
+    PosePrior: Constraints.add_pose,
+    GlobalFix: Constraints.add_fix,
+}
 
 
 class Scene(MapTables):
@@ -74,7 +86,7 @@ class Scene(MapTables):
             self._set_rig(measurement)
             return
         if isinstance(measurement, OfTime):
-            self._add_absolute(measurement)
+            _CONSTRAINTS[type(measurement)](self.constraints, measurement, self.log)
             return
         if self.session_id is not None and measurement.session_id != self.session_id:
             if isinstance(measurement, Keyframe) and ingest.keyframe_pose(measurement, self.log) is None:
@@ -94,23 +106,7 @@ class Scene(MapTables):
         elif isinstance(measurement, LandmarkGuesses):
             self._add_guesses(measurement)
         else:
-            self._add_constraint(measurement)
-
-    def _add_absolute(self, measured: PosePrior | GlobalFix) -> None:
-        if isinstance(measured, PosePrior):
-            self.constraints.add_pose(measured, self.log)
-        else:
-            self.constraints.add_fix(measured, self.log)
-
-    def _add_constraint(self, measured: RelativePose | LandmarkPriors | TrackMerge | GravityDirection) -> None:
-        if isinstance(measured, RelativePose):
-            self.constraints.add_relative(measured, self.log)
-        elif isinstance(measured, GravityDirection):
-            self.constraints.add_gravity(measured, self.log)
-        elif isinstance(measured, LandmarkPriors):
-            self.constraints.add_landmarks(measured, self.log)
-        else:
-            self.constraints.add_merge(measured, self.log)
+            _CONSTRAINTS[type(measurement)](self.constraints, measurement, self.log)
 
     def usable(self, measurement: Keyframe | OfSession) -> bool:
         """Return True if anything of a measurement passes the checks it can be given by itself; count nothing."""
@@ -137,9 +133,8 @@ class Scene(MapTables):
 
     def take_waiting(self, other: Scene) -> None:
         """Take over the tracks that wait in another scene of this session for keyframes that it does not know."""
-        mine = [tracks for tracks in other.pending if other.find_keyframe(tracks.keyframe_id) is None]
-        other.pending = [tracks for tracks in other.pending if other.find_keyframe(tracks.keyframe_id) is not None]
-        self.pending += mine
+        self.pending += [tracks for tracks in other.pending if tracks.keyframe_id not in other._keyframe_rows]
+        other.pending = [tracks for tracks in other.pending if tracks.keyframe_id in other._keyframe_rows]
 
     def end_pending(self) -> None:
         """Give up on everything that still waits."""
@@ -322,9 +317,4 @@ class Scene(MapTables):
 
 
 def _same(a: Cameras, b: Cameras) -> bool:
-    return (
-        np.array_equal(a.model, b.model)
-        and np.array_equal(a.params, b.params)
-        and np.array_equal(a.rotation, b.rotation)
-        and np.array_equal(a.translation, b.translation)
-    )
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in vars(a))

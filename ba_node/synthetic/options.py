@@ -24,28 +24,22 @@ class SyntheticOptions(Checked):
         "loop: a figure of eight around two blocks, through the passage between them; line: down a street.",
         choices=("loop", "line"),
     )
-    length_m: float = option(
-        52.0, "Length of the path; the site of a loop scales with it.", unit="m", within=(10.0, 10_000.0)
-    )
-    keyframe_rate_hz: float = option(4.0, "Keyframes a second.", unit="Hz", within=(0.01, 1000.0))
+    length_m: float = option(52.0, "Length of the path; the site of a loop scales with it.", within=(10.0, 10_000.0))
+    keyframe_rate_hz: float = option(4.0, "Keyframes a second.", within=(0.01, 1000.0))
 
-    baseline_m: float = option(0.12, "Distance of the stereo cameras; 0 for one camera.", unit="m", within=(0.0, 10.0))
-    look_deg: float = option(
-        0.0, "Where the cameras look from ahead, positive to the left.", unit="deg", within=(-180.0, 180.0)
-    )
-    width_px: int = option(640, "Width of an image.", unit="px", within=(16, 16_384))
-    height_px: int = option(480, "Height of an image.", unit="px", within=(16, 16_384))
-    fov_deg: float = option(85.0, "Horizontal field of view before k1, k2, ... act.", unit="deg", within=(10.0, 150.0))
+    baseline_m: float = option(0.12, "Distance of the stereo cameras; 0 for one camera.", within=(0.0, 10.0))
+    look_deg: float = option(0.0, "Where the cameras look from ahead, positive to the left.", within=(-180.0, 180.0))
+    width_px: int = option(640, "Width of an image.", within=(16, 16_384))
+    height_px: int = option(480, "Height of an image.", within=(16, 16_384))
+    fov_deg: float = option(85.0, "Horizontal field of view before k1, k2, ... act.", within=(10.0, 150.0))
     distortion: str = option(
         "none",
         "Lens: none (plumb_bob with zeros), plumb_bob or equidistant, with coefficients as of real lenses.",
         choices=("none", "plumb_bob", "equidistant"),
     )
 
-    max_range_m: float = option(20.0, "Points farther away are not tracked.", unit="m", within=(1.0, 10_000.0))
-    noise_px: float = option(
-        0.5, "Standard deviation of the Gaussian noise on u and v.", unit="px", within=(0.0, 100.0)
-    )
+    max_range_m: float = option(20.0, "Points farther away are not tracked.", within=(1.0, 10_000.0))
+    noise_px: float = option(0.5, "Standard deviation of the Gaussian noise on u and v.", within=(0.0, 100.0))
     outlier_share: float = option(0.03, "Share of observations displaced by 10 to 60 px.", within=(0.0, 0.9))
     send_sigma: bool = option(True, "Publish noise_px as sigma_px; without it the receiver assumes 1 px.")
     depth_share: float = option(

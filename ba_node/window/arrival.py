@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where does a new keyframe begin whose front-end's pose its tracks contradict?
+"""Relocalise a new keyframe whose pose by the front-end contradicts its tracks.
 
 A keyframe that was not refined yet stands where the front-end's step from the one before puts it. If the points that
 are known already lie nowhere near where it sees them, the front-end has jumped or the tracks are wrong. Then its pose

@@ -36,8 +36,8 @@ _LEVEL_RAD = 0.05
 _UNKNOWN = 1e6
 # Pairs that map and world are aligned by, spread over all.
 _ALIGNED = 2000
-# Minimal sets that are tried, pairs in each, pairs that judge them, rounds of weighting.
-_SETS, _IN_SET, _JUDGES, _ROUNDS = 60, 5, 300, 10
+# Minimal sets that are tried, pairs in each, pairs that score them, rounds of weighting.
+_SETS, _IN_SET, _SCORED, _ROUNDS = 60, 5, 300, 10
 # The path has to spread so many times the noise of positions, and the heading to be known to so much (rad).
 _SPREAD, _HEADING_RAD = 5.0, 0.03
 
@@ -166,13 +166,13 @@ def _aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatAr
     turned = scene.keyframes.rotation[pairs.row] @ np.swapaxes(pairs.rotation, 1, 2)
     best, lowest = None, np.inf
     rng = np.random.default_rng(0)
-    judges = np.unique(np.linspace(0, len(pairs) - 1, _JUDGES).astype(int))
+    scored = np.unique(np.linspace(0, len(pairs) - 1, _SCORED).astype(int))
     for _ in range(_SETS):
         few = rng.choice(len(pairs), min(_IN_SET, len(pairs)), replace=False)
         weight = np.zeros(len(pairs))
         weight[few] = 1.0 / sigma[few] ** 2
         found = _kabsch(there, pairs.position, weight, turned, turn_rad)
-        cost = float(np.sum(np.log1p(_off(found, there[judges], pairs.position[judges], sigma[judges]) ** 2)))
+        cost = float(np.sum(np.log1p(_off(found, there[scored], pairs.position[scored], sigma[scored]) ** 2)))
         if cost < lowest:
             best, lowest = found, cost
     assert best is not None

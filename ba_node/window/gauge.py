@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Hold the freedom of a problem: place, heading, and scale where it cannot be seen.
+"""Fix the gauge of a problem: place, heading, and scale where it cannot be seen.
 
 Scale can be seen where two cameras of one keyframe, apart from each other, see the same point, or where depth is
 measured. The front-end's steps (odometry.py) tie consecutive keyframes to each other, and have a scale. For each part
@@ -33,7 +33,7 @@ _MIN_BASELINE_M = 1e-6
 
 @dataclass(frozen=True)
 class Gauge:
-    """What holds a problem."""
+    """What fixes the gauge of a problem."""
 
     fixed: BoolArray  # (n_kf,) keyframes whose pose is held
     unscaled: IntArray  # (n_kf,) for a keyframe of a part whose scale floats the number of its fixed keyframe, else -1

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""May a solution be taken? It must be determined, plausible, and better than what came in.
+"""Decide whether a solution is taken: it must be determined, plausible, and better than what came in.
 
 - **Determined**: most observations agree with it within the nominal gate. Keyframes that see too few points were left
   out of the solve by the selection.

@@ -52,7 +52,7 @@ class Agreed:
     """What the views of points agree on."""
 
     points: FloatArray  # (n_pt, 3), m
-    good: BoolArray  # (n_pt,) True where that is a place to believe in
+    good: BoolArray  # (n_pt,) True where that is a place to go by
     measured: BoolArray  # (n_pt,) True where a distance was measured by one that agrees
 
 

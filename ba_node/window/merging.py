@@ -187,7 +187,7 @@ def classify(
     """Mark the observations to leave out next time, and note the error of each point.
 
     The gate widens with the bulk of the residuals, so that an early, bad window does not lose its points. A point that
-    less than half of its views believe in is placed anew where more of them agree. One with fewer than two good views
+    fewer than half of its views agree with is placed anew where more of them do. One with fewer than two good views
     (or one with a measured depth) is in the wrong place, or its track is: it loses its position, and all its views are
     heard again when it is next placed. ``norm`` are the sizes of the residuals; those of what is placed anew are
     written over.

@@ -5,8 +5,8 @@
 Tracks on an object agree with each other as those of the scene do, only on another motion of the camera. Each few of
 their views nearly fit a point, so view by view most pass the gate of outliers, and together they pull the solution. The
 motion that counts is the one that the keyframes begin with: refined before, or as the front-end's step has it. A point
-that stands, seen by it, leaves noise alone; one that moves leaves more in most of its views. So tracks are judged as a
-whole, by the mean of their squared residuals ``r`` in sigmas, none of which counts for more than the gate::
+that stands, seen by it, leaves noise alone; one that moves leaves more in most of its views. So tracks are classified
+as a whole, by the mean of their squared residuals ``r`` in sigmas, none of which counts for more than the gate::
 
     mean of min(r, 6)^2 > 9,    r > 3 in two views in five, and in two at least
 
@@ -14,7 +14,7 @@ Noise alone gives a mean of 2. A view that is far off in the image, as a mismatc
 somewhat off too, most of all those that were not refined yet: where the best third of the residuals exceed noise, of
 the window or of such a keyframe, its residuals are divided by how many times they do.
 
-What moves sits out the solve that it is found in, and is no point of the map. It is judged anew before each.
+What moves sits out the solve that it is found in, and is no point of the map. It is looked for anew before each.
 
 Where much is found to move more does that is not found, as what moves slowly or was placed by few views. Then solutions
 follow it, and explain it well. Or nothing moves, and the calibration is wrong: what contradicts it is taken for moving.
@@ -55,7 +55,7 @@ _MUCH = 0.1
 def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: str = "auto") -> BoolArray:
     """Return which points move, (n_pt,).
 
-    A point that seems to may only be in the wrong place. So it is judged again where most of its views agree.
+    A point that seems to may only be in the wrong place. So it is classified again where most of its views agree.
 
     The problem has all observations, flagged ones too; points without a place are NaN. ``norms`` (n_obs,) are the
     residuals at the start, sigmas; no solve has refined the poses of ``unrefined`` (n_kf,) yet.

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of keyframes that leave the window (``window.old_keyframes``).
+"""Fix, marginalise or drop keyframes that leave the window (``window.old_keyframes``).
 
 - fix: those that see the window's points take part with fixed poses, as if they were exact.
 - drop: they take no part. What they told is forgotten, and the oldest keyframe of the window is held.

@@ -309,8 +309,8 @@ def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Par
 def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     """Return the guesses of landmarks moved from the front-end's frame to the refined map, NaN where there is none.
 
-    Each is moved by the correction of the earliest keyframe that sees it: a front-end's point hangs on the view that
-    it was first seen in, and this choice does not depend on when the message came.
+    Each is moved by the correction of the earliest keyframe that sees it: a front-end's point is anchored to the
+    view that it was first seen in, and this choice does not depend on when the message came.
     """
     has_guess = scene.landmarks.has_guess[landmarks, None]
     guess = np.where(has_guess, scene.landmarks.guess[landmarks], np.nan)
@@ -336,14 +336,14 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
     if not far.any():
         return usable
     # By keyframe: where most residuals of a keyframe are large, its pose is wrong, and the solve is to mend that.
-    judged = usable & placed.take(obs.point)
+    classified = usable & placed.take(obs.point)
     n_kf = len(part.keyframes)
-    large = np.bincount(obs.keyframe[judged & (SPREAD * norms > gate)], minlength=n_kf)
+    large = np.bincount(obs.keyframe[classified & (SPREAD * norms > gate)], minlength=n_kf)
     has_far = np.bincount(obs.keyframe[far], minlength=n_kf) > 0
-    suspect = (2 * large >= np.bincount(obs.keyframe, judged, n_kf)) & has_far
+    suspect = (2 * large >= np.bincount(obs.keyframe, classified, n_kf)) & has_far
     for k in np.flatnonzero(suspect):
         own = np.flatnonzero(obs.keyframe == k)
-        far[own] = norms[own] > widened(gate, norms[own[judged[own]]], 1)
+        far[own] = norms[own] > widened(gate, norms[own[classified[own]]], 1)
     return usable & ~far
 
 

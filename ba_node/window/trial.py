@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Try poses on some tracks: how well do they explain them, wherever the points lie?
+"""Compare how well two sets of poses explain some tracks, wherever the points lie.
 
 The points are triangulated anew, robustly, under each set of poses, so the frame and (for one camera) the scale of the
 poses do not matter, nor what a solve made of the points. Which tracks are tried is a fixed choice by their ids; most of

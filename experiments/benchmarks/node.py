@@ -116,12 +116,12 @@ def recording(args: argparse.Namespace, case: Case) -> list[list[tuple[str, Any]
     )
     data = generate(options)
     begin_ns = time.time_ns() + 10**9
-    frames: list[list[tuple[str, Any]]] = [[("camera_rig", conversion.rig_message(_FACTORY, data.rig, 0))]]
+    frames: list[list[tuple[str, Any]]] = [[("camera_rig", conversion.input_message(_FACTORY, data.rig, 0)[1])]]
     for k, (keyframe, tracks) in enumerate(zip(data.keyframes, data.tracks, strict=True)):
         stamp_ns = begin_ns + round(k * 1e9 / args.rate)
         frame = dataclasses.replace(keyframe, stamp_ns=stamp_ns)
-        messages = [("keyframes", conversion.keyframe_message(_FACTORY, frame))]
-        messages += [("feature_tracks", conversion.tracks_message(_FACTORY, t, stamp_ns, "camera")) for t in tracks]
+        messages = [("keyframes", conversion.input_message(_FACTORY, frame)[1])]
+        messages += [("feature_tracks", conversion.input_message(_FACTORY, t, stamp_ns, "camera")[1]) for t in tracks]
         frames.append(messages)
     return [[(topic, serialize_message(message)) for topic, message in frame] for frame in frames]
 
@@ -178,7 +178,7 @@ def conversion_times() -> list[str]:
 
         lines.append(row(f"build and publish {topic}", times_ms(build_and_publish)))
     tracks = FeatureTracks(0, 0, 0, np.arange(1000, dtype=np.uint64), rng.normal(size=(1000, 2)), np.ones(1000))
-    message = conversion.tracks_message(_FACTORY, tracks, 0, "camera")
+    message = conversion.input_message(_FACTORY, tracks, 0, "camera")[1]
     kind = INPUT_TYPES["feature_tracks"]
     lines.append(row("take 1000 tracks", times_ms(lambda: conversion.measurement_from_message(kind, message))))
     node.destroy_node()

@@ -23,9 +23,7 @@ class SphereOptions(Checked):
         within=(0, 100_000_000),
     )
     radius: float = option(500.0, "Radius of the sphere, in units of length.", within=(1e-3, 1e6))
-    focal_px: float = option(
-        350.0, "Mean focal length; as a number it is best below the radius.", unit="px", within=(10.0, 1e5)
-    )
+    focal_px: float = option(350.0, "Mean focal length; as a number it is best below the radius.", within=(10.0, 1e5))
     camera_spread: float = option(
         1.0, "How much f, k1 and k2 differ between images; 0: one camera took all.", within=(0.0, 10.0)
     )
@@ -34,25 +32,18 @@ class SphereOptions(Checked):
     cone_deg: float = option(
         15.0,
         "Cameras lie within this angle of one axis: the larger, the fewer images see a point; 180 for all round.",
-        unit="deg",
         within=(1.0, 180.0),
     )
-    tilt_deg: float = option(
-        15.0, "Largest angle between optical axis and ray to the centre.", unit="deg", within=(0.0, 30.0)
-    )
+    tilt_deg: float = option(15.0, "Largest angle between optical axis and ray to the centre.", within=(0.0, 30.0))
     min_image_points: int = option(
         20, "An image with fewer observations is dropped, and another one taken.", within=(6, 1_000_000)
     )
     min_image_area: float = option(
         0.25, "So is one whose observations span a smaller share of 800 x 600 px.", within=(0.0, 0.95)
     )
-    noise_px: float = option(
-        0.17, "Standard deviation of the Gaussian noise on u and v.", unit="px", within=(0.0, 100.0)
-    )
+    noise_px: float = option(0.17, "Standard deviation of the Gaussian noise on u and v.", within=(0.0, 100.0))
     outlier_share: float = option(0.0, "Share of observations displaced by 10 to 60 px.", within=(0.0, 0.9))
-    start_rotation_deg: float = option(
-        1.0, "Error of a rotation at the start, about each axis.", unit="deg", within=(0.0, 90.0)
-    )
+    start_rotation_deg: float = option(1.0, "Error of a rotation at the start, about each axis.", within=(0.0, 90.0))
     start_translation: float = option(
         0.01, "Error of a translation at the start, along each axis, in radii.", within=(0.0, 10.0)
     )

@@ -67,7 +67,7 @@ def test_two_replays_into_one_folder_are_refused(bag: Path, tmp_path: Path, caps
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["info", "none.npz"], "ba: error: none.npz: cannot be read: No such file or directory"),
+        (["info", "none.npz"], "ba: error: none.npz: cannot be opened: No such file or directory"),
         (["info", "{saved}", "--tum", "a"], "info writes nothing"),
         (["export", "{saved}"], "export writes what --tum and --ply name"),
         (["export", "{saved}", "--tum", "none/a.tum"], "there is no folder none"),
@@ -133,7 +133,7 @@ def test_a_map_that_cannot_be_loaded_ends_the_replay(
     bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert replay(bag, tmp_path / "out", "--load-map", str(tmp_path / "none.npz")) == 2
-    assert "none.npz: cannot be read" in capsys.readouterr().err
+    assert "none.npz: cannot be opened" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert replay(bag, tmp_path / "out", "--save-map", str(tmp_path / "none" / "a.npz")) == 2
     assert "there is no folder" in capsys.readouterr().err

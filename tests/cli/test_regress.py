@@ -32,7 +32,7 @@ SHIPPED = Path(__file__).resolve().parents[2] / "bags" / "regress.yaml"
     ],
 )
 def test_a_figure_is_judged(direction: str, tolerance: float, now: float | None, verdict: str) -> None:
-    assert Figure("key", 1.0, "m", direction, tolerance).judge(now) == verdict
+    assert Figure("key", 1.0, "m", direction, tolerance).compare(now) == verdict
 
 
 def test_a_value_is_found_by_its_path() -> None:

@@ -60,6 +60,12 @@ class Threads(Alone):
         total: NDArray[np.float64] = self.broadcast(None if parts is None else np.sum(parts, axis=0))
         return total.copy()
 
+    def abort(self, code: int) -> None:  # noqa: ARG002
+        self._barrier.abort()
+
+    def finish(self) -> None:
+        self._barrier.wait()
+
 
 def on_ranks(problem: Problem, options: SolverOptions, size: int) -> tuple[Sequence[Result], State]:
     """Solve on threads; return the result of each rank, and the whole state."""

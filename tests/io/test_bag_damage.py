@@ -17,7 +17,7 @@ from ba_node.io import ros_types
 from ba_node.io.bag_index import MAGIC
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
-from ba_node.messages.conversion import keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES
 
 if TYPE_CHECKING:
@@ -47,11 +47,11 @@ def record(rig: CameraRig, chunk_size: int, compression: CompressionType, chunki
     def write(name: str, message: object, t: int) -> None:
         writer.add_message(channels[name], t, ros_types.encode(INPUT_TYPES[name], message), t)
 
-    write("camera_rig", rig_message(F, rig, 0), 0)
+    write("camera_rig", input_message(F, rig, 0)[1], 0)
     for i in range(N_KEYFRAMES):
         keyframe, tracks = frame(i)
-        write("keyframes", keyframe_message(F, keyframe), i)
-        write("feature_tracks", tracks_message(F, tracks, 0, "c"), i)
+        write("keyframes", input_message(F, keyframe)[1], i)
+        write("feature_tracks", input_message(F, tracks, 0, "c")[1], i)
     writer.finish()  # type: ignore[no-untyped-call]
     return stream.getvalue()
 
@@ -174,9 +174,9 @@ def rewrite(
     writer.start("ros2")
     keyframe, tracks = frame(1)
     messages = {
-        "camera_rig": rig_message(F, rig, 0),
-        "keyframes": keyframe_message(F, keyframe),
-        "feature_tracks": tracks_message(F, tracks, 0, "c"),
+        "camera_rig": input_message(F, rig, 0)[1],
+        "keyframes": input_message(F, keyframe)[1],
+        "feature_tracks": input_message(F, tracks, 0, "c")[1],
     }
     for topic, message in messages.items():
         kind = INPUT_TYPES[topic]
@@ -212,7 +212,7 @@ def test_a_definition_with_more_fields_is_read_by_itself(tmp_path: Path, rig: Ca
     text = text.replace(
         "geometry_msgs/PoseWithCovariance pose\n", "geometry_msgs/PoseWithCovariance pose\nuint8[] more\n"
     )
-    longer = ros_types.encode(INPUT_TYPES["keyframes"], keyframe_message(F, frame(1)[0])) + b"\x02\x00\x00\x00ab"
+    longer = ros_types.encode(INPUT_TYPES["keyframes"], input_message(F, frame(1)[0])[1]) + b"\x02\x00\x00\x00ab"
     found, reader = read(tmp_path / "t.mcap", rewrite(rig, "keyframes", text=text, payload=longer))
     # The two messages without the new field are short of what their definition says.
     assert reader.rejected == {"undecodable": 2}
@@ -223,9 +223,9 @@ def test_a_definition_with_more_fields_is_read_by_itself(tmp_path: Path, rig: Ca
 def test_a_broken_message_is_counted_and_the_rest_is_read(tmp_path: Path, rig: CameraRig, name: str) -> None:
     keyframe, tracks = frame(1)
     whole = {
-        "camera_rig": rig_message(F, rig, 0),
-        "keyframes": keyframe_message(F, keyframe),
-        "feature_tracks": tracks_message(F, tracks, 0, "c"),
+        "camera_rig": input_message(F, rig, 0)[1],
+        "keyframes": input_message(F, keyframe)[1],
+        "feature_tracks": input_message(F, tracks, 0, "c")[1],
     }[name]
     data = ros_types.encode(INPUT_TYPES[name], whole)
     for payload in (
@@ -245,7 +245,7 @@ def test_a_broken_message_is_counted_and_the_rest_is_read(tmp_path: Path, rig: C
 
 
 def test_a_rig_of_unequal_lengths_is_counted(tmp_path: Path, rig: CameraRig) -> None:
-    message = rig_message(F, rig, 0)
+    message = input_message(F, rig, 0)[1]
     message.body_from_camera.pop()
     payload = ros_types.encode(INPUT_TYPES["camera_rig"], message)
     (tmp_path / "t.mcap").write_bytes(rewrite(rig, "camera_rig", payload=payload))

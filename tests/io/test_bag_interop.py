@@ -24,13 +24,7 @@ from ba_node.config import OutputConfig
 from ba_node.io import ros_types
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.messages.conversion import (
-    guesses_message,
-    keyframe_message,
-    measurement_from_message,
-    rig_message,
-    tracks_message,
-)
+from ba_node.messages.conversion import input_message, measurement_from_message
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 
@@ -46,11 +40,11 @@ def messages(
 ) -> list[tuple[str, str, Any]]:
     """Return one of every message: inputs and outputs."""
     inputs = {
-        "camera_rig": rig_message(F, rig, 5),
-        "keyframes": keyframe_message(F, keyframe),
-        "feature_tracks": tracks_message(F, tracks, 5, "c"),
-        "landmark_guesses": guesses_message(F, guesses, 5, "map"),
-        "camera_info": rig_message(F, rig, 5).cameras[1],
+        "camera_rig": input_message(F, rig, 5)[1],
+        "keyframes": input_message(F, keyframe)[1],
+        "feature_tracks": input_message(F, tracks, 5, "c")[1],
+        "landmark_guesses": input_message(F, guesses, 5, "map")[1],
+        "camera_info": input_message(F, rig, 5)[1].cameras[1],
     }
     out = [(name, INPUT_TYPES[name], message) for name, message in inputs.items()]
     return out + output_messages(F, estimate, OutputConfig())
@@ -100,7 +94,7 @@ def test_extremes_survive_cdr(ids: list[int], values: list[float], keyframe_id: 
         session_id, keyframe_id, 0, np.array(ids, np.uint64), np.stack([column, -column], axis=1), column, -column
     )
     kind = INPUT_TYPES["feature_tracks"]
-    data = ros_types.encode(kind, tracks_message(F, tracks, -1, "c"))
+    data = ros_types.encode(kind, input_message(F, tracks, -1, "c")[1])
     back = measurement_from_message(kind, ros_types.decode(kind, data))
     other = DecoderFactory().decoder_for(
         "cdr",

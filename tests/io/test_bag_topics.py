@@ -13,10 +13,11 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.config import Config
+from ba_node.io.bag_source import BagChannel
 from ba_node.io.bag_topics import NO_CHOICE, Chooser, TopicChoice, parse_topic
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.offline.replay import MapOptions, replay
 from ba_node.synthetic import SyntheticOptions, generate
@@ -137,14 +138,14 @@ def write_robots(path: Path, spaces: dict[str, int]) -> None:
         data = generate(SyntheticOptions(keyframes=12, landmarks=3000, tracks=150, length_m=10.0, seed=seed))
         for topic, stamp, m in data.timeline():
             if isinstance(m, CameraRig):
-                message = rig_message(F, m, stamp)
+                message = input_message(F, m, stamp)[1]
             elif isinstance(m, Keyframe):
-                message = keyframe_message(F, m)
+                message = input_message(F, m)[1]
             elif isinstance(m, LandmarkGuesses):
-                message = guesses_message(F, m, stamp, "odom")
+                message = input_message(F, m, stamp, "odom")[1]
             else:
                 assert isinstance(m, FeatureTracks)
-                message = tracks_message(F, m, stamp, f"camera{m.camera_index}")
+                message = input_message(F, m, stamp, f"camera{m.camera_index}")[1]
             entries.append((stamp, f"{space}/{topic}", INPUT_TYPES[topic], message))
     entries.sort(key=lambda entry: entry[0])
     with BagWriter(path) as bag:
@@ -178,7 +179,7 @@ def test_topics_without_messages_are_not_meant(tmp_path: Path) -> None:
         messages = list(reader.messages())
     with BagWriter(tmp_path / "two.mcap") as bag:
         for name in (KF, FT, RIG):
-            bag._channel(f"/robot1/{name}", INPUT_TYPES[name], latched=False)
+            bag._register(BagChannel(0, f"/robot1/{name}", INPUT_TYPES[name], ("cdr", "ros2msg"), "", 0), {})
         for topic, kind, time, data in messages:
             bag.write(topic, kind, data, time)
     with BagReader(tmp_path / "two.mcap") as reader:

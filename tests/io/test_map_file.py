@@ -177,8 +177,8 @@ def test_other_files_are_no_maps(folder: Path) -> None:
     for name, message in (
         ("text", "not a map: expected an .npz file"),
         ("other.npz", "not a map: it has no map.json"),
-        ("none", "cannot be read: No such file"),
-        (".", "cannot be read: Is a directory"),
+        ("none", "cannot be opened: No such file"),
+        (".", "cannot be opened: Is a directory"),
     ):
         with pytest.raises(MapFileError, match=message):
             read_map(folder / name)

@@ -19,7 +19,7 @@ from ba_node.io import ros_types
 from ba_node.io.bag_index import read_index
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import input_message
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import INPUT_TYPES
 
@@ -36,10 +36,10 @@ def write_inputs(
     path: Path, keyframe: Keyframe, tracks: FeatureTracks, guesses: LandmarkGuesses, rig: CameraRig
 ) -> None:
     with BagWriter(path) as bag:
-        bag.write("/camera_rig", INPUT_TYPES["camera_rig"], rig_message(F, rig, 5), 5, latched=True)
-        bag.write("/keyframes", INPUT_TYPES["keyframes"], keyframe_message(F, keyframe), 10)
-        bag.write("/feature_tracks", INPUT_TYPES["feature_tracks"], tracks_message(F, tracks, 5, "c"), 10)
-        bag.write("/landmark_guesses", INPUT_TYPES["landmark_guesses"], guesses_message(F, guesses, 5, "map"), 7)
+        bag.write("/camera_rig", INPUT_TYPES["camera_rig"], input_message(F, rig, 5)[1], 5, latched=True)
+        bag.write("/keyframes", INPUT_TYPES["keyframes"], input_message(F, keyframe)[1], 10)
+        bag.write("/feature_tracks", INPUT_TYPES["feature_tracks"], input_message(F, tracks, 5, "c")[1], 10)
+        bag.write("/landmark_guesses", INPUT_TYPES["landmark_guesses"], input_message(F, guesses, 5, "map")[1], 7)
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_nothing_is_left_of_a_file_that_failed(tmp_path: Path, keyframe: Keyfram
 
     def write_half() -> None:
         with BagWriter(old) as bag:
-            bag.write("/keyframes", INPUT_TYPES["keyframes"], keyframe_message(F, keyframe), 1)
+            bag.write("/keyframes", INPUT_TYPES["keyframes"], input_message(F, keyframe)[1], 1)
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
@@ -129,7 +129,7 @@ def test_nothing_is_left_of_a_file_that_failed(tmp_path: Path, keyframe: Keyfram
 
 
 def test_writer_names_what_does_not_fit(tmp_path: Path, keyframe: Keyframe, rig: CameraRig) -> None:
-    message = keyframe_message(F, keyframe)
+    message = input_message(F, keyframe)[1]
     with BagWriter(tmp_path / "out.mcap") as bag:
         bag.write("k", INPUT_TYPES["keyframes"], message, 2**64 - 1)
         with pytest.raises(BagError, match=r"topic /k: log time -1 ns"):
@@ -137,7 +137,7 @@ def test_writer_names_what_does_not_fit(tmp_path: Path, keyframe: Keyframe, rig:
         with pytest.raises(BagError, match="a topic keeps both"):
             bag.write("/k", INPUT_TYPES["keyframes"], message, 1, latched=True)
         with pytest.raises(BagError, match="message does not fit ba_msgs/msg/Keyframe"):
-            bag.write("/other", INPUT_TYPES["keyframes"], rig_message(F, rig, 0), 1)
+            bag.write("/other", INPUT_TYPES["keyframes"], input_message(F, rig, 0)[1], 1)
     with BagReader(tmp_path / "out.mcap") as reader:
         assert reader.topics == {"/k": "ba_msgs/msg/Keyframe"}
         assert [t for _, _, t, _ in reader.messages()] == [2**64 - 1]
@@ -277,16 +277,16 @@ def test_a_missing_topic_is_named_with_those_that_are_there(
 
 
 def test_camera_info_counts_only_without_a_rig(tmp_path: Path, keyframe: Keyframe, rig: CameraRig) -> None:
-    info = rig_message(F, rig, 0).cameras[0]
+    info = input_message(F, rig, 0)[1].cameras[0]
     for with_rig in (True, False):
         path = tmp_path / f"{with_rig}.mcap"
         empty = FeatureTracks(0, 0, 0, np.empty(0, np.uint64), np.empty((0, 2)))
         with BagWriter(path) as out:
             out.write("/left/camera_info", INPUT_TYPES["camera_info"], info, 1, latched=True)
-            out.write("/keyframes", INPUT_TYPES["keyframes"], keyframe_message(F, keyframe), 2)
-            out.write("/feature_tracks", INPUT_TYPES["feature_tracks"], tracks_message(F, empty, 0, "c"), 2)
+            out.write("/keyframes", INPUT_TYPES["keyframes"], input_message(F, keyframe)[1], 2)
+            out.write("/feature_tracks", INPUT_TYPES["feature_tracks"], input_message(F, empty, 0, "c")[1], 2)
             if with_rig:
-                out.write("/camera_rig", INPUT_TYPES["camera_rig"], rig_message(F, rig, 0), 1, latched=True)
+                out.write("/camera_rig", INPUT_TYPES["camera_rig"], input_message(F, rig, 0)[1], 1, latched=True)
         with BagReader(path) as reader:
             sizes = [len(m) for _, _, m in reader.measurements() if isinstance(m, CameraRig)]
         assert sizes == ([2] if with_rig else [1])

@@ -26,14 +26,7 @@ from ba_node.measurements import (
     Measurement,
     TrackMerge,
 )
-from ba_node.messages.conversion import (
-    guesses_message,
-    keyframe_message,
-    measurement_from_message,
-    rig_message,
-    side_message,
-    tracks_message,
-)
+from ba_node.messages.conversion import input_message, measurement_from_message
 from ba_node.messages.factory import ConversionError, stamp_ns_from_message
 from ba_node.messages.outputs import POINT_DTYPE, output_messages
 from ba_node.messages.report import Report, report_message
@@ -83,10 +76,10 @@ def test_measurements_survive_the_way_through_messages(
     keyframe: Keyframe, tracks: FeatureTracks, guesses: LandmarkGuesses, rig: CameraRig
 ) -> None:
     messages = {
-        "keyframes": (keyframe, keyframe_message(FACTORY, keyframe)),
-        "feature_tracks": (tracks, tracks_message(FACTORY, tracks, 5, "left_optical")),
-        "landmark_guesses": (guesses, guesses_message(FACTORY, guesses, 5, "map")),
-        "camera_rig": (rig, rig_message(FACTORY, rig, 5)),
+        "keyframes": (keyframe, input_message(FACTORY, keyframe)[1]),
+        "feature_tracks": (tracks, input_message(FACTORY, tracks, 5, "left_optical")[1]),
+        "landmark_guesses": (guesses, input_message(FACTORY, guesses, 5, "map")[1]),
+        "camera_rig": (rig, input_message(FACTORY, rig, 5)[1]),
     }
     for topic, (measurement, message) in messages.items():
         assert message.type_name == INPUT_TYPES[topic]
@@ -98,7 +91,7 @@ def test_measurements_survive_the_way_through_messages(
 def test_what_is_known_beside_pixels_survives_too(beside_pixels: list[Measurement]) -> None:
     seen = set()
     for measurement in beside_pixels:
-        topic, message = side_message(FACTORY, measurement, 5, "base_link")
+        topic, message = input_message(FACTORY, measurement, 5, "base_link")
         assert message.type_name == INPUT_TYPES[topic]
         assert_same(measurement, measurement_from_message(INPUT_TYPES[topic], message))
         seen.add(topic)
@@ -108,24 +101,24 @@ def test_what_is_known_beside_pixels_survives_too(beside_pixels: list[Measuremen
 def test_a_covariance_of_a_keyframe_is_read_and_all_zero_is_unknown(keyframe: Keyframe) -> None:
     told = dataclasses.replace(keyframe, covariance=np.arange(36.0))
     for one in (keyframe, told):
-        assert_same(one, measurement_from_message(INPUT_TYPES["keyframes"], keyframe_message(FACTORY, one)))
+        assert_same(one, measurement_from_message(INPUT_TYPES["keyframes"], input_message(FACTORY, one)[1]))
 
 
 def test_arrays_of_priors_and_merges_that_do_not_fit_are_named(beside_pixels: list[Measurement]) -> None:
-    _, priors = side_message(FACTORY, beside_pixels[1])
+    _, priors = input_message(FACTORY, beside_pixels[1])
     priors.covariance = priors.covariance[:-1]
     found = measurement_from_message(INPUT_TYPES["landmark_priors"], priors)
     assert isinstance(found, LandmarkPriors)
-    assert found.malformed.startswith("2 tracks, 6 coord")
-    _, merge = side_message(FACTORY, beside_pixels[2])
+    assert found.malformed.startswith("covariance has 17 entries, track_id 2: expected 9")
+    _, merge = input_message(FACTORY, beside_pixels[2])
     merge.same_as = merge.same_as[:-1]
     found = measurement_from_message(INPUT_TYPES["track_merges"], merge)
     assert isinstance(found, TrackMerge)
-    assert found.malformed.startswith("track_id has 2 entries")
+    assert found.malformed.startswith("same_as has 1 entries, track_id 2")
 
 
 def test_lone_camera_is_a_rig_of_one_at_the_origin(rig: CameraRig) -> None:
-    info = rig_message(FACTORY, rig, 0).cameras[0]
+    info = input_message(FACTORY, rig, 0)[1].cameras[0]
     one = measurement_from_message("sensor_msgs/msg/CameraInfo", info)
     assert isinstance(one, CameraRig)
     assert (len(one), one.frame_id, one.names, one.models) == (1, "left_optical", ("left_optical",), ("plumb_bob",))
@@ -148,7 +141,7 @@ def test_lone_camera_is_a_rig_of_one_at_the_origin(rig: CameraRig) -> None:
 )
 def test_tracks_of_unequal_lengths_say_so(field: str, length: int, words: str) -> None:
     good = FeatureTracks(1, 2, 0, np.arange(12, dtype=np.uint64), np.zeros((12, 2)))
-    message = tracks_message(FACTORY, good, 0, "c")
+    message = input_message(FACTORY, good, 0, "c")[1]
     setattr(message, field, array.array("Q" if field == "track_id" else "f", [0] * length))
     tracks = measurement_from_message(INPUT_TYPES["feature_tracks"], message)
     assert isinstance(tracks, FeatureTracks)
@@ -159,7 +152,7 @@ def test_tracks_of_unequal_lengths_say_so(field: str, length: int, words: str) -
 
 
 def test_guesses_of_unequal_lengths_say_so(guesses: LandmarkGuesses) -> None:
-    message = guesses_message(FACTORY, guesses, 0, "map")
+    message = input_message(FACTORY, guesses, 0, "map")[1]
     message.position = array.array("d", [0.0] * 5)
     found = measurement_from_message(INPUT_TYPES["landmark_guesses"], message)
     assert isinstance(found, LandmarkGuesses)
@@ -175,10 +168,10 @@ def malformed(message: Any) -> str:
 
 
 def test_a_rig_that_cannot_be_used_says_so(rig: CameraRig) -> None:
-    message = rig_message(FACTORY, rig, 0)
+    message = input_message(FACTORY, rig, 0)[1]
     message.body_from_camera.pop()
     assert malformed(message) == "cameras has 2 entries, body_from_camera 1: expected one pose for each camera"
-    message = rig_message(FACTORY, rig, 0)
+    message = input_message(FACTORY, rig, 0)[1]
     message.cameras[1].k[1] = 0.5
     assert malformed(message).startswith("camera 1 ('right_optical'): skew k[1] = 0.5")
 
@@ -191,7 +184,7 @@ def test_a_type_that_is_no_input_is_named() -> None:
 @given(arrays(np.uint64, st.integers(0, 5), elements=st.integers(0, 2**64 - 1)))
 def test_ids_are_exact(ids: NDArray[np.uint64]) -> None:
     tracks = FeatureTracks(0, 0, 0, ids, np.zeros((len(ids), 2)))
-    back = measurement_from_message(INPUT_TYPES["feature_tracks"], tracks_message(FACTORY, tracks, 0, ""))
+    back = measurement_from_message(INPUT_TYPES["feature_tracks"], input_message(FACTORY, tracks, 0, "")[1])
     assert isinstance(back, FeatureTracks)
     assert back.track_id.tolist() == ids.tolist()
 
@@ -199,18 +192,18 @@ def test_ids_are_exact(ids: NDArray[np.uint64]) -> None:
 @given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
 def test_stamps_are_exact_and_nanoseconds_never_negative(stamp_ns: int) -> None:
     keyframe = Keyframe(0, 0, stamp_ns, "map", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-    stamp = keyframe_message(FACTORY, keyframe).header.stamp
+    stamp = input_message(FACTORY, keyframe)[1].header.stamp
     assert 0 <= stamp.nanosec < 10**9
     assert stamp_ns_from_message(stamp) == stamp_ns
 
 
 def test_a_stamp_beyond_the_message_is_an_error(keyframe: Keyframe) -> None:
     with pytest.raises(ConversionError, match="2147483648"):
-        keyframe_message(FACTORY, dataclasses.replace(keyframe, stamp_ns=2**31 * 10**9))
+        input_message(FACTORY, dataclasses.replace(keyframe, stamp_ns=2**31 * 10**9))[1]
 
 
 def test_nothing_kept_shares_memory_with_the_message(tracks: FeatureTracks) -> None:
-    message = tracks_message(FACTORY, tracks, 0, "c")
+    message = input_message(FACTORY, tracks, 0, "c")[1]
     kept = measurement_from_message(INPUT_TYPES["feature_tracks"], message)
     assert isinstance(kept, FeatureTracks)
     message.track_id[0] = 99
@@ -345,7 +338,7 @@ def lines_run(action: Callable[[], object]) -> int:
 def test_conversion_does_not_loop_over_elements(estimate: Estimate) -> None:
     def take(n: int) -> int:
         tracks = FeatureTracks(0, 0, 0, np.arange(n, dtype=np.uint64), np.zeros((n, 2)), np.ones(n), np.ones(n))
-        message = tracks_message(FACTORY, tracks, 0, "c")
+        message = input_message(FACTORY, tracks, 0, "c")[1]
         return lines_run(lambda: measurement_from_message(INPUT_TYPES["feature_tracks"], message))
 
     def give(n: int) -> int:

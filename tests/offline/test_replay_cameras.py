@@ -16,7 +16,7 @@ from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.messages.conversion import guesses_message, keyframe_message, rig_message, tracks_message
+from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.offline.recording import TRUTH_TOPIC, TRUTH_TYPE, _true_pose
 from ba_node.offline.replay import replay
@@ -35,7 +35,7 @@ def record_with(path: Path, change: Callable[[Any], None], lone: bool = False, *
     with BagWriter(path) as bag:
         for topic, stamp, m in data.timeline():
             if isinstance(m, CameraRig):
-                message = rig_message(F, m, stamp)
+                message = input_message(F, m, stamp)[1]
                 for info in message.cameras:
                     change(info)
                 if lone:
@@ -43,12 +43,12 @@ def record_with(path: Path, change: Callable[[Any], None], lone: bool = False, *
                     continue
             elif isinstance(m, Keyframe):
                 bag.write(TRUTH_TOPIC, TRUTH_TYPE, _true_pose(data.truth, rows[m.keyframe_id], "odom"), stamp)
-                message = keyframe_message(F, m)
+                message = input_message(F, m)[1]
             elif isinstance(m, LandmarkGuesses):
-                message = guesses_message(F, m, stamp, "odom")
+                message = input_message(F, m, stamp, "odom")[1]
             else:
                 assert isinstance(m, FeatureTracks)
-                message = tracks_message(F, m, stamp, "camera")
+                message = input_message(F, m, stamp, "camera")[1]
             bag.write(topic, INPUT_TYPES[topic], message, stamp, latched=isinstance(m, CameraRig))
     return path
 

@@ -32,7 +32,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RclpyParameter
 
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.measurements import Measurement
 from ba_node.messages import conversion
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros import qos
@@ -209,17 +209,8 @@ class Peer:
 
     def publish(self, measurement: Measurement, stamp_ns: int = 0) -> None:
         """Send a measurement on its topic."""
-        if isinstance(measurement, Keyframe):
-            self.publishers["keyframes"].publish(conversion.keyframe_message(FACTORY, measurement))
-        elif isinstance(measurement, FeatureTracks):
-            message = conversion.tracks_message(FACTORY, measurement, stamp_ns, "camera")
-            self.publishers["feature_tracks"].publish(message)
-        elif isinstance(measurement, LandmarkGuesses):
-            message = conversion.guesses_message(FACTORY, measurement, stamp_ns, "odom")
-            self.publishers["landmark_guesses"].publish(message)
-        else:
-            assert isinstance(measurement, CameraRig)
-            self.publishers["camera_rig"].publish(conversion.rig_message(FACTORY, measurement, stamp_ns))
+        topic, message = conversion.input_message(FACTORY, measurement, stamp_ns, "camera")
+        self.publishers[topic].publish(message)
 
     def play(self, data: SyntheticData, session_id: int = 0) -> None:
         """Publish a recording, each keyframe when the one before was solved; listens to the reports for that."""

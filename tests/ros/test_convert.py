@@ -12,14 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.conversion import (
-    guesses_message,
-    keyframe_message,
-    measurement_from_message,
-    rig_message,
-    side_message,
-    tracks_message,
-)
+from ba_node.messages.conversion import input_message, measurement_from_message
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -54,12 +47,12 @@ def test_inputs_survive_the_wire(
     beside_pixels: list[Measurement],
 ) -> None:
     sent: dict[str, tuple[Measurement, Any]] = {
-        "keyframes": (keyframe, keyframe_message(FACTORY, keyframe)),
-        "feature_tracks": (tracks, tracks_message(FACTORY, tracks, 5, "left_optical")),
-        "landmark_guesses": (guesses, guesses_message(FACTORY, guesses, 5, "map")),
-        "camera_rig": (rig, rig_message(FACTORY, rig, 5)),
+        "keyframes": (keyframe, input_message(FACTORY, keyframe)[1]),
+        "feature_tracks": (tracks, input_message(FACTORY, tracks, 5, "left_optical")[1]),
+        "landmark_guesses": (guesses, input_message(FACTORY, guesses, 5, "map")[1]),
+        "camera_rig": (rig, input_message(FACTORY, rig, 5)[1]),
     }
-    sent |= {topic: (one, message) for one in beside_pixels for topic, message in [side_message(FACTORY, one)]}
+    sent |= {topic: (one, message) for one in beside_pixels for topic, message in [input_message(FACTORY, one)]}
     for topic, (measurement, message) in sent.items():
         kind = INPUT_TYPES[topic]
         received = deserialize_message(serialize_message(message), message_class(kind))

@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import signal
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -34,8 +33,13 @@ from tests.ros.harness import NodeProcess, Peer, solve_until_stopped
 
 pytestmark = pytest.mark.dds
 
+
 StartNode = Callable[..., Any]
+
+
 MakePeer = Callable[..., Any]
+
+
 KEYFRAMES = 12
 
 
@@ -162,7 +166,9 @@ class TestPlayed:
         with contextlib.closing(Peer()) as late:
             late.listen("points", "path")
             late.until(lambda: late.received["points"] and late.received["path"], "latched points and path")
-            assert late.received["points"][0].width == played[1].received["points"][-1].width
+            peer, width = played[1], late.received["points"][0].width
+            # A solve may have followed that the first one has not heard of yet.
+            peer.until(lambda: peer.received["points"][-1].width == width, f"a map of {width} points")
 
     def test_a_node_that_ends_says_what_it_has_done(self, played: tuple[NodeProcess, Peer]) -> None:
         node, _ = played
@@ -179,9 +185,9 @@ def test_bad_input_is_counted_and_nothing_is_lost(
     peer.connect()
     factory = RclpyFactory()
     good = scene.tracks[0][0]
-    message = conversion.tracks_message(factory, good, 0, "camera")
+    message = conversion.input_message(factory, good, 0, "camera")[1]
     message.u = message.u[:-1]
-    short_rig = conversion.rig_message(factory, scene.rig, 0)
+    short_rig = conversion.input_message(factory, scene.rig, 0)[1]
     short_rig.body_from_camera = []
     nan = np.full(3, np.nan)
     storm = [
@@ -249,7 +255,7 @@ def test_a_camera_driver_is_heard(
     camera = peer.node.create_publisher(CameraInfo, "camera_info", profile)
     peer.publishers["camera_info"] = camera
     peer.connect()
-    info = conversion.rig_message(RclpyFactory(), mono.rig, 0).cameras[0]
+    info = conversion.input_message(RclpyFactory(), mono.rig, 0)[1].cameras[0]
     timer = peer.node.create_timer(0.03, lambda: camera.publish(info))
     for _, stamp_ns, measurement in list(mono.timeline())[1:]:
         peer.publish(_of_camera(measurement, mono.rig) if isinstance(measurement, Keyframe) else measurement, stamp_ns)
@@ -315,42 +321,6 @@ def test_starts_with_a_file_and_a_namespace(
     assert "/car/keyframes" in types
     assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
     assert node.stop(signal.SIGTERM) == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("-p", "window.max_keyfames:=5"), "did you mean 'window.max_keyframes'"),
-        (("-p", "window.max_keyframes:=0"), "expected a number in [2, 100000]"),
-        (("-p", "solver.loss:=cubic"), "choose one of squared, huber"),
-        (("-p", "window.max_keyframes:=[]"), "expected int"),
-        (("-r", "__ns:=9 lives"), "9 lives"),
-        (("--params-file", "no/such/file.yaml"), "no/such/file.yaml"),
-        (("--nonsense",), "--nonsense"),
-        (("--", "-p", "window.max_keyframes:=30"), "argument '-p' is not known; parameters follow --ros-args"),
-    ],
-)
-def test_wrong_arguments_end_with_one_line(start_node: StartNode, arguments: tuple[str, ...], words: str) -> None:
-    node = start_node("--ros-args", *arguments)
-    assert node.wait() == 2, node.err
-    own = [line for line in node.err.splitlines() if "[rcl]" not in line]
-    assert len(own) == 1, node.err
-    assert words in own[0]
-    assert "Traceback" not in node.err
-
-
-def test_help_is_given_and_a_file_for_another_node_is_told(start_node: StartNode, tmp_path: Any) -> None:
-    node = start_node("--help")
-    assert node.wait() == 0, node.err
-    assert node.out.startswith("usage: ba_node [--ros-args [-p NAME:=VALUE]")
-    file = tmp_path / "params.yaml"
-    file.write_text("ba_nod:\n  ros__parameters:\n    window.max_keyframes: 4\n")
-    node = start_node("--ros-args", "--params-file", str(file), "-r", "__ns:=/car")
-    while "activate: done" not in node.out + node.err:
-        assert node.alive, node.err
-        time.sleep(0.05)
-    assert f"{file} has parameters for /ba_nod and none for /car/ba_node: nothing of it is used" in node.err
-    assert node.stop() == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -25,8 +25,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.qos import ReliabilityPolicy
 
 from ba_node.config import declared
-from ba_node.config.front_end import FrontEndOptions
-from ba_node.config.front_end_node import FrontEndNodeOptions
+from ba_node.config.front_end import FrontEndNodeOptions, FrontEndOptions
 from ba_node.core import geometry
 from ba_node.estimate import Correction, Poses
 from ba_node.front_end.front_end import FrontEnd

@@ -28,7 +28,7 @@ from rclpy.time import Time
 
 from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig
-from ba_node.messages.conversion import rig_message
+from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
@@ -131,7 +131,7 @@ def publish_rig(rig: CameraRig, namespace: str, said: Callable[[str], None]) -> 
     with _node(PlayOptions(namespace=namespace)) as node:
         topic = TOPICS["camera_rig"]
         publisher = node.create_publisher(message_class(topic.type_name), topic.name, qos.latched())
-        publisher.publish(rig_message(RclpyFactory(), rig, node.get_clock().now().nanoseconds))
+        publisher.publish(input_message(RclpyFactory(), rig, node.get_clock().now().nanoseconds)[1])
         said(publisher.topic_name)
         while True:
             time.sleep(_ACK_TIMEOUT_S)

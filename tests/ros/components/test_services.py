@@ -175,7 +175,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
     (tmp_path / "cut.npz").write_bytes(good.read_bytes()[:-1000])
     np.savez(tmp_path / "foreign.npz", a=np.zeros(3))
     for path, reason in (
-        (tmp_path / "none.npz", "cannot be read: No such file or directory; the map is as before"),
+        (tmp_path / "none.npz", "cannot be opened: No such file or directory; the map is as before"),
         (tmp_path / "folder.npz", "is no regular file"),
         (tmp_path / "pipe.npz", "is no regular file"),
         (tmp_path / "link.npz", "is a link"),

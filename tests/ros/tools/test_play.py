@@ -21,7 +21,6 @@ from ba_node.config import Config
 from ba_node.io.bal import read_bal
 from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.model import from_bal
-from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.topics import CAMERAS, INPUT_TYPES
 from ba_node.offline.convert import timeline
@@ -42,13 +41,7 @@ def scene() -> SyntheticData:
 
 
 def _message(measurement: Any, stamp_ns: int) -> Any:
-    if isinstance(measurement, Keyframe):
-        return conversion.keyframe_message(ROSBAGS_FACTORY, measurement)
-    if isinstance(measurement, FeatureTracks):
-        return conversion.tracks_message(ROSBAGS_FACTORY, measurement, stamp_ns, "camera")
-    if hasattr(measurement, "track_id"):
-        return conversion.guesses_message(ROSBAGS_FACTORY, measurement, stamp_ns, "odom")
-    return conversion.rig_message(ROSBAGS_FACTORY, measurement, stamp_ns)
+    return conversion.input_message(ROSBAGS_FACTORY, measurement, stamp_ns, "camera")[1]
 
 
 @pytest.fixture
