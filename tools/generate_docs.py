@@ -22,7 +22,6 @@ from ba_node.config.front_end import FrontEndNodeOptions, FrontEndOptions
 from ba_node.core.methods import METHODS
 from ba_node.io.parameters import parameters_markdown, parameters_yaml, plain_yaml
 from ba_node.messages.topics import ACTIONS, INTERFACE_VERSION, SERVICES, TOPICS, Command, Direction, Topic
-from ba_node.offline.solver_settings import describe
 from ba_node.scene.rejections import NOTICES, REASONS
 from experiments.robustness.page import page as robustness_page
 from experiments.thesis.open_page import open_page
@@ -121,7 +120,7 @@ def methods_tables() -> str:
     about += [f"| `{method.name}` | {method.doc} | {method.source} |" for method in options["method"].allowed]
     names = list(METHODS)
     chosen = ["| option | " + " | ".join(f"`{name}`" for name in names) + " |", "|---" * (len(names) + 1) + "|"]
-    described = [describe(METHODS[name]) for name in names]
+    described = [dataclasses.asdict(METHODS[name]) for name in names]
     chosen += [
         f"| {option} | " + " | ".join(_shown(option, values) for values in described) + " |"
         for option in described[0]
