@@ -54,7 +54,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from scipy import sparse
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
@@ -146,7 +145,7 @@ def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, vari
     groups = np.unique(rows.group[rows.group > DEPTHS])
     if not len(groups):
         return
-    seen = reduced.influence.T @ sparse.diags(variance) @ reduced.influence
+    seen = reduced.influence.T @ scipy.sparse.diags(variance) @ reduced.influence
     of_seen = roots.T @ (seen @ roots)
     members = [np.flatnonzero(rows.group == group) for group in groups]
     slopes = [np.maximum(rows.slope[of], 0.0) for of in members]
@@ -190,7 +189,7 @@ class Reduced:
 
     def __init__(self, rows: Rows, weight: FloatArray) -> None:
         self.rows = rows
-        weighted = sparse.diags(weight)
+        weighted = scipy.sparse.diags(weight)
         self.inverse = _inverse_blocks((rows.points.T @ weighted @ rows.points).tobsr((3, 3)))
         self.back = (self.inverse @ (rows.points.T @ weighted @ rows.keyframes)).tocsr()
         self.influence = (rows.keyframes - rows.points @ self.back).tocsr()
@@ -208,7 +207,7 @@ class Reduced:
         return np.asarray(np.asarray(local).ravel() + np.concatenate(parts))
 
 
-def _inverse_blocks(c: sparse.bsr_matrix) -> sparse.bsr_matrix:
+def _inverse_blocks(c: scipy.sparse.bsr_matrix) -> scipy.sparse.bsr_matrix:
     """Return the inverse of a block diagonal matrix; 0 for points that nothing determines."""
     n = c.shape[0] // 3
     blocks = np.zeros((n, 3, 3))
@@ -218,7 +217,7 @@ def _inverse_blocks(c: sparse.bsr_matrix) -> sparse.bsr_matrix:
     sound = values > _ROUNDING * np.maximum(values[:, 2:], 1e-300)
     inverse = np.where(sound, 1.0 / np.where(sound, values, 1.0), 0.0)
     blocks = (vectors * inverse[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    return sparse.bsr_matrix((blocks, np.arange(n), np.arange(n + 1)), shape=c.shape)
+    return scipy.sparse.bsr_matrix((blocks, np.arange(n), np.arange(n + 1)), shape=c.shape)
 
 
 @dataclass(frozen=True)
@@ -233,7 +232,7 @@ class Uncertainty:
     def _meat(self, variance: FloatArray) -> FloatArray:
         """Return ``X' (sum v u'u) X``, (k, k)."""
         influence = self.reduced.influence
-        meat = (influence.T @ sparse.diags(variance) @ influence).toarray()
+        meat = (influence.T @ scipy.sparse.diags(variance) @ influence).toarray()
         return np.asarray(self.roots.T @ meat @ self.roots)
 
     def of(self, unknowns: IntArray) -> FloatArray:
@@ -271,7 +270,7 @@ class Uncertainty:
         n = len(which)
         inverse = reduced.inverse.tocsr()[place][:, place]
         seen = rows.points[:, place] @ inverse
-        weighted = sparse.diags(variance) @ seen
+        weighted = scipy.sparse.diags(variance) @ seen
         back = np.asarray(reduced.back[place] @ self.roots)
         own = (seen.T @ weighted).tobsr((3, 3))
         out = np.zeros((n, 3, 3))

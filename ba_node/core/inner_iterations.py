@@ -5,6 +5,12 @@
 Each point has its own 3 x 3 damped normal equations (Marquardt) and its own objective. A point whose step does not
 lower its objective goes back to where it was, and stays: no point can make the whole worse. Only observations of points
 that still move are looked at again.
+
+Under Huber's loss IRLS meets w J'J where an observation outside of ``scale`` has w J'(I - r r' / |r|^2) J: along its
+residual the loss is linear. A point of two views that do not agree creeps along a flat valley then: a hundred
+iterations of Ladybug-49 did not reach the objective that fifteen reach with nine tenths of that taken away. So it is
+from the second step on where IRLS promises little more: far from there steps that long fail, and a point whose step
+fails goes on by the first.
 """
 
 from __future__ import annotations
@@ -14,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import columns
 from ba_node.core.objective import Objective, PointRows
 from ba_node.core.problem import State
@@ -26,6 +33,9 @@ _MIN_GAIN = 1e-4
 # One that its model promises less than this share does not step at all. With 1e-4 the last 1e-6 of the objective of a
 # loop of 1000 cameras took 57 iterations in place of 21; with 1e-8 windows and Ladybug end as if all stepped.
 _MIN_PROMISE = 1e-8
+# With an observation outside of Huber's loss: the share that has arrived; that which IRLS must promise less than; and
+# how much of the curvature along the residual is taken away.
+_MIN_GAIN_OUTLIER, _CLOSE, _RADIAL = 1e-6, 1e-3, 0.9
 
 
 @dataclass(frozen=True)
@@ -50,20 +60,27 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
     before = 0.5 * float(np.sum(seen.cost)) + factors
     for step in range(steps + 1):
         count = np.diff(start, append=len(rows))
+        flat = _flatness(objective, seen, start)
         cost = columns.sum_runs(seen.cost, start)
         better = cost < best_cost[ids]
         if step:
             taken = np.flatnonzero(np.repeat(better, count))
             kept.update(rows[taken], seen, taken)
         with np.errstate(invalid="ignore"):
-            active = better & ~(best_cost[ids] - cost < _MIN_GAIN * cost)
+            least = np.where(np.trace(flat, axis1=1, axis2=2) > 0.0, _MIN_GAIN_OUTLIER, _MIN_GAIN)
+            active = better & ~(best_cost[ids] - cost < least * cost)
         best[ids[better]], best_cost[ids[better]] = points[ids[better]], cost[better]
         if step == steps or not active.any():
             break
         c, gradient = columns.normal_equations(seen.d_point, seen.residual, start)
-        diagonal = np.maximum(np.diagonal(c, axis1=1, axis2=2), _MIN_DIAGONAL)
-        inverse = inverse_cholesky3(columns.plus_diagonal(c, damping * diagonal))
+        diagonal = damping * np.maximum(np.diagonal(c, axis1=1, axis2=2), _MIN_DIAGONAL)
+        inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
         scaled = columns.times(inverse, gradient)
+        close = np.sum(scaled * scaled, axis=1) <= _CLOSE * cost
+        if step and flat.any() and close.any():
+            c[close] -= flat[close]
+            inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
+            scaled = columns.times(inverse, gradient)
         active &= np.sum(scaled * scaled, axis=1) > _MIN_PROMISE * cost
         if not active.any():
             break
@@ -75,3 +92,18 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
         damping *= 0.1
     after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)])) + factors
     return InnerIterations(dataclasses.replace(state, points=best), before, after, kept)
+
+
+def _flatness(objective: Objective, seen: PointRows, start: IntArray) -> FloatArray:
+    """Return what Huber's loss takes from the curvature of each point, (n_pt, 3, 3); zero under another loss."""
+    options = objective.options
+    if options.loss != "huber" or options.loss_per != "observation":
+        return np.zeros((len(start), 3, 3))
+    # r and J are both weighted: |r|^2 is scale times the norm outside.
+    residual = seen.residual[:, :2]
+    norm2 = np.sum(residual * residual, axis=1)
+    outside = np.flatnonzero(norm2 > options.loss_scale_px**2)
+    along = np.zeros((len(residual), 3))
+    projected = columns.times(columns.transposed(seen.d_point[outside, :2]), residual[outside])
+    along[outside] = projected * np.sqrt(_RADIAL / norm2[outside])[:, None]
+    return columns.normal_equations(along[:, None], along[:, :1], start)[0]

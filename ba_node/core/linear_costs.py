@@ -7,7 +7,9 @@ of d, P pairs of keyframes over all points, F block products of the sparse facto
 
 - dense:  6 d^2 P to form S, 12 n^2 bytes to lay it out, n^3 / 3 for Cholesky;
 - sparse: the same for S, 2 d^3 F for the factor, at a lower rate where a column and what it needs leave the cache;
-- pcg:    N blocks of d x 3 read in each of _PCG_STEPS steps; nothing is formed.
+- pcg:    N blocks of d x 3 read in each step; nothing is formed. A step carries what it knows from a keyframe to those
+          that share its points: the longer the way from one end of a map to the other, the more steps. A factor with F
+          products reaches ``b = sqrt(2 F / K)`` keyframes ahead, so that K keyframes are K / b stretches long.
 
 Both factors are our own. The sparse one (native/src/linalg/sparse_cholesky.hpp), by blocks of the size of a camera,
 took 0.02 s where Eigen's SimplicialLLT took 0.20 s and CHOLMOD's supernodal one 0.15 s (1000 cameras on a circle, one
@@ -30,8 +32,10 @@ _SPARSE_FLOPS_LARGE = 10e9
 _BYTES = 12e9
 # Bytes that a column of the factor and its sources may take before the lower rate holds.
 _CACHE_BYTES = 5e6
-# Steps of PCG that an outer iteration is charged: with block Jacobi, and with clusters and a coarse system.
-_PCG_STEPS = 60
+# Steps of PCG that an outer iteration is charged: of a map where all keyframes meet, and for each stretch of a long
+# one (10 stretches of 1000 keyframes took 45 steps, then 144, then 232, where a factor ends after six iterations).
+_PCG_STEPS, _PCG_STEPS_OF_STRETCH = 60, 20
+# The same with clusters and a coarse system in place of block Jacobi.
 _TWO_LEVEL_STEPS = 20
 # From so many steps of PCG on for the cost of forming S PCG is tried first, for half as many.
 _WORTH_A_TRY = 15
@@ -59,8 +63,8 @@ class Factor:
 
 
 def block_bytes(block: int) -> int:
-    """Return the memory of a d x d block; those of 9 x 9 are padded."""
-    return 64 * 11 if block == 9 else 8 * 36
+    """Return the memory of a d x d block, padded (those of 6 x 6 with AVX-512 alone)."""
+    return 64 * 11 if block == 9 else 64 * 6
 
 
 def max_blocks(block: int) -> int:
@@ -86,9 +90,11 @@ def sparse_s(sizes: Sizes, factor: Factor) -> float:
     return _form_s(sizes) + flops(sizes, factor) / rate
 
 
-def pcg_s(sizes: Sizes) -> float:
-    """Return the seconds of an iteration with conjugate gradients."""
-    return _PCG_STEPS * 3.0 * 8.0 * sizes.block * sizes.edges / _BYTES
+def pcg_s(sizes: Sizes, products: float) -> float:
+    """Return the seconds of an iteration with conjugate gradients where a factor takes so many block products."""
+    keyframes = max(sizes.unknowns / sizes.block, 1.0)
+    stretches = keyframes / math.sqrt(max(2.0 * products / keyframes, 1.0))
+    return (_PCG_STEPS + _PCG_STEPS_OF_STRETCH * stretches) * _pcg_step_s(sizes)
 
 
 def preconditioner(sizes: Sizes, schur_blocks: int) -> str:
@@ -100,7 +106,7 @@ def preconditioner(sizes: Sizes, schur_blocks: int) -> str:
     if sizes.unknowns <= DENSE_LIMIT or 3.0 * size > MAX_BYTES:
         return "schur_block"
     two_level = _form_s(sizes) + (_TWO_LEVEL_STEPS + 3) * 2.0 * size / _BYTES
-    return "two_level" if two_level < pcg_s(sizes) else "schur_block"
+    return "two_level" if two_level < _PCG_STEPS * _pcg_step_s(sizes) else "schur_block"
 
 
 def pcg_tries(sizes: Sizes) -> int:
@@ -109,7 +115,7 @@ def pcg_tries(sizes: Sizes) -> int:
     That costs as much as forming S at least. At half the steps that cost as much, a try that fails makes one iteration
     half as long again.
     """
-    steps = _form_s(sizes) / (pcg_s(sizes) / _PCG_STEPS) if sizes.edges else 0.0
+    steps = _form_s(sizes) / _pcg_step_s(sizes) if sizes.edges else 0.0
     return int(0.5 * steps) if steps >= _WORTH_A_TRY else 0
 
 
@@ -120,13 +126,17 @@ def flops(sizes: Sizes, factor: Factor) -> float:
 
 def max_products(sizes: Sizes, *, exact: bool = False) -> float:
     """Return from how many block products on the sparse factor is not the cheapest way."""
-    spare = min(dense_s(sizes), math.inf if exact else pcg_s(sizes)) - _form_s(sizes)
-    return max(spare, 0.0) * _SPARSE_FLOPS / (2.0 * sizes.block**3)
+    low, high = 1.0, max(sizes.unknowns / sizes.block, 1.0) ** 3
+    while high > 1.001 * low:
+        middle = math.sqrt(low * high)
+        others = min(dense_s(sizes), math.inf if exact else pcg_s(sizes, middle)) - _form_s(sizes)
+        low, high = (middle, high) if 2.0 * sizes.block**3 * middle < others * _SPARSE_FLOPS else (low, middle)
+    return high
 
 
 def cheapest(sizes: Sizes, factor: Factor, *, exact: bool = False) -> str:
     """Return sparse, dense or pcg; pcg only where it costs less, if need be with less memory, than what is exact."""
-    costs = {"sparse": sparse_s(sizes, factor), "dense": dense_s(sizes), "pcg": pcg_s(sizes)}
+    costs = {"sparse": sparse_s(sizes, factor), "dense": dense_s(sizes), "pcg": pcg_s(sizes, factor.products)}
     if exact and math.isfinite(min(costs["sparse"], costs["dense"])):
         del costs["pcg"]
     return min(costs, key=lambda name: costs[name])
@@ -148,3 +158,7 @@ def describe(kind: str, n: int, sizes: Sizes | None, factor: Factor | None) -> s
 
 def _form_s(sizes: Sizes) -> float:
     return 6.0 * sizes.block**2 * sizes.pairs / _FORM_FLOPS
+
+
+def _pcg_step_s(sizes: Sizes) -> float:
+    return 3.0 * 8.0 * sizes.block * sizes.edges / _BYTES

@@ -46,7 +46,7 @@ _TQ = dataclasses.replace(_LOCAL, loss="truncated_quadratic", annealing="gnc", p
 
 # Local DINM/IRLS as a window wants it: D of damping and region is Marquardt's, which has no unit, so that nothing needs
 # to be known of the scene; what costs less is solved exactly, the limit t_eps -> 0; points follow each step.
-_LOCAL_IRLS = SolverOptions(trust_region="diag", q_eps=0.1)
+_LOCAL_IRLS = SolverOptions(q_eps=0.1)
 
 _CHOICES = {
     "lma_cd": _LMA_CD,

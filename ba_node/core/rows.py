@@ -19,7 +19,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
@@ -40,8 +40,8 @@ class Rows:
     """Residuals that count: those behind a camera, and depths that were not measured, are left out."""
 
     residual: FloatArray  # (m,) whitened
-    keyframes: sparse.csr_matrix  # (m, 6 n_free) derivatives by the local steps of the free keyframes
-    points: sparse.csr_matrix  # (m, 3 n_pt) by the points, m^-1
+    keyframes: scipy.sparse.csr_matrix  # (m, 6 n_free) derivatives by the local steps of the free keyframes
+    points: scipy.sparse.csr_matrix  # (m, 3 n_pt) by the points, m^-1
     weight: FloatArray  # (m,) w
     slope: FloatArray  # (m,) d
     group: IntArray  # (m,) as above; 2 and up are factors of each kind
@@ -98,7 +98,7 @@ def _prior_rows(problem: Problem, priors: PointPriors, state: State, beside: Row
     residual = (root @ (state.points[priors.point] - priors.position)[:, :, None])[..., 0]
     return Rows(
         residual.ravel(),
-        sparse.csr_matrix((3 * n, beside.keyframes.shape[1])),
+        scipy.sparse.csr_matrix((3 * n, beside.keyframes.shape[1])),
         _blocks(root, priors.point, problem.n_points),
         np.ones(3 * n),
         np.ones(3 * n),
@@ -120,7 +120,7 @@ def _factor_rows(kind: KeyframeFactors, group: int, state: State, column: IntArr
     rows = Rows(
         residual.ravel(),
         sum(blocks[1:], blocks[0]),
-        sparse.csr_matrix((n * m, 3 * n_points)),
+        scipy.sparse.csr_matrix((n * m, 3 * n_points)),
         np.repeat(weights[0], m),
         np.repeat(weights[1], m),
         np.full(n * m, group),
@@ -133,7 +133,9 @@ def joined(parts: list[Rows]) -> Rows:
     """Return the rows of several, one after another."""
     columns = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(Rows)}
     stacked = {
-        name: sparse.vstack(of, "csr") if sparse.issparse(of[0]) else np.concatenate(of) for name, of in columns.items()
+        name: scipy.sparse.vstack(of, "csr") if scipy.sparse.issparse(of[0]) else np.concatenate(of)
+        for name, of in columns.items()
+        for name, of in columns.items()
     }
     return Rows(**stacked)
 
@@ -148,7 +150,7 @@ def _weighed(name: str, scale: float, residual: FloatArray, size: IntArray | int
     return np.stack([weight, ((m - 1) * weight + (ahead - behind) / (2.0 * h)) / m])
 
 
-def _blocks(jacobian: FloatArray, column: IntArray, n_blocks: int) -> sparse.csr_matrix:
+def _blocks(jacobian: FloatArray, column: IntArray, n_blocks: int) -> scipy.sparse.csr_matrix:
     """Return (n, d, k) blocks as (n d, k n_blocks), each in its column of blocks; those at -1 are left out."""
     n, d, k = jacobian.shape
     held = np.flatnonzero(column >= 0)
@@ -157,4 +159,4 @@ def _blocks(jacobian: FloatArray, column: IntArray, n_blocks: int) -> sparse.csr
     bounds = np.concatenate([[0], np.cumsum(np.repeat(counts, d))])
     place = (k * column[held])[:, None, None] + np.zeros((1, d, 1), np.intp) + np.arange(k)
     values = np.ascontiguousarray(jacobian[held]).ravel()
-    return sparse.csr_matrix((values, place.ravel(), bounds), shape=(n * d, k * n_blocks))
+    return scipy.sparse.csr_matrix((values, place.ravel(), bounds), shape=(n * d, k * n_blocks))

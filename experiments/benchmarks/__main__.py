@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare ba_node with the solvers that are installed, on the same problems, and write tables and plots."""
+"""Compare ba_node with the solvers that are installed, on the same problems, and write tables, plots and a page."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.benchmarks import plots, problems, solvers, suite
+from ba_node.offline.page import PageError
+from experiments.benchmarks import page, plots, problems, solvers, suite
 from experiments.benchmarks.floor import Peak, measure
 from experiments.benchmarks.process import Limits
-from experiments.benchmarks.report import overview, problem_section
+from experiments.benchmarks.report import overview, problem_section, table
 from experiments.figures import png
 
 _EPILOG = "Problems, solvers, rules and how to read the tables: docs/performance.md"
@@ -106,12 +107,19 @@ def _write(out: Path, comparisons: list[suite.Comparison], absent: list[str], pe
     (out / "summary.json").write_text(json.dumps(_finite(summary), indent=1) + "\n")
     text = overview(comparisons)
     sections = "\n".join(problem_section(comparison) for comparison in comparisons)
-    (out / "report.md").write_text(f"## Against the fastest peer\n\n{text}\n\n## Problems\n\n{sections}")
+    ranked = table(page.RANKING, page.ranking(short))
+    (out / "report.md").write_text(
+        f"## Against the fastest peer\n\n{text}\n\n## Objective at the end\n\n{ranked}\n\n## Problems\n\n{sections}"
+    )
     if comparisons:
         (out / "profiles.png").write_bytes(png(plots.profiles(short)))
     if growth:
         (out / "growth.png").write_bytes(png(plots.growth(growth)))
-    print(f"{text}\n\nwritten to {os.path.relpath(out)}")
+    try:
+        page.write(out / "index.html", common, short)
+    except PageError as error:
+        print(error)
+    print(f"{text}\n\n{ranked}\n\nwritten to {os.path.relpath(out)}")
 
 
 def _finite(value: Any) -> Any:

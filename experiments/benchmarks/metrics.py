@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -81,3 +82,13 @@ def growth(sizes: Sequence[float], values: Sequence[float]) -> tuple[float, floa
     log_s, log_v = np.log(np.array(pairs)).T
     exponent, intercept = np.polyfit(log_s, log_v, 1)
     return float(np.exp(intercept)), float(exponent)
+
+
+def numbers(problems: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return problems as a summary's JSON has them, with inf for "never" and NaN for nothing."""
+    known = {"never": math.inf, None: math.nan}
+
+    def row(values: Mapping[str, Any]) -> dict[str, float]:
+        return {key: known.get(value, value) for key, value in values.items()}
+
+    return [{**p, "solvers": {name: row(values) for name, values in p["solvers"].items()}} for p in problems]

@@ -128,11 +128,8 @@ def main() -> int:
     """Draw the plots of a summary."""
     source, out = Path(sys.argv[1]), Path(sys.argv[2])
     summary = json.loads(source.read_text(), parse_constant=float)
-    for problem in summary["problems"]:
-        for row in problem["solvers"].values():
-            row |= {name: {"never": math.inf, None: math.nan}.get(value, value) for name, value in row.items()}
     out.mkdir(parents=True, exist_ok=True)
-    (out / "bench_profiles.png").write_bytes(png(profiles(summary["problems"])))
+    (out / "bench_profiles.png").write_bytes(png(profiles(metrics.numbers(summary["problems"]))))
     (out / "bench_growth.png").write_bytes(png(growth(summary["growth"])))
     return 0
 

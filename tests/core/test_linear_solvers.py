@@ -222,6 +222,17 @@ def test_chains_are_solved_sparsely_and_large_full_systems_are_not() -> None:
     assert linear_costs.cheapest(*full(5000)) == "pcg"
 
 
+def test_a_long_map_is_not_left_to_pcg() -> None:
+    """A corridor whose points are seen from 95 keyframes each: its factor costs more than 60 steps of PCG, not more
+    than the hundreds that it takes to carry a correction from one end to the other."""
+    for keyframes in (1000, 36_000):
+        sizes = Sizes(6 * keyframes, 6, 190 * keyframes, 8300 * keyframes)
+        factor = Factor(95 * keyframes, 4500.0 * keyframes)
+        assert linear_costs.cheapest(sizes, factor) == "sparse"
+        assert linear_costs.pcg_s(sizes, factor.products) > 2.0 * linear_costs.sparse_s(sizes, factor)
+        assert factor.products < linear_costs.max_products(sizes), "counting it is not given up"
+
+
 @given(st.integers(2, 400), st.integers(1, 60))
 def test_a_factor_beyond_the_limit_is_never_the_cheapest(cameras: int, reach: int) -> None:
     sizes, factor = banded(cameras, reach)

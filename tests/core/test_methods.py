@@ -247,7 +247,7 @@ def test_methods_are_the_table_of_the_thesis() -> None:
         "local_dinm": ("identity", "inc", "pcg", "points", "local", "squared"),
         "irls_huber": ("identity", "inc", "pcg", "points", "local", "huber"),
         "irls_tq": ("identity", "inc", "pcg", "points", "local", "truncated_quadratic"),
-        "local_irls": ("diag", "diag", "auto", "points", "local", "squared"),
+        "local_irls": ("diag", "none", "auto", "points", "local", "squared"),
     }
     parts = ("damping", "trust_region", "linear_solver", "schur", "parameterisation", "loss")
     for name, row in expected.items():

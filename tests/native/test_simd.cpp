@@ -1,9 +1,11 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 #include <array>
+#include <cmath>
 #include <limits>
 
 #include "check.hpp"
+#include "linalg/blocks.hpp"
 #include "parallel/memory.hpp"
 #include "simd/simd.hpp"
 
@@ -92,4 +94,59 @@ TEST(buffers_are_aligned_for_registers) {
   }
   for (const Buffer<double>& buffer : kept)
     for (double x : buffer) CHECK_NEAR(x, 2.5, 0);
+}
+
+namespace {
+
+// Entry of an edge's block Z, and of a block of S.
+template <int D>
+double entry_of(const Edge<D>& z, int r, int i) {
+  if constexpr (D == 9) {
+    if (r == 8) return z.b[i];
+  }
+  return z.a[i][r];
+}
+
+template <int D>
+Edge<D> edge(double first) {
+  Edge<D> z{};
+  for (int i = 0; i < 3; ++i)
+    for (int r = 0; r < kLanes; ++r) z.a[i][r] = std::sin(first + 3 * (D == 6 ? r % 6 : r) + i);
+  if constexpr (D == 9)
+    for (int i = 0; i < 3; ++i) z.b[i] = std::sin(first + 24 + i);
+  return z;
+}
+
+template <int D>
+Block<D> block(double first) {
+  Block<D> s;
+  clear(&s, 1);
+  for (int r = 0; r < D; ++r)
+    for (int c = 0; c < D; ++c) set_entry(s, r, c, std::cos(first + r * D + c));
+  return s;
+}
+
+template <int D>
+void products_of_blocks() {
+  const Edge<D> x = edge<D>(0.3), y = edge<D>(1.7);
+  const Block<D> a = block<D>(0.1), b = block<D>(2.2), before = block<D>(5.0);
+  Block<D> outer = before, turned = before;
+  subtract_product(outer, Left<D>(x), y);
+  subtract_transposed(turned, a, b);
+  for (int r = 0; r < D; ++r) {
+    for (int c = 0; c < D; ++c) {
+      double by_edges = entry(before, r, c), by_blocks = by_edges;
+      for (int i = 0; i < 3; ++i) by_edges -= entry_of(x, r, i) * entry_of(y, c, i);
+      for (int m = 0; m < D; ++m) by_blocks -= entry(a, r, m) * entry(b, c, m);
+      CHECK_NEAR(entry(outer, r, c), by_edges, 1e-14);
+      CHECK_NEAR(entry(turned, r, c), by_blocks, 1e-14);
+    }
+  }
+}
+
+}  // namespace
+
+TEST(products_of_blocks_are_those_of_their_entries) {
+  products_of_blocks<6>();
+  products_of_blocks<9>();
 }

@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 
-from experiments.benchmarks import metrics
+from experiments.benchmarks import metrics, page
 from experiments.benchmarks.process import Run
 from experiments.benchmarks.suite import START_AGREES, START_AGREES_PRINTED, Result, faults
 
@@ -78,3 +79,29 @@ def test_medians_over_runs_count_a_failed_run_as_never() -> None:
     assert row["tau 1e-01"] == 9.0
     assert row["gap 1e-03"] == math.inf
     assert row["final"] == 100.0
+
+
+def test_the_end_is_a_ranking_of_its_own(tmp_path: Path) -> None:
+    """Who stops early is told apart from who ends low; times to 1e-6 and memory are on the page too."""
+    times = {f"gap {gap:.0e}": 1.0 for gap in metrics.GAPS}
+    problems = [
+        {
+            "problem": f"window-{n}",
+            "f_start": 1e6,
+            "f_best": 100.0,
+            "solvers": {
+                "early": {"final": 101.0, **times, "gap 1e-06": "never", "peak_mb": 10.0},
+                "ba_node": {"final": 100.0, **times, "peak_mb": 20.0},
+                "absent": {"final": None, **dict.fromkeys(times), "peak_mb": None},
+            },
+        }
+        for n in (5, 10)
+    ]
+    known = metrics.numbers(problems)
+    assert page.ranking(known) == [["ba_node", "2", "2", "same", "same"], ["early", "2", "0", "1 %", "1 %"]]
+    figures = {figure.key: figure for figure in page.figures(known)}
+    assert [trace["name"] for trace in figures["gap_1e_06"].data if trace["x"]] == ["ba_node"]
+    assert [trace["y"] for trace in figures["above"].data] == [[pytest.approx(0.01)] * 2, [page.SAME] * 2, []]
+    page.write(tmp_path / "index.html", {"machine": "a core"}, known)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "Objective at the end" in text and "a core" in text and len(text) > 1_000_000

@@ -86,6 +86,9 @@ class Rows {
     if (cost_.cheirality == Cheirality::kDrop) drop_behind(layout, start);
   }
 
+  // The scale of Huber's loss, 0 for another.
+  double huber() const { return cost_.loss == Loss::kHuber ? cost_.scale : 0.0; }
+
   // Call f(lens, depth) with the lens that the problem needs and whether it measures depth, both as types. Where
   // keyframes have intrinsics of their own (D = 9) the lens is radial at least.
   template <int D, class F>

@@ -34,6 +34,14 @@ struct Edge<6> {
   V8 a[3];
 };
 
+// Registers that a column of six rows fills: AVX-512 works on the whole of it, with two rows that mean nothing, as what
+// its products need is stored in half as many pieces then.
+#if defined(__AVX512F__)
+constexpr int kStride6 = 8;
+#else
+constexpr int kStride6 = 6;
+#endif
+
 // A d x d block: for 6 its numbers by columns, for 9 eight rows by columns and the ninth row.
 template <int D>
 struct Block {
@@ -43,8 +51,8 @@ struct Block {
   double pad[7];
 };
 template <>
-struct alignas(32) Block<6> {
-  double v[36];
+struct alignas(8 * (kStride6 == 8 ? 8 : 4)) Block<6> {
+  double v[6 * kStride6];
 };
 
 template <class T>
@@ -67,6 +75,7 @@ inline double dot(const Column<D>& x, const Column<D>& y) {
   return out;
 }
 
+#if !defined(__AVX512F__)
 // Two columns of six rows are three registers of four: rows 0 to 3 of the first, 4 and 5 of the first and 0 and 1 of
 // the second, 2 to 5 of the second. So products of 6 x 6 blocks leave no lane empty.
 BA_INLINE Native4 load4(const double* p) { return Loaded<Native4>::from(p); }
@@ -98,9 +107,18 @@ struct Pair {
   }
 };
 
+#endif
+
 // x of products x y' with many y, as far as it fits into registers.
 template <int D>
 struct Left;
+#if defined(__AVX512F__)
+template <>
+struct Left<6> {
+  BA_INLINE explicit Left(const Edge<6>& x) : a{x.a[0], x.a[1], x.a[2]} {}
+  V8 a[3];
+};
+#else
 template <>
 struct Left<6> {
   BA_INLINE explicit Left(const Edge<6>& x) {
@@ -112,6 +130,7 @@ struct Left<6> {
   }
   Pair column[3];
 };
+#endif
 template <>
 struct Left<9> {
   BA_INLINE explicit Left(const Edge<9>& x) : a{x.a[0], x.a[1], x.a[2]}, b(reinterpret_cast<const double*>(&x.b)) {}
@@ -120,6 +139,17 @@ struct Left<9> {
 };
 
 // s -= x y'.
+#if defined(__AVX512F__)
+BA_INLINE void subtract_product(Block<6>& s, const Left<6>& x, const Edge<6>& y) {
+#pragma GCC unroll 6
+  for (int c = 0; c < 6; ++c) {
+    V8 column = load(&s.v[kStride6 * c]);
+#pragma GCC unroll 3
+    for (int i = 0; i < 3; ++i) column -= x.a[i] * reinterpret_cast<const double*>(&y.a[i])[c];
+    std::memcpy(&s.v[kStride6 * c], &column, sizeof(column));
+  }
+}
+#else
 BA_INLINE void subtract_product(Block<6>& s, const Left<6>& x, const Edge<6>& y) {
 #pragma GCC unroll 3
   for (int c = 0; c < 6; c += 2) {
@@ -129,6 +159,7 @@ BA_INLINE void subtract_product(Block<6>& s, const Left<6>& x, const Edge<6>& y)
     pair.store(&s.v[6 * c]);
   }
 }
+#endif
 
 BA_INLINE void subtract_product(Block<9>& s, const Left<9>& x, const Edge<9>& y) {
 #pragma GCC unroll 8
@@ -139,6 +170,21 @@ BA_INLINE void subtract_product(Block<9>& s, const Left<9>& x, const Edge<9>& y)
 }
 
 // c -= a b'.
+#if defined(__AVX512F__)
+inline void subtract_transposed(Block<6>& c, const Block<6>& a, const Block<6>& b) {
+  V8 out[6];
+#pragma GCC unroll 6
+  for (int j = 0; j < 6; ++j) out[j] = load(&c.v[kStride6 * j]);
+#pragma GCC unroll 6
+  for (int m = 0; m < 6; ++m) {
+    const V8 column = load(&a.v[kStride6 * m]);
+#pragma GCC unroll 6
+    for (int j = 0; j < 6; ++j) out[j] -= column * b.v[kStride6 * m + j];
+  }
+#pragma GCC unroll 6
+  for (int j = 0; j < 6; ++j) std::memcpy(&c.v[kStride6 * j], &out[j], sizeof(out[j]));
+}
+#else
 inline void subtract_transposed(Block<6>& c, const Block<6>& a, const Block<6>& b) {
   Pair out[3] = {Pair::of(c.v), Pair::of(c.v + 12), Pair::of(c.v + 24)};
 #pragma GCC unroll 6
@@ -150,6 +196,7 @@ inline void subtract_transposed(Block<6>& c, const Block<6>& a, const Block<6>& 
   }
   for (int j = 0; j < 3; ++j) out[j].store(c.v + 12 * j);
 }
+#endif
 
 inline void subtract_transposed(Block<9>& c, const Block<9>& a, const Block<9>& b) {
   const double *a_row = reinterpret_cast<const double*>(&a.row), *b_row = reinterpret_cast<const double*>(&b.row);
@@ -178,13 +225,13 @@ inline void subtract_transposed(Block<9>& c, const Block<9>& a, const Block<9>& 
   c.corner = corner;
 }
 
-inline double entry(const Block<6>& s, int r, int c) { return s.v[6 * c + r]; }
+inline double entry(const Block<6>& s, int r, int c) { return s.v[kStride6 * c + r]; }
 inline double entry(const Block<9>& s, int r, int c) {
   if (r == 8) return c == 8 ? s.corner : s.row[c];
   return s.col[c][r];
 }
 
-inline void set_entry(Block<6>& s, int r, int c, double value) { s.v[6 * c + r] = value; }
+inline void set_entry(Block<6>& s, int r, int c, double value) { s.v[kStride6 * c + r] = value; }
 inline void set_entry(Block<9>& s, int r, int c, double value) {
   if (r == 8 && c == 8) {
     s.corner = value;
@@ -223,7 +270,7 @@ inline void add_multiplied_transposed(const Block<D>& b, const double* x, double
 inline Column<6> multiply(const Block<6>& b, const Column<6>& x) {
   double out[kLanes] = {};
   for (int c = 0; c < 6; ++c)
-    for (int r = 0; r < 6; ++r) out[r] += b.v[6 * c + r] * x.a[c];
+    for (int r = 0; r < 6; ++r) out[r] += b.v[kStride6 * c + r] * x.a[c];
   return {load(out)};
 }
 inline Column<9> multiply(const Block<9>& b, const Column<9>& x) {
