@@ -3,12 +3,15 @@
 """The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
 
 from ba_node.backend.archive import MapState
-from ba_node.backend.backend import FINISHED_KEPT, Adjustment, Admitted, Backend, Check
+from ba_node.backend.backend import FINISHED_KEPT, Backend
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
+from ba_node.check.watch import Check
 from ba_node.core.calibration import Calibration
+from ba_node.scene.candidates import Admitted
 from ba_node.scene.map_content import MapContent, MapError
+from ba_node.window.adjustment import Adjustment
 from ba_node.window.full import Optimization
 from ba_node.window.quality import Residuals
 

@@ -29,7 +29,7 @@ Nothing here reads a clock: the caller passes one, for the report alone.
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
 from ba_node.backend import archive
@@ -47,8 +47,6 @@ from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import adjustment, full, guard, quality
 from ba_node.window.adjustment import Adjustment
-
-__all__ = ["FINISHED_KEPT", "Adjustment", "Admitted", "Backend", "Check"]
 
 FINISHED_KEPT = 8
 _REFUSED_KEPT = 1000
@@ -90,11 +88,6 @@ class Backend:
         return dataclasses.replace(
             self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.map.warnings
         )
-
-    @property
-    def notices(self) -> Counter[str]:
-        """Return what was unusual but used in this session, by kind (``rejections.NOTICES``)."""
-        return self.scene.log.notices
 
     @property
     def rejection_notes(self) -> deque[str]:
@@ -143,15 +136,11 @@ class Backend:
 
     def admit(self, measurement: Measurement) -> tuple[Admitted, ...]:
         """Return what is to be taken in now, in order: nothing while a keyframe is held, several once that is over."""
-        decision = self._sessions.decide(self.scene, measurement)
-        self._sessions.commit(measurement, decision)
-        return self._decided(decision)
+        return self._decided(self._sessions.decide(self.scene, measurement), measurement)
 
     def admit_rest(self) -> tuple[Admitted, ...]:
         """Return what is to be taken in of all that is held, as nothing more will come."""
-        decision = self._sessions.end(self.scene)
-        self._sessions.commit(None, decision)
-        return self._decided(decision)
+        return self._decided(self._sessions.end(self.scene))
 
     def take(self, admitted: Admitted) -> None:
         """Take in what :meth:`admit` returned."""
@@ -178,12 +167,7 @@ class Backend:
         ``final``: nothing more will come, and what waits for its keyframe or for the rig is given up.
         """
         self.map.completion.closed = True
-        if final:
-            rest = self.admit_rest()
-        else:
-            decision = self._sessions.settle(self.scene)
-            self._sessions.commit(None, decision)
-            rest = self._decided(decision)
+        rest = self.admit_rest() if final else self._decided(self._sessions.settle(self.scene))
         for admitted in rest:
             self.take(admitted)
         if rest:
@@ -252,14 +236,15 @@ class Backend:
             yield from self._taken(admitted)
         self.flush(final=True)
         while self.ready:
-            yield from self._solved()
+            if (estimate := self.solve()) is not None:
+                yield estimate
         last = self.adjust(final=True) if not self.setup.reason(self.scene) else None
         if last is not None:
             yield last
 
     def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
-        if self.completes(admitted):
-            yield from self._solved()
+        if self.completes(admitted) and (estimate := self.solve()) is not None:
+            yield estimate
         before = self.map
         self.take(admitted)
         if self.map is not before:
@@ -267,11 +252,6 @@ class Backend:
         one = admitted.measurement
         if isinstance(one, Keyframe) and self.scene.find_keyframe(one.keyframe_id) is not None:
             yield one
-
-    def _solved(self) -> Iterator[Estimate]:
-        estimate = self.solve()
-        if estimate is not None:
-            yield estimate
 
     def take_check(self, check: Check) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
@@ -378,7 +358,8 @@ class Backend:
         self.map.completion = Completion(newest, known.settled, known.delivered)
         self.solve_count = max(self.solve_count, known.solve_count)
 
-    def _decided(self, decision: Decision) -> tuple[Admitted, ...]:
+    def _decided(self, decision: Decision, measurement: Measurement | None = None) -> tuple[Admitted, ...]:
+        self._sessions.commit(measurement, decision)
         for refusal in decision.refused:
             self.scene.refuse(refusal)
             if isinstance(refusal.measurement, Keyframe):

@@ -26,7 +26,7 @@ from ba_node.core.problem import State
 from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import full, old_keyframes, quality, view
+from ba_node.window import full, old_keyframes, precision, quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -103,6 +103,7 @@ class CurrentMap:
         self.calibration: Calibration | None = None
         self.adjustments = 0
         self._trust = Trust()
+        self._precision: precision.Precision | None = None
 
     @property
     def session_id(self) -> int:
@@ -241,6 +242,7 @@ class CurrentMap:
             self.scene.moved(np.array(tried.without, np.intp))
             rows = selection.keyframes, selection.landmarks, selection.origin
             old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
+            self._precision = precision.learn(self.scene, self.config, self._precision, selection, state)
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}

@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from ba_node.check import ids, intrinsics, relations, units
+from ba_node.check import ids, intrinsics, motion, placement, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
@@ -37,8 +37,9 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
     tests: dict[str, Callable[[], Diagnosis]] = {
         _PIXELS: lambda: units.check_pixels(tracks),
         "stamps": lambda: units.check_stamps(tracks),
+        "sigma": lambda: units.check_sigma(tracks),
         "ids": lambda: ids.check_ids(tracks),
-        "cameras": lambda: relations.check_cameras(tracks),
+        "cameras": lambda: placement.check_cameras(tracks, related),
         "poses": lambda: _poses(tracks, related()),
         "depth": lambda: units.check_depth(tracks, related()),
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
@@ -56,8 +57,8 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
             outcome.told |= {name}
         if name == _PIXELS and found.findings:
             outcome.told |= tests.keys()
-        if name == "ids" and found.findings:
-            # Their tracks are of several points, and tell nothing else.
+        if name in ("ids", "sigma") and found.findings:
+            # Such tracks are of several points, or how precise they are is not known: little things are not told.
             outcome.told |= set(_BUILD_ON_THESE)
     if outcome.harmful:
         outcome.sound, outcome.untold = [], []
@@ -73,28 +74,31 @@ def _run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
 
 
 def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:
-    motion = relations.check_motion(tracks, pairs)
-    if not motion.sound and all(not finding.usual for finding in motion.findings):
-        size = _of_size(tracks, motion)
+    outcome = motion.check_motion(tracks, pairs)
+    if not outcome.sound and not (outcome.findings and outcome.usual):
+        size = _of_size(tracks, pairs, outcome)
         if size is not None:
-            motion.findings, motion.untold = [size], []
-    return motion
+            outcome.findings, outcome.untold = [size], []
+    return outcome
 
 
-def _of_size(tracks: Tracks, motion: Diagnosis) -> Finding | None:
+def _of_size(tracks: Tracks, pairs: list[Relation], outcome: Diagnosis) -> Finding | None:
     """Return another size of the images as the cause, if poses that contradict the tracks fit with it."""
-    found: list[tuple[float, intrinsics.Model]] = []
-    evidence = motion.findings[0].evidence if motion.findings else "the poses fit the tracks with that undone"
-    for model in intrinsics.other_sizes(tracks):
-        other = tracks.with_params(model.params)
-        pairs = relations.in_motion(other)
-        outcome = relations.check_motion(other, pairs)
-        if outcome.sound:
-            motion.rows.append(dataclasses.replace(outcome.rows[0], hypothesis=model.cause))
-            found.append((intrinsics.loss_of(other, pairs), model))
-    if not found:
+    evidence = outcome.findings[0].evidence if outcome.findings else "the poses fit the tracks with that undone"
+    fits: list[tuple[float, str, str]] = []
+    for size in intrinsics.other_sizes(tracks):
+        # Few keyframes cannot tell precisely where a region is.
+        model = intrinsics.freed_from(tracks, pairs, size) or size
+        other = tracks.seen(params=model.params)
+        related = relations.in_motion(other)
+        fit = motion.check_motion(other, related)
+        if fit.sound:
+            outcome.rows.append(dataclasses.replace(fit.rows[0], hypothesis=model.cause))
+            fits.append((intrinsics.loss_of(other, related), model.cause, model.change))
+    if not fits:
         return None
-    found.sort(key=lambda one: one[0])
     # Few keyframes cannot tell these apart.
-    named = [model for loss, model in found if loss <= _ALIKE * found[0][0]]
-    return Finding(tuple(one.cause for one in named), evidence, tuple(one.change for one in named), usual=True)
+    causes, changes = zip(
+        *((cause, change) for loss, cause, change in sorted(fits) if loss <= _ALIKE * min(fits)[0]), strict=True
+    )
+    return Finding(causes, evidence, changes, usual=True)

@@ -2,69 +2,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find out whether the cameras' intrinsics are those of the images, by small adjustments with free poses.
 
-Two images hardly tell a wrong focal length: rotation and direction follow it. A dozen keyframes do. So a few of them
-are adjusted freely, once as given and once for every other camera model in question, and the sums of residuals (Cauchy)
-are compared. Whoever is clearly lower wins.
+Two images hardly tell a wrong focal length: rotation and direction follow it. A dozen keyframes do. So some of them are
+adjusted freely: as given; with focal length and principal point free too, the same for all cameras (``bordered.py``);
+and once for every lens in question. The sums of residuals (Cauchy) are compared: whoever is clearly lower wins.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from ba_node.arrays import FloatArray
+from ba_node.check.adjusted import LARGE, Adjusted, Freed, Measure, problem_of
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
-from ba_node.check.relations import AGREED, Relation, median_share, spread
+from ba_node.check.relations import AGREED, Relation, median_share
 from ba_node.check.tracks import Tracks
-from ba_node.config import SolverOptions
-from ba_node.core import cameras, geometry, methods, native_kernels, solver, triangulation
+from ba_node.core import cameras
 from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
-from ba_node.core.problem import Observations, Problem, State
+from ba_node.core.problem import Problem
 
-_KEYFRAMES = 10
-_OBSERVATIONS = 1600
-_MIN_POINTS = 30
-_MIN_VIEWS = 3
-_MAX_STRIDE = 3
-_MIN_KEYFRAMES = 8
-# A wide loss first, as the front-end's steps may be far off; the sum that counts is that of the narrow one.
-_WIDE, _NARROW = (
-    dataclasses.replace(
-        methods.options("auto"),
-        loss="cauchy",
-        loss_scale_px=scale,
-        max_iterations=iterations,
-        function_tolerance=1e-3,
-    )
-    for scale, iterations in ((8.0, 10), (1.0, 12))
-)
-_PATIENT = dataclasses.replace(_NARROW, max_iterations=60, function_tolerance=1e-5)
-# Distance of a point that has none, in diameters of the path.
-_FAR = 20.0
-# Residuals beyond this many of the usual ones with the given model are mismatches.
-_MISMATCH = 5.0
-# Residuals beyond this many sigmas, and points behind a camera, all count the same.
-_CAP = 10.0
-# Factors of the focal length that are tried first; where one is better, the others beyond it.
-_BRACKET = 1.18
-_SMALLER, _LARGER = (0.92, 0.7, 0.6, 0.5, 0.4), (1.08, 1.4, 1.65, 2.0, 2.5)
-# Factors nearer to 1 than this are not named.
-_LEAST_FACTOR = 0.06
-# Two estimates of a factor agree to this.
-_SAME_FACTOR = 1.15
-# Usual residual, in sigmas, from which on it is more than noise, and factors far from 1 are tried too.
-_LARGE = 1.5
+# Focal lengths that are tried too where the given ones are far off.
+_FACTORS = (0.5, 0.7, 1.4, 2.0)
+# Changes of the focal length, and of the principal point in focal lengths, that are not named; and the standard
+# deviations that they have to be worth. What has a larger standard deviation than the last is not told.
+_LEAST_FACTOR, _LEAST_SHIFT = 0.03, 0.02
+_SIGMAS, _TOLD = 4.0, 0.01
+# Two estimates of a factor, and of a shift in focal lengths, agree to this.
+_SAME_FACTOR, _SAME_SHIFT = 1.06, 0.05
+# Factors by which images are made smaller or larger, and how nearly focal length and principal point show one.
+_BINNINGS, _NEARLY = (4.0, 2.0, 0.5), 1.12
 # Barrel distortion that images have where none is given.
 _BARREL = (-0.1, -0.2, -0.3, -0.4)
 # Share of the tracks' extent by which a principal point is off their middle where other sizes of the image are tried.
 _OFF_CENTRE = 0.2
 # Pixels of cameras are square to better than this.
 _SQUARE = 1.05
-# Another model is better if its sum of residuals is lower by this share, and by so many times its mean.
-_LOWER = 0.03
-_SURE = 25.0
+# Another model is better if its sum of residuals is lower by so many times its mean, and by this share:
+# what lenses do that no model says leaves less.
+_SURE = 16.0
+_LOWER = 0.05
+# A lens is named rather than a focal length and a principal point that leave no less than this part of its sum.
+_RATHER = 0.9
 # Where fewer tracks than this agree with free relations, the sum has to fall to this share: moving objects pull too.
 _MOST_AGREE, _LEFT = 0.85, 0.75
 _TEST = "intrinsics"
@@ -73,7 +52,7 @@ _INFO = "camera_info in camera_rig"
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model in question."""
+    """Cameras in question."""
 
     cause: str  # what it would mean
     change: str  # what to change
@@ -83,11 +62,12 @@ class Model:
     def confirms(self, other: Model) -> bool:
         """Return True if it says the same, whatever the precise numbers."""
         ratio = float(self.params[0, FX] / other.params[0, FX])
-        return self.change == other.change and 1.0 / _SAME_FACTOR < ratio < _SAME_FACTOR
+        shift = np.abs(self.params[0, CX : CY + 1] - other.params[0, CX : CY + 1]).max() / other.params[0, FX]
+        return self.change == other.change and abs(np.log(ratio)) < np.log(_SAME_FACTOR) and shift < _SAME_SHIFT
 
 
 def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
-    """Compare camera models by how well they explain a dozen keyframes; other tracks have to confirm what is found."""
+    """Compare cameras by how well they explain a dozen keyframes; other tracks have to confirm what is found."""
     outcome, model = _compare(tracks, relations, part=0)
     if model is None:
         return outcome
@@ -98,43 +78,35 @@ def check_intrinsics(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
 
 
 def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diagnosis, Model | None]:
-    """Return what half of the tracks tell, and which camera model is better than the given one."""
-    problem = _problem(tracks, relations, part)
+    """Return what half of the tracks tell, and which cameras are better than the given ones."""
+    problem = problem_of(tracks, relations, part)
     if problem is None:
         return Diagnosis(untold=["too few long tracks with parallax to judge the intrinsics"]), None
-    given = tracks.cameras.params
-    adjusted = {1.0: _Adjusted(problem, given)}
-    measure = _Measure(adjusted[1.0].norms)
-    now = measure(adjusted[1.0])
-    for factor in (1.0 / _BRACKET, _BRACKET):
-        adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
-    n = len(measure)
-    least = min(measure(adjusted[1.0 / _BRACKET]), measure(adjusted[_BRACKET]))
-    flat = n * (least / now - 1.0) < _SURE
-    tried = [(model, _Adjusted(problem, model.params, model.lens)) for model in other_models(tracks)]
-    if least < now or measure.noise > _LARGE:
-        for factor in (*_SMALLER, *_LARGER):
-            adjusted[factor] = _Adjusted(problem, _scaled(given, factor))
-        cost = {factor: measure(one) for factor, one in adjusted.items()}
-        factor = _lowest(cost)
-        if abs(factor - 1.0) > _LEAST_FACTOR and _is_sharp(cost):
-            tried.append((_focal(given, factor), adjusted[min(cost, key=lambda one: cost[one])]))
-    rows = [Row(_TEST, "as given", _explained(now))]
-    for cause in dict.fromkeys(model.cause for model, _ in tried):
-        least_loss = min(measure(one) for model, one in tried if model.cause == cause)
-        rows.append(Row(_TEST, cause, _explained(least_loss)))
-    if tried:
-        model, best = min(tried, key=lambda one: measure(one[1]))
+    given = Adjusted(problem, tracks.cameras.params)
+    measure = Measure(given.norms)
+    now, n = measure(given), len(measure)
+    free = _freed(problem, given, measure, tracks)
+    rows = [Row(_TEST, "as given", _explained(now)), Row(_TEST, "free", _explained(measure(free)))]
+    lenses = [(model, Adjusted(problem, model.params, model.lens)) for model in other_lenses(tracks)]
+    rows += [Row(_TEST, model.cause, _explained(measure(one))) for model, one in lenses]
+    found: list[tuple[Model, Adjusted | Freed]] = []
+    if lenses:
+        found = [min(lenses, key=lambda one: measure(one[1]))]
+    if not found or measure(free) < _RATHER * measure(found[0][1]) or not _is_lower(measure(found[0][1]), now, n):
+        off = _named(tracks, free)
+        found = [] if off is None else [(off, free)]
+    for model, best in found:
         lowest = measure(best)
         # Then the given model gets every chance: many iterations, and to begin where the other one ended.
-        if _is_lower(lowest, now, n) and _is_lower(lowest, adjusted[1.0].thorough(best.state, measure), n):
+        if _is_lower(lowest, now, n) and _is_lower(lowest, given.thorough(best.state, measure), n):
             if lowest > _left(relations) * now:
                 return Diagnosis(untold=["too many outliers to judge the intrinsics"], rows=rows), None
             evidence = f"a free adjustment leaves {lowest / now:.0%} of the loss that it leaves as given"
             return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows), model
-    if flat:
-        return Diagnosis(untold=["the motion so far does not tell the focal length"], rows=rows), None
-    return Diagnosis(sound=["the focal length fits"], rows=rows), None
+    if free.sigma.max() > _TOLD:
+        what = "the focal length" if free.sigma[0] > _TOLD else "the principal point"
+        return Diagnosis(untold=[f"the motion so far does not tell {what}"], rows=rows), None
+    return Diagnosis(sound=["focal length and principal point fit"], rows=rows), None
 
 
 def _left(relations: list[Relation]) -> float:
@@ -145,13 +117,21 @@ def _left(relations: list[Relation]) -> float:
     return _LEFT if share < _MOST_AGREE else 1.0
 
 
+def freed_from(tracks: Tracks, relations: list[Relation], model: Model) -> Model | None:
+    """Return cameras whose focal length and principal point are adjusted from a model on; None where that fails."""
+    problem = problem_of(tracks, relations, part=0)
+    if problem is None:
+        return None
+    return _named(tracks, Freed(Adjusted(problem, model.params)))
+
+
 def loss_of(tracks: Tracks, relations: list[Relation]) -> float:
     """Return the mean loss of a free adjustment of a dozen keyframes; infinite if there is none."""
-    problem = _problem(tracks, relations, part=0)
+    problem = problem_of(tracks, relations, part=0)
     if problem is None:
         return np.inf
-    norms = np.minimum(_Adjusted(problem, tracks.cameras.params).norms, _CAP)
-    return float(np.log1p(norms * norms).mean())
+    adjusted = Adjusted(problem, tracks.cameras.params)
+    return Measure(adjusted.norms, noise=1.0)(adjusted)
 
 
 def _is_lower(cost: float, other: float, observations: int) -> bool:
@@ -164,45 +144,79 @@ def _explained(cost: float) -> float:
     return float(1.0 / (1.0 + cost))
 
 
+def _freed(problem: Problem, given: Adjusted, measure: Measure, tracks: Tracks) -> Freed:
+    """Return the adjustment whose cameras are free; where those given are far off, from several others on too."""
+    starts = [given]
+    if measure.noise > LARGE:
+        params = tracks.cameras.params
+        scaled = [_scaled(params, factor) for factor in _FACTORS]
+        starts += [Adjusted(problem, one) for one in (*scaled, *(size.params for size in other_sizes(tracks)))]
+    return min((Freed(one) for one in starts), key=measure)
+
+
+def _named(tracks: Tracks, free: Freed) -> Model | None:
+    """Return in words how the cameras that fit differ from the given ones; None if they do not."""
+    given, fits, sigma = tracks.cameras.params[0], free.params[0], _SIGMAS * free.sigma
+    factor, shift = float(fits[FX] / given[FX]), (fits[CX : CY + 1] - given[CX : CY + 1]) / given[FX]
+    scaled = [
+        b
+        for b in _BINNINGS
+        if _near(1.0 / factor, b) and _near(float(np.mean(given[CX : CY + 1] / fits[CX : CY + 1])), b)
+    ]
+    if scaled:
+        return _size(tracks, scaled[0], free.params)
+    causes = []
+    if abs(np.log(factor)) > max(np.log1p(_LEAST_FACTOR), sigma[0]):
+        causes.append(
+            f"focal length off by a factor of about {1.0 / factor:.2f}:"
+            f" the tracks fit {fits[FX]:.0f} px, not {given[FX]:.0f}"
+        )
+    if (np.abs(shift) > np.maximum(_LEAST_SHIFT, sigma[1:])).any():
+        causes.append(_region(given[CX : CY + 1], f"the tracks fit {_at(fits[CX : CY + 1])}"))
+    if not causes:
+        return None
+    change = f"k of {_INFO}" if len(causes) == 1 and "focal" in causes[0] else _ROI
+    return Model(", and ".join(causes), change, free.params)
+
+
+def _near(value: float, other: float) -> bool:
+    return abs(np.log(value / other)) < np.log(_NEARLY) if value > 0.0 else False
+
+
+_ROI = f"roi in {_INFO}, or subtract its offset from the principal point in k"
+
+
+def _region(given: FloatArray, instead: str) -> str:
+    return f"region of interest not applied, or principal point wrong: {instead}, k says {_at(given)}"
+
+
+def _at(uv: FloatArray) -> str:
+    return f"({uv[0]:.0f}, {uv[1]:.0f})"
+
+
+def _size(tracks: Tracks, binning: float, params: FloatArray | None = None) -> Model:
+    """Return the cameras of an image that is smaller by a factor than the one that k is of."""
+    cause = f"binning not applied: k is that of an image {binning:g} times as large"
+    change = f"binning_x and binning_y in {_INFO}, or divide k by {binning:g}"
+    if binning < 1.0:
+        cause = f"k is that of a smaller image: the tracks are in one {1.0 / binning:g} times as large"
+        change = f"binning_x and binning_y in {_INFO} to 1, or multiply k by {1.0 / binning:g}"
+    if params is None:
+        params = tracks.cameras.params.copy()
+        params[:, FX : CY + 1] /= binning
+    return Model(cause, change, params)
+
+
 def _scaled(params: FloatArray, factor: float) -> FloatArray:
     scaled = params.copy()
     scaled[:, FX : FY + 1] *= factor
     return scaled
 
 
-def _focal(params: FloatArray, factor: float) -> Model:
-    focal = params[0, FX]
-    return Model(
-        f"focal length off by a factor of about {1.0 / factor:.2f}:"
-        f" the tracks fit {factor * focal:.0f} px, not {focal:.0f}",
-        f"k of {_INFO}",
-        _scaled(params, factor),
-    )
-
-
-def _is_sharp(cost: dict[float, float]) -> bool:
-    """Return True if the sum rises on both sides of its least."""
-    costs = [cost[factor] for factor in sorted(cost)]
-    at = int(np.argmin(costs))
-    return min(max(costs[: at + 1]), max(costs[at:])) > (1.0 + _LOWER) * costs[at]
-
-
-def _lowest(cost: dict[float, float]) -> float:
-    """Return the factor of the least cost, between the factors that were tried (parabola over their logarithms)."""
-    factors = np.array(sorted(cost))
-    costs = np.array([cost[factor] for factor in factors])
-    at = int(np.argmin(costs))
-    if at in (0, len(costs) - 1):
-        return float(factors[at])
-    three = slice(at - 1, at + 2)
-    a, b, _ = np.polyfit(np.log(factors[three]), costs[three], 2)
-    return float(np.exp(-b / (2.0 * a)))
-
-
-def other_models(tracks: Tracks) -> list[Model]:
-    """Return the camera models that are usual mistakes: of the other kind of image, of another size of it."""
+def other_lenses(tracks: Tracks) -> list[Model]:
+    """Return the cameras that are usual mistakes: of the other kind of image, and with square pixels."""
     given = tracks.cameras.params
-    models = [*other_sizes(tracks), *_square(given)]
+    models = _square(given)
     plain = given.copy()
     plain[:, DISTORTION] = 0.0
     rational = (tracks.cameras.model == cameras.Model.RATIONAL).all()
@@ -239,144 +253,14 @@ def _square(given: FloatArray) -> list[Model]:
 
 
 def other_sizes(tracks: Tracks) -> list[Model]:
-    """Return the camera models of a region of the image and of a binned one, if the tracks lie far off the centre."""
-    given, models = tracks.cameras.params, []
+    """Return the cameras of a region of the image and of a binned one, if the tracks lie far off the centre."""
+    given = tracks.cameras.params
     low, high = np.percentile(tracks.uv, [0.2, 99.8], axis=0)
     middle, centre = 0.5 * (low + high), np.median(given[:, CX : CY + 1], axis=0)
     if not (np.abs(centre - middle) > _OFF_CENTRE * (high - low)).any():
         return []
-    where = (
-        f"the tracks lie about ({middle[0]:.0f}, {middle[1]:.0f}) px,"
-        f" the principal point is at ({centre[0]:.0f}, {centre[1]:.0f})"
-    )
     region = given.copy()
     region[:, CX : CY + 1] += middle - centre
-    cause = f"region of interest not applied: {where}"
-    models.append(Model(cause, f"roi in {_INFO}, or subtract its offset from the principal point in k", region))
+    models = [Model(_region(centre, f"the tracks lie about {_at(middle)}"), _ROI, region)]
     factor = float(np.median(centre / middle))
-    for binning in (4.0, 2.0, 0.5):
-        if 0.75 < factor / binning < 1.33:
-            binned = given.copy()
-            binned[:, FX : CY + 1] /= binning
-            cause = f"binning not applied: k is that of an image {binning:g} times as large"
-            change = f"binning_x and binning_y in {_INFO}, or divide k by {binning:g}"
-            if binning < 1.0:
-                cause = f"k is that of a smaller image: the tracks are in one {1.0 / binning:g} times as large"
-                change = f"binning_x and binning_y in {_INFO} to 1, or multiply k by {1.0 / binning:g}"
-            models.append(Model(cause, change, binned))
-    return models
-
-
-def _problem(tracks: Tracks, relations: list[Relation], part: int) -> Problem | None:
-    """Return the adjustment of a dozen keyframes that turn most, every other of their tracks, the first pose fixed.
-
-    The second part has the other tracks, and keyframes of the other end of the recording.
-    """
-    usable = [one for one in relations if one.has_direction]
-    if len(usable) < 3:
-        return None
-    stride = int(np.clip(np.median([one.b[0] - one.a[0] for one in usable]) // 2, 1, _MAX_STRIDE))
-    turning = max(usable, key=lambda one: float(np.trace(np.eye(3) - one.pose.rotation)))
-    reach = stride * (_KEYFRAMES - 1)
-    first = max(0, min(turning.a[0] - reach // 2, len(tracks) - 1 - reach))
-    first = max(0, len(tracks) - 1 - reach - first) if part else first
-    keyframes = np.arange(first, len(tracks))[::stride][:_KEYFRAMES]
-    if len(keyframes) < _MIN_KEYFRAMES:
-        return None
-    place = np.full(len(tracks), -1)
-    place[keyframes] = np.arange(len(keyframes))
-    rows = np.flatnonzero((place[tracks.keyframe] >= 0) & np.isfinite(tracks.ray[:, 0]))
-    image = np.unique(tracks.track[rows] * len(tracks) + tracks.keyframe[rows])
-    views = np.bincount(image // len(tracks))
-    # Tracks are numbered as they begin: so some of each keyframe.
-    longest = np.flatnonzero(views >= _MIN_VIEWS)[part::2]
-    count = np.bincount(tracks.track[rows])[longest].sum()
-    longest = longest[spread(len(longest), int(len(longest) * _OBSERVATIONS / max(count, 1)))]
-    if len(longest) < _MIN_POINTS:
-        return None
-    number = np.full(len(views), -1)
-    number[longest] = np.arange(len(longest))
-    rows = rows[number[tracks.track[rows]] >= 0]
-    rows = rows[np.lexsort((tracks.camera[rows], tracks.keyframe[rows], tracks.track[rows]))]
-    empty = np.empty(0)
-    observations = Observations(
-        place[tracks.keyframe[rows]],
-        tracks.camera[rows],
-        number[tracks.track[rows]],
-        tracks.uv[rows],
-        tracks.sigma_px[rows],
-        empty,
-        empty,
-    )
-    poses = geometry.inverse(tracks.rotation[keyframes], tracks.position[keyframes] - tracks.position[first])
-    start = State(*poses, np.zeros((len(longest), 3)), np.empty((0, 3)))
-    fixed = np.arange(len(keyframes)) == 0
-    return Problem(start, fixed, tracks.cameras, observations)
-
-
-class _Measure:
-    """How well an adjustment explains the observations that are no mismatches, as the given model has them.
-
-    The loss is in units of the usual residual: that of real images is seldom what sigma_px says.
-    """
-
-    def __init__(self, norms: FloatArray) -> None:
-        usual = float(np.median(norms))
-        # Where most residuals are large, the given model is in doubt, and they are not for it to judge.
-        self._rows = (norms < _MISMATCH * max(usual, 1.0)) | (usual > _LARGE)
-        self.noise = max(float(np.median(norms[self._rows])), 1e-3)  # usual residual with the given model, sigmas
-
-    def __len__(self) -> int:
-        return int(np.count_nonzero(self._rows))
-
-    def __call__(self, adjusted: _Adjusted) -> float:
-        """Return the mean Cauchy loss of a residual; beyond a limit, and behind a camera, all count the same."""
-        norms = np.minimum(adjusted.norms[self._rows], _CAP) / self.noise
-        return float(np.log1p(norms * norms).mean())
-
-
-class _Adjusted:
-    """An adjustment with given intrinsics.
-
-    Attributes:
-        state: where it ended.
-        norms: sizes of the residuals there, sigmas.
-    """
-
-    def __init__(self, problem: Problem, params: FloatArray, lens: cameras.Model | None = None) -> None:
-        model = problem.cameras.model if lens is None else np.full_like(problem.cameras.model, lens)
-        rig = dataclasses.replace(problem.cameras, params=params, model=model)
-        self._problem = dataclasses.replace(problem, cameras=rig)
-        self.state = solver.solve(_placed(self._problem), _WIDE).state
-        self._finish(_NARROW)
-
-    def thorough(self, state: State, measure: _Measure) -> float:
-        """Return the mean loss after as many iterations as it takes, from here or from other poses: the lower one."""
-        self._finish(_PATIENT)
-        costs = [measure(self)]
-        for wide in (False, True):
-            self.state = state
-            if wide:
-                self.state = solver.solve(_placed(dataclasses.replace(self._problem, start=state)), _WIDE).state
-            self._finish(_PATIENT)
-            costs.append(measure(self))
-        return min(costs)
-
-    def _finish(self, options: SolverOptions) -> None:
-        self.state = solver.solve(_placed(dataclasses.replace(self._problem, start=self.state)), options).state
-        self.norms = native_kernels.residual_norms(self._problem, self.state)
-
-
-def _placed(problem: Problem) -> Problem:
-    """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
-    rays, n = triangulation.rays_of(problem), problem.n_points
-    if not len(rays.point):
-        return problem
-    points = triangulation.triangulate(rays, n).points
-    ahead = ((points[rays.point] - rays.centre) * rays.direction).sum(axis=1)
-    behind = np.bincount(rays.point, ~(ahead > 0.0), n) > 0
-    reach = _FAR * float(np.linalg.norm(np.ptp(rays.centre, axis=0)))
-    # The last row of a point wins; any of its rays will do.
-    points[rays.point[behind[rays.point]]] = (rays.centre + reach * rays.direction)[behind[rays.point]]
-    points[~np.isfinite(points).all(axis=1)] = 0.0
-    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
+    return models + [_size(tracks, binning) for binning in _BINNINGS if 0.75 < factor / binning < 1.33]

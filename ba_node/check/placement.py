@@ -1,213 +1,185 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Name the ways in which cameras and poses are usually given wrongly, each as another rig and other poses.
+"""Compare how the cameras stand to each other by their tracks with how they should by the rig.
 
-The optical frame of a camera looks along z, a body along x (REP-103). Cameras are body_from_camera as in the rig, poses
-are fixed frame from body.
+The relation is estimated from the tracks alone. Only where the given one explains clearly fewer of them are the usual
+mistakes tried, and the nearest is named.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
-from ba_node.check.tracks import Image, Tracks
+from ba_node.check import two_view
+from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
+from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding
+from ba_node.check.motion import contradicts
+from ba_node.check.relations import AGREED, Relation, of_cameras, relate, spread
+from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 from ba_node.core import geometry
 
-# Body from optical frame: x right, y down, z forward are -y, -z, x of the body.
-_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_EXTRINSICS = "body_from_camera in camera_rig (or tf_static)"
-_ONE = "body_from_camera of camera {camera} in camera_rig (or tf_static)"
-_POSES = "pose in the keyframes"
+# Keyframes that are looked at, and rays of two cameras.
+_KEYFRAMES = 20
+_MAX_RAYS = 800
+# Keyframes from which on it is measured by how much a camera is off.
+_KEYFRAMES_TO_MEASURE = 10
+# Cameras beyond the first that are tested.
+_MAX_CAMERAS = 8
+# The given relation fits if it explains this share of what the best does.
+_FITS = 0.9
+# Where the best relation explains less than this, the tracks of two images contradict each other.
+_CONTRADICT = 0.2
+# Another relation is named if it explains this share.
+_NAMED = 0.95
+# Angles below which nothing is named, whatever the residuals: calibration is no better.
+_MISFIT_DEG = 0.25
+# A relation that is turned further against the estimate does not explain it.
+_TURNED_DEG = 0.5
+# A usual mistake is not one of a few degrees.
+_SAME_DEG = 10.0
+# Factors by which the focal length of one camera may be wrong.
+_ZOOMS = tuple(float(factor) for factor in np.geomspace(0.5, 2.0, 41))
+# Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
+_PAIRS_NEEDED = 5
+_VOTES = 0.8
+# Outliers keep it from being measured unless the given relation explains less than this share of what the best does.
+_CLEAR = 0.5
 
 
-@dataclass(frozen=True)
-class Placed:
-    """Rigid transforms: rotation (n, 3, 3) and translation (n, 3)."""
-
-    rotation: FloatArray
-    translation: FloatArray
-
-    def inverse(self) -> Placed:
-        """Return the inverses."""
-        return Placed(*geometry.inverse(self.rotation, self.translation))
-
-    def after(self, other: Placed) -> Placed:
-        """Return the transforms that apply others first, then these."""
-        return Placed(*geometry.compose(self.rotation, self.translation, other.rotation, other.translation))
-
-    def turned(self, rotation: FloatArray) -> Placed:
-        """Return the transforms that turn first, then apply these."""
-        return Placed(self.rotation @ rotation, self.translation)
-
-    def only(self, row: int) -> Placed:
-        """Return one of them, still with a first axis."""
-        return Placed(self.rotation[row : row + 1], self.translation[row : row + 1])
+def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diagnosis:
+    """Compare the cameras of the rig with each other; ``related`` gives the relations in motion, should it matter."""
+    outcome = Diagnosis()
+    for camera in range(1, min(len(tracks.cameras.model), 1 + _MAX_CAMERAS)):
+        relation = of_cameras(tracks, camera)
+        if relation is None:
+            shared = sum(len(tracks.match((k, 0), (k, camera))[0]) for k in spread(len(tracks), _KEYFRAMES))
+            if shared:
+                outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
+            continue
+        found = _check_camera(tracks, camera, relation, related)
+        if (best := max(row.share for row in found.rows)) < _CONTRADICT and _agree_alone(tracks, camera):
+            found = Diagnosis([_ids_differ(camera, best)], rows=found.rows)
+        unclear = relation.share < AGREED and found.rows[0].share > _CLEAR * relation.share
+        why = "too many outliers" if unclear else "too few keyframes"
+        if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
+            found = Diagnosis(untold=[f"{why} to measure how camera {camera} is off its place"], rows=found.rows)
+        outcome.add(found)
+    return outcome
 
 
-@dataclass(frozen=True)
-class SetUp:
-    """Where everything is: cameras on the body (n_cam), and the body in the fixed frame (n_kf)."""
-
-    cameras: Placed
-    poses: Placed
-
-    def between_cameras(self, a: int, b: int) -> Pose:
-        """Return camera b from camera a."""
-        step = self.cameras.only(b).inverse().after(self.cameras.only(a))
-        return Pose(step.rotation[0], step.translation[0])
-
-    def between_images(self, a: Image, b: Image) -> Pose:
-        """Return image b from image a, both (keyframe, camera)."""
-        (key_a, cam_a), (key_b, cam_b) = a, b
-        from_a = self.poses.only(key_a).after(self.cameras.only(cam_a))
-        step = self.poses.only(key_b).after(self.cameras.only(cam_b)).inverse().after(from_a)
-        return Pose(step.rotation[0], step.translation[0])
-
-
-@dataclass(frozen=True)
-class Mistake:
-    """A way to give a set-up wrongly."""
-
-    name: str  # as a user would say it; ``{camera}`` is the camera in question
-    change: str  # the field or parameter to change
-    undo: Callable[[SetUp, int], SetUp]  # from the set-up as given to the one that was meant; for cameras: of which one
-
-
-def as_given(tracks: Tracks) -> SetUp:
-    """Return the set-up as it was given."""
-    cameras = Placed(tracks.cameras.rotation, tracks.cameras.translation).inverse()
-    return SetUp(cameras, Placed(tracks.rotation, tracks.position))
-
-
-def _reversed(given: SetUp, camera: int) -> SetUp:
-    """Put a camera on the other side of camera 0."""
-    position = given.cameras.translation.copy()
-    position[camera] = 2.0 * position[0] - position[camera]
-    return SetUp(Placed(given.cameras.rotation, position), given.poses)
+def _check_camera(tracks: Tracks, camera: int, relation: Relation, related: Callable[[], list[Relation]]) -> Diagnosis:
+    test, now = f"camera {camera} against camera 0", tracks.between_cameras(0, camera)
+    rows = [_row(test, "as given", relation, now), _row(test, "free", relation, relation.pose)]
+    if not np.linalg.norm(now.translation) > 0.0:
+        return _same_place(camera, relation, rows)
+    if rows[0].share >= max(_FITS * rows[1].share, _CONTRADICT):
+        return Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
+    others = {one: one.undo(tracks, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS}
+    # Where points are far, consensus finds one of many relations; a usual mistake may be the way to a better one.
+    near = (relation.at(two_view.refined(relation.pair, pose)) for pose in others.values())
+    relation = max((relation, *near), key=lambda one: one.share)
+    rows = [_row(test, "as given", relation, now), _row(test, "free", relation, relation.pose)]
+    if relation.share < _CONTRADICT:
+        return Diagnosis(untold=[f"the tracks of cameras 0 and {camera} contradict each other"], rows=rows)
+    tried: dict[Mistake | Flip, Row] = {
+        one: _row(test, one.name.format(camera=camera), relation, pose) for one, pose in others.items()
+    }
+    for flip in FLIPS:
+        seen = of_cameras(flip.undo(tracks), camera)
+        if seen is not None and not contradicts(tracks, related(), flip):
+            tried[flip] = _row(test, flip.name, seen, now)
+    rows += tried.values()
+    best = max(one.share for one in tried.values())
+    named = [
+        mistake
+        for mistake, one in tried.items()
+        if one.share >= max(0.97 * best, _NAMED * rows[1].share)
+        and one.rotation_deg < _TURNED_DEG
+        and not one.direction_deg > rows[0].direction_deg
+        and (isinstance(mistake, Flip) or _differ(now, others[mistake]))
+    ]
+    if not named:
+        return _misfit(camera, relation, now, rows)
+    evidence = (
+        f"of the tracks of cameras 0 and {camera}, {rows[0].share:.0%} meet in front as given,"
+        f" {best:.0%} with that undone"
+    )
+    return Diagnosis([finding(named, evidence, camera)], rows=rows)
 
 
-def _swapped(given: SetUp, camera: int) -> SetUp:
-    order = np.arange(len(given.cameras.rotation))
-    order[[0, camera]] = camera, 0
-    return SetUp(Placed(given.cameras.rotation[order], given.cameras.translation[order]), given.poses)
+def _row(test: str, name: str, relation: Relation, pose: Pose) -> Row:
+    """Return how well a pose explains the rays of a relation, and how far it is off that."""
+    off = pose.direction_from(relation.pose) if relation.has_direction else float("nan")
+    return Row(test, name, two_view.share(relation.pair, pose), pose.turned_from(relation.pose), off)
 
 
-def _rotation_only(given: SetUp, camera: int) -> SetUp:
-    """Turn one camera about, which is what an inverse of its rotation alone does."""
-    rotation = given.cameras.rotation.copy()
-    rotation[camera] = rotation[camera].T
-    return SetUp(Placed(rotation, given.cameras.translation), given.poses)
+def _agree_alone(tracks: Tracks, camera: int) -> bool:
+    """Return True if the tracks of each of two cameras agree with those of its next images."""
+    found = []
+    for own in (0, camera):
+        for k in spread(len(tracks) - 1, _PAIRS_NEEDED):
+            a, b = (int(k), own), (int(k) + 1, own)
+            found.append(relate(tracks, a, b, tracks.match(a, b)))
+    return len(found) >= 2 * _PAIRS_NEEDED and all(one is not None and one.share > AGREED for one in found)
 
 
-def _one_inverted(given: SetUp, camera: int) -> SetUp:
-    rotation, translation = given.cameras.rotation.copy(), given.cameras.translation.copy()
-    rotation[camera], translation[camera] = geometry.inverse(rotation[camera], translation[camera])
-    return SetUp(Placed(rotation, translation), given.poses)
+def _ids_differ(camera: int, share: float) -> Finding:
+    cause = f"track ids of cameras 0 and {camera} do not name the same points"
+    evidence = f"{share:.0%} of those that both see agree, although the tracks of each camera alone do"
+    change = f"track_id in the feature_tracks of camera {camera}: one id for one point, whichever camera sees it"
+    return Finding((cause,), evidence, (change,), usual=True)
 
 
-def _w_first(placed: Placed) -> Placed:
-    """Read quaternions that were written w x y z into the fields x y z w."""
-    written = geometry.quaternion_from_matrix(placed.rotation)
-    return Placed(geometry.matrix_from_quaternion(written[:, [1, 2, 3, 0]]), placed.translation)
+def _same_place(camera: int, relation: Relation, rows: list[Row]) -> Diagnosis:
+    """Tell of two cameras that are given at one place; where points are far that may be as well."""
+    if not relation.has_direction or rows[1].share < AGREED:
+        return Diagnosis(
+            untold=[f"too little parallax between cameras 0 and {camera} to tell how they stand"], rows=rows
+        )
+    cause = f"baseline of camera {camera} missing: it is given at the same place as camera 0"
+    evidence = f"{rows[1].share:.0%} of the tracks of cameras 0 and {camera} meet if they are apart"
+    change = f"the position in body_from_camera of camera {camera} in camera_rig (or tf_static)"
+    return Diagnosis([Finding((cause,), evidence, (change,), usual=True)], rows=rows)
 
 
-def _cameras(change: Callable[[Placed], Placed]) -> Callable[[SetUp, int], SetUp]:
-    return lambda given, _: SetUp(change(given.cameras), given.poses)
+def _differ(one: Pose, other: Pose) -> bool:
+    """Return True if two poses are so far apart that the one cannot stand for a small error in the other."""
+    return max(one.turned_from(other), float(np.nan_to_num(one.direction_from(other)))) > _SAME_DEG
 
 
-def _poses(change: Callable[[Placed], Placed]) -> Callable[[SetUp, int], SetUp]:
-    return lambda given, _: SetUp(given.cameras, change(given.poses))
-
-
-def _of_camera(given: Placed) -> Placed:
-    return given.only(0).inverse().after(given)
-
-
-_INVERTED = Mistake(
-    "extrinsics inverted: body_from_camera holds camera-from-body", _EXTRINSICS, _cameras(Placed.inverse)
-)
-_AXES = (
-    Mistake(
-        "optical and body axes confused: body_from_camera is that of a frame that looks along x",
-        f"{_EXTRINSICS}: give the pose of the optical frame (z forward)",
-        _cameras(lambda placed: placed.turned(_OPTICAL)),
-    ),
-    Mistake(
-        "optical and body axes confused: body_from_camera turns into the optical frame twice",
-        f"{_EXTRINSICS}: give the pose of the optical frame (z forward) once",
-        _cameras(lambda placed: placed.turned(_OPTICAL.T)),
-    ),
-)
-# Mistakes that show between two cameras of a keyframe.
-BETWEEN_CAMERAS = (
-    Mistake(
-        "baseline of camera {camera} reversed: the tracks see it on the other side of camera 0",
-        f"the position in {_ONE}",
-        _reversed,
-    ),
-    Mistake(
-        "cameras 0 and {camera} swapped",
-        "camera_index in the feature_tracks, or the order of the cameras in camera_rig",
-        _swapped,
-    ),
-    _INVERTED,
-    Mistake(
-        "extrinsics of camera {camera} inverted: body_from_camera holds camera-from-body",
-        _ONE,
-        _one_inverted,
-    ),
-    Mistake(
-        "rotation of camera {camera} inverted: body_from_camera holds the rotation of camera-from-body",
-        f"the orientation in {_ONE}",
-        _rotation_only,
-    ),
-    *_AXES,
-    Mistake("quaternions of body_from_camera with w first", _EXTRINSICS, _cameras(_w_first)),
-)
-# Mistakes that show as a camera moves.
-IN_MOTION = (
-    Mistake(
-        "poses inverted: they hold body-from-world, expected world-from-body",
-        f"{_POSES}: send the inverse",
-        _poses(Placed.inverse),
-    ),
-    Mistake(
-        "poses are of the camera, given as of the body",
-        "frames.poses_of = camera",
-        _cameras(_of_camera),
-    ),
-    Mistake(
-        "poses inverted and of the camera: they hold camera-from-world, expected world-from-body",
-        f"{_POSES}: send the inverse, and set frames.poses_of = camera",
-        lambda given, _: SetUp(_of_camera(given.cameras), given.poses.inverse()),
-    ),
-    _INVERTED,
-    *_AXES,
-    Mistake(
-        "optical and body axes confused: the poses are of a body whose z looks forward",
-        f"{_POSES}: send them of a body with x forward, or give {_EXTRINSICS} to that body",
-        _poses(lambda placed: placed.turned(_OPTICAL.T)),
-    ),
-    Mistake(
-        "optical and body axes confused: the poses are of a body whose x looks forward, the rig is of one whose z does",
-        f"{_POSES}, or {_EXTRINSICS}",
-        _poses(lambda placed: placed.turned(_OPTICAL)),
-    ),
-    Mistake(
-        "positions of body_from_camera in millimetres",
-        f"{_EXTRINSICS}, expected metres",
-        _cameras(lambda placed: Placed(placed.rotation, 0.001 * placed.translation)),
-    ),
-    Mistake(
-        "positions of body_from_camera in centimetres",
-        f"{_EXTRINSICS}, expected metres",
-        _cameras(lambda placed: Placed(placed.rotation, 0.01 * placed.translation)),
-    ),
-    Mistake("quaternions of the poses with w first", _POSES, _poses(_w_first)),
-    Mistake("quaternions of body_from_camera with w first", _EXTRINSICS, _cameras(_w_first)),
-)
+def _misfit(camera: int, relation: Relation, given: Pose, rows: list[Row]) -> Diagnosis:
+    """Tell of a camera that is a little off its place, or whose own intrinsics are wrong: the rig fits with others."""
+    row, other = rows[0], Diagnosis(rows=rows)
+    change = f"body_from_camera of camera {camera} in camera_rig (or tf_static)"
+    info = f"k in the camera_info of camera {camera}"
+    tried = {factor: two_view.share(relation.pair.zoomed(factor), given) for factor in _ZOOMS}
+    factor = max(tried, key=lambda one: tried[one])
+    if tried[factor] >= max(_NAMED * relation.share, 1.1 * row.share):
+        cause = f"focal length of camera {camera} off by a factor of about {factor:.2g} against that of camera 0"
+        rows.append(Row(row.test, cause, tried[factor]))
+        other.findings.append(Finding((cause,), f"{row.share:.0%} of the tracks meet as given", (info,)))
+        return other
+    # A rotation alone is measured far better than together with the direction of the baseline.
+    turned = two_view.refined(relation.pair, given, free=3)
+    relation = relation if two_view.share(relation.pair, turned) < _NAMED * relation.share else relation.at(turned)
+    row = dataclasses.replace(row, rotation_deg=given.turned_from(relation.pose))
+    what = f"by about {angle(row.rotation_deg)}"
+    if row.rotation_deg < _MISFIT_DEG:
+        by = f", by about {row.direction_deg:.0f} degrees" if np.isfinite(row.direction_deg) else ""
+        what = f"in the direction from camera 0{by}"
+    causes, changes = [f"camera {camera} does not fit its place on the body {what}"], [change]
+    turn = geometry.so3_log(relation.pose.rotation @ given.rotation.T)
+    shifted = relation.pair.shifted(np.array([turn[1], -turn[0]]))
+    if two_view.share(shifted, given) >= _NAMED * relation.share:
+        causes.append(f"principal point of camera {camera} off by as much")
+        changes.append(info)
+    evidence = (
+        f"of the tracks of cameras 0 and {camera}, {row.share:.0%} meet as given,"
+        f" {relation.share:.0%} where they see it"
+    )
+    other.findings.append(Finding(tuple(causes), evidence, tuple(changes)))
+    return other

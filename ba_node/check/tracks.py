@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ba_node.arrays import FloatArray, IntArray
+from ba_node.check.two_view import Pose
 from ba_node.core import cameras as camera_models
 from ba_node.core.problem import Cameras
 from ba_node.scene.scene import Scene
@@ -72,12 +73,29 @@ class Tracks:
         """Return the length of a pixel in the rays of some rows."""
         return float(np.median(1.0 / _focal(self.cameras)[self.camera[rows]])) if len(rows) else 0.0
 
-    def with_params(self, params: FloatArray) -> Tracks:
-        """Return the same pixels seen through cameras with other intrinsics, (n_cam, 12)."""
-        cameras = dataclasses.replace(self.cameras, params=params)
-        ray = _rays(cameras, self.camera, self.uv)
+    def seen(self, uv: FloatArray | None = None, params: FloatArray | None = None) -> Tracks:
+        """Return the same with other pixels (n_obs, 2), or seen through cameras with other intrinsics (n_cam, 12)."""
+        cameras = self.cameras if params is None else dataclasses.replace(self.cameras, params=params)
+        uv = self.uv if uv is None else uv
+        ray = _rays(cameras, self.camera, uv)
         images = _images(self.keyframe, self.camera, self.track, ray)
-        return dataclasses.replace(self, cameras=cameras, ray=ray, images=images)
+        return dataclasses.replace(self, cameras=cameras, uv=uv, ray=ray, images=images)
+
+    def between_cameras(self, a: int, b: int) -> Pose:
+        """Return camera b from camera a, as given."""
+        rig = self.cameras
+        rotation = rig.rotation[b] @ rig.rotation[a].T
+        return Pose(rotation, rig.translation[b] - rotation @ rig.translation[a])
+
+    def between_images(self, a: Image, b: Image) -> Pose:
+        """Return image b from image a, as given."""
+        (rotation_a, at_a), (rotation_b, at_b) = (self._world_from(image) for image in (a, b))
+        return Pose(rotation_b.T @ rotation_a, rotation_b.T @ (at_a - at_b))
+
+    def _world_from(self, image: Image) -> tuple[FloatArray, FloatArray]:
+        keyframe, camera = image
+        rotation = self.rotation[keyframe] @ self.cameras.rotation[camera].T
+        return rotation, self.position[keyframe] - rotation @ self.cameras.translation[camera]
 
 
 def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:

@@ -11,8 +11,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
-from ba_node.check.placement import as_given
-from ba_node.check.relations import Relation, agreed, rays
+from ba_node.check.relations import Relation, agreed, in_motion, rays
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 
@@ -49,6 +48,9 @@ _STEPS = "the position in the keyframes, expected metres"
 # Image coordinates no larger than this are no pixels, where the focal length is at least this.
 _NO_PIXEL = 3.0
 _FOCAL = 30.0
+# Values of sigma_px that are not looked at; the factor by which others are wrong, and the least noise of tracks, px.
+_USUAL_SIGMA_PX = (0.05, 5.0)
+_SIGMA_FACTOR, _LEAST_NOISE_PX = 8.0, 0.01
 # Sensible distances between keyframes, s; and units that stamps may have been taken for.
 _SPACING_S = (5e-4, 600.0)
 _STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
@@ -64,6 +66,25 @@ def check_pixels(tracks: Tracks) -> Diagnosis:
     cause = f"image coordinates are not in pixels: nearly all of them are below {reach:.2g}"
     change = "u and v in the feature_tracks, expected pixels of the image, not normalised coordinates"
     return Diagnosis([Finding((cause,), f"the focal length is {focal:.0f} px", (change,), usual=True)])
+
+
+def check_sigma(tracks: Tracks) -> Diagnosis:
+    """Compare sigma_px, where it is an unusual one, with how far tracks are off what is best for two images."""
+    told = float(np.median(tracks.sigma_px))
+    if _USUAL_SIGMA_PX[0] <= told <= _USUAL_SIGMA_PX[1]:
+        return Diagnosis()
+    # With a gate of its own, which the sigma that came does not widen.
+    pairs = in_motion(dataclasses.replace(tracks, sigma_px=np.ones_like(tracks.sigma_px)))
+    if len(pairs) < _PAIRS:
+        return Diagnosis(untold=["too few tracks to judge sigma_px"])
+    focal = float(np.median(tracks.cameras.params[:, 0]))
+    found = [np.median(np.abs(two_view.residuals(one.pair, one.pose))) for one in pairs]
+    noise = 1.48 * focal * float(np.median(found))
+    if not 1.0 / _SIGMA_FACTOR < told / max(noise, _LEAST_NOISE_PX) < _SIGMA_FACTOR:
+        cause = f"sigma_px is {told:.2g} px, the tracks scatter by about {noise:.2g} px"
+        change = "sigma_px in the feature_tracks: the standard deviation of u and of v, px"
+        return Diagnosis([Finding((cause,), f"over {len(pairs)} pairs of keyframes", (change,), harmful=False)])
+    return Diagnosis(sound=["sigma_px fits the tracks"])
 
 
 def check_stamps(tracks: Tracks) -> Diagnosis:
@@ -147,11 +168,11 @@ def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: boo
 
     Where it is not known that ``intrinsics_fit``, a mistake needs more pairs of images, as it may be theirs.
     """
-    outcome, given = Diagnosis(), as_given(tracks)
-    if len(given.cameras.rotation) > 1 and len(tracks) < _KEYFRAMES:
+    outcome, n_cam = Diagnosis(), len(tracks.cameras.model)
+    if n_cam > 1 and len(tracks) < _KEYFRAMES:
         return Diagnosis(untold=["too few keyframes to compare a baseline with steps"])
-    for camera in range(1, min(len(given.cameras.rotation), 3)):
-        baseline = given.between_cameras(0, camera)
+    for camera in range(1, min(n_cam, 3)):
+        baseline = tracks.between_cameras(0, camera)
         keyframes = sorted({one.b[0] for one in relations if one.b[1] == 0})
         if not any(len(tracks.match((k, 0), (k, camera))[0]) for k in keyframes):
             continue
@@ -245,9 +266,9 @@ def _scale_of_steps(factor: float) -> str:
 
 def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """Return given depths and those of the front-end's steps, m, for each pair of images with enough of them."""
-    given, found = as_given(tracks), []
+    found = []
     for one in relations:
-        length = float(np.linalg.norm(given.between_images(one.a, one.b).translation))
+        length = float(np.linalg.norm(tracks.between_images(one.a, one.b).translation))
         if not one.has_direction or length <= 0.0:
             continue
         _, in_b, parallax = two_view.depths(one.pair, Pose(one.pose.rotation, one.pose.translation * length))

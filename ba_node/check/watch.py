@@ -19,10 +19,10 @@ from ba_node.check.tracks import tracks_of
 from ba_node.scene.scene import Scene
 
 # Keyframes at which a session is checked. A robot may stand for long before there is anything to tell.
-_AT = (3, 6, 10, 15, 25, 40, 60, 90, 130, 200, 300, 450, 700, 1000)
-# Poses that fit on a straight way, or seem to over a few keyframes, are looked at once more here.
-_AGAIN = (15, 40)
-_POSES = frozenset({"poses"})
+_AT = (3, 6, 10, 15, 25, 40, 60, 90, 150, 250, 500, 1000)
+# What fits on a straight way, or seems to over a few keyframes, is looked at once more here.
+_AGAIN = (15, 40, 90)
+_ONCE = frozenset({"pixels", "stamps"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
 # The newest of them are looked at.
@@ -63,7 +63,7 @@ class SetUpWatch:
         if not (self._reason or self._busy or self._next >= len(_AT) or count < _AT[self._next]):
             again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
-            self._check(scene, self._told - _POSES if again else self._told)
+            self._check(scene, self._told & _ONCE if again else self._told)
         return self._reason
 
     def reason(self, scene: Scene) -> str:

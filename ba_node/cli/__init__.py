@@ -4,6 +4,8 @@
 
 from ba_node.cli import interrupts
 
-if interrupts.is_program():
+if interrupts.is_worker():
+    interrupts.leave_to_parent()
+elif interrupts.is_program():
     # Before the imports that take time, in which somebody may interrupt.
     interrupts.begin()

@@ -158,6 +158,21 @@ def add_fleet_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_search_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of commands that try parameters on many recordings."""
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    parser.add_argument(
+        "--objective",
+        choices=("auto", "truth", "held_out"),
+        default="auto",
+        help="what the error is: of the trajectory, of tracks held out, or (auto) the former where there is a truth",
+    )
+    parser.add_argument("--each", action="store_true", help="every RECORDING is one by itself, whatever it is called")
+    add_fleet_options(parser)
+    add_topic_options(parser)
+    add_parameter_options(parser)
+
+
 def say_left_out(left_out: Mapping[str, str]) -> int:
     """Name the recordings that could not be used, and why; return the exit code."""
     for name, words in left_out.items():

@@ -31,6 +31,16 @@ def is_program() -> bool:
     return os.path.basename(sys.argv[0]) == "ba" or (sys.argv[0] == "-m" and _PROGRAM in sys.orig_argv)  # noqa: PTH119
 
 
+def is_worker() -> bool:
+    """Return True in a process that ``ba`` has started for a part of its work, in which it is imported again."""
+    return "--multiprocessing-fork" in sys.orig_argv
+
+
+def leave_to_parent() -> None:
+    """Have Ctrl-C in a terminal, which reaches all processes, end that which began them, and they with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def begin() -> None:
     """Take the signals over, until the process ends."""
     global _begun  # noqa: PLW0603  # signals are those of the whole process, too

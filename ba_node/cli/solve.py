@@ -144,7 +144,7 @@ def _start_ranks(args: argparse.Namespace) -> int:
     if code not in (0, NOTHING, ATTENTION):
         hint = (
             f": go on from {args.checkpoint} with --resume"
-            if args.checkpoint
+            if args.checkpoint and args.checkpoint.is_file()
             else "; --checkpoint FILE keeps what was done"
         )
         print(f"ba: error: a rank ended with code {code}, and all with it{hint}", file=sys.stderr)

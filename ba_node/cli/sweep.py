@@ -9,12 +9,9 @@ Writes into DIR: sweep.csv, sweep.json, and index.html.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from ba_node.cli.console import (
-    add_fleet_options,
-    add_parameter_options,
-    add_topic_options,
+    add_search_options,
     parameters,
     progress_bar,
     say_left_out,
@@ -30,17 +27,10 @@ EXAMPLE = "ba sweep bags/*.mcap --out out/sweep --values window.max_keyframes=5,
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", nargs="+", metavar="RECORDING", help="files, folders or URLs")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument(
         "--values", action="append", required=True, metavar="NAME=A,B,C", help="values of a parameter; repeatable"
     )
-    parser.add_argument(
-        "--objective", choices=("auto", "truth", "held_out"), default="auto", help="what the error is, as in ba tune"
-    )
-    parser.add_argument("--each", action="store_true", help="every RECORDING is one by itself, whatever it is called")
-    add_fleet_options(parser)
-    add_topic_options(parser)
-    add_parameter_options(parser)
+    add_search_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -25,9 +25,7 @@ from typing import TYPE_CHECKING
 
 from ba_node.cli.console import (
     TargetError,
-    add_fleet_options,
-    add_parameter_options,
-    add_topic_options,
+    add_search_options,
     parameters,
     progress_bar,
     require_folder,
@@ -49,7 +47,6 @@ ATTENTION = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", nargs="*", metavar="RECORDING", help="files, folders or URLs")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--parameters",
@@ -65,22 +62,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("accuracy", "latency"),
         help="what is lowered (default: as --preset): error, or time of a solve",
     )
-    parser.add_argument(
-        "--objective",
-        choices=("auto", "truth", "held_out"),
-        default="auto",
-        help="what the error is: of the trajectory, of tracks held out, or (auto) the former where there is a truth",
-    )
     parser.add_argument("--max-latency-ms", type=float, metavar="MS", help="limit on p95 of the time of a solve")
     parser.add_argument("--validate", metavar="RECORDING", help="the one for validation (default: the last of several)")
     parser.add_argument("--trials", type=int, default=50, metavar="N", help="trials in all (default: 50)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the search (default: 1)")
     parser.add_argument("--storage", type=Path, metavar="FILE", help="where trials are kept (default: DIR/trials.log)")
-    parser.add_argument("--each", action="store_true", help="every RECORDING is one by itself, whatever it is called")
     parser.add_argument("--apply", metavar="NODE", help="set the parameters found on a running node, e.g. /ba_node")
-    add_fleet_options(parser)
-    add_topic_options(parser)
-    add_parameter_options(parser)
+    add_search_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:

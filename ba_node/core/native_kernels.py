@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
 from ba_node.core.factors import FactorSum, FactorTerms, RelativePoses
@@ -170,6 +170,8 @@ class NativeSystem:
         self.product = kernel.product
         # These are written in every iteration; S only where it is asked for.
         self._x, self._dense = np.empty(n), np.empty((0, 0))
+        # S, and where its blocks on and above the diagonal go, where their transposes, and of which blocks.
+        self._sparse: tuple[scipy.sparse.bsr_matrix, IntArray, IntArray, IntArray] | None = None
 
     def renew(self) -> NativeSystem:
         """Return the system after another reduction."""
@@ -189,15 +191,22 @@ class NativeSystem:
         return self._x if self._kernel.solve(self._x) else None
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
-        """Return S, block-sparse."""
+        """Return S, block-sparse; the next call writes over it."""
         blocks, columns, starts = self._kernel.sparse()
-        n, rows = len(self.rhs), np.repeat(np.arange(self._kernel.n_free), np.diff(starts))
-        above = rows != columns
-        both = np.concatenate([rows, columns[above]]), np.concatenate([columns, rows[above]])
-        order = np.lexsort(both[::-1])
-        blocks = np.concatenate([blocks, np.swapaxes(blocks[above], 1, 2)])[order]
-        starts = np.searchsorted(both[0][order], np.arange(self._kernel.n_free + 1))
-        return scipy.sparse.bsr_matrix((blocks, both[1][order], starts), shape=(n, n))
+        if self._sparse is None:
+            n, rows = len(self.rhs), np.repeat(np.arange(self._kernel.n_free), np.diff(starts))
+            above = np.flatnonzero(rows != columns)
+            all_rows, all_columns = np.concatenate([rows, columns[above]]), np.concatenate([columns, rows[above]])
+            order = np.lexsort((all_columns, all_rows))
+            place = np.argsort(order)
+            ends = np.searchsorted(all_rows[order], np.arange(self._kernel.n_free + 1))
+            data = np.empty((len(order), self._size, self._size))
+            matrix = scipy.sparse.bsr_matrix((data, all_columns[order], ends), shape=(n, n))
+            self._sparse = matrix, place[: len(rows)], place[len(rows) :], above
+        matrix, place, mirrored, above = self._sparse
+        matrix.data[place] = blocks
+        matrix.data[mirrored] = np.swapaxes(blocks[above], 1, 2)
+        return matrix
 
     def sizes(self) -> Sizes:
         """Return what each linear solver would have to do."""

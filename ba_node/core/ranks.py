@@ -46,11 +46,11 @@ def deal(problem: Problem, rank: int, size: int) -> tuple[Problem, slice]:
     rows = slice(*np.searchsorted(obs.point, [points.start, points.stop]).tolist())
 
     def part(array: FloatArray | IntArray) -> Any:
-        return array[rows] if len(array) else array
+        return array[rows].copy() if len(array) else array  # so that the whole need not stay
 
     own = {field.name: part(getattr(obs, field.name)) for field in dataclasses.fields(obs)}
     own["point"] = own["point"] - points.start
-    start = dataclasses.replace(problem.start, points=problem.start.points[points])
+    start = dataclasses.replace(problem.start, points=problem.start.points[points].copy())
     changes: dict[str, Any] = {"start": start, "observations": dataclasses.replace(obs, **own)}
     if rank:
         changes["factors"] = ()

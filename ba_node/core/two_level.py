@@ -42,6 +42,7 @@ class TwoLevel:
         self.state: State  # at which the system was linearised
         self._free = free
         self._communicator = communicator or Alone()
+        self._key: IntArray = np.empty(0, np.intp)  # places of the blocks of W, of all ranks
         self._label: IntArray | None = None  # (n_free,) cluster of each free keyframe
 
     def solve(
@@ -82,7 +83,7 @@ class TwoLevel:
         """Return ``r -> M^-1 r`` of the system that is not scaled."""
         inside = _Inside(s, label, self._communicator)
         p = self._coarse_space(label, s.blocksize[0])
-        w = total(self._communicator, (s @ p).tobsr(blocksize=p.blocksize))
+        w = self._sum((s @ p).tobsr(blocksize=p.blocksize))
         p_t, w_t = p.T.tobsr(), w.T.tobsr()
         coarse = scipy.sparse.csc_matrix(p_t @ w)
         diagonal = coarse.diagonal()
@@ -101,6 +102,20 @@ class TwoLevel:
 
         return apply
 
+    def _sum(self, w: scipy.sparse.bsr_matrix) -> scipy.sparse.bsr_matrix:
+        """Return the sum over ranks, whose blocks are put where those of all ranks were seen before."""
+        if self._communicator.size == 1:
+            return w
+        (n, d), (count, q) = ((size // of, of) for size, of in zip(w.shape, w.blocksize, strict=True))
+        key = np.repeat(np.arange(n), np.diff(w.indptr)) * count + w.indices
+        if self._communicator.sum(np.array([len(np.setdiff1d(key, self._key))], dtype=float))[0]:
+            keys = self._communicator.gather(np.union1d(key, self._key))
+            self._key = self._communicator.broadcast(None if keys is None else np.unique(np.concatenate(keys)))
+        data = np.zeros((len(self._key), d, q))
+        data[np.searchsorted(self._key, key)] = w.data
+        starts = np.searchsorted(self._key, np.arange(n + 1) * count)
+        return scipy.sparse.bsr_matrix((self._communicator.sum(data), self._key % count, starts), shape=w.shape)
+
     def _coarse_space(self, label: IntArray, d: int) -> scipy.sparse.bsr_matrix:
         """Return P, (n_free d, n_clusters (d + 1)): all unknowns of a cluster alike, and its growth."""
         rotation, translation = self.state.rotation[self._free], self.state.translation[self._free]
@@ -115,15 +130,17 @@ class TwoLevel:
 
 
 class _Inside:
-    """The inverses of the blocks of S inside clusters, in single precision: M need not be exact."""
+    """The inverses of the blocks of S inside clusters, in single precision: M need not be exact.
+
+    Every rank has those of a share of the clusters.
+    """
 
     def __init__(self, s: scipy.sparse.bsr_matrix, label: IntArray, communicator: Communicator) -> None:
+        self._communicator = communicator
         n, (d, _) = len(label), s.blocksize
         row = np.repeat(np.arange(n), np.diff(s.indptr))
         kept = np.flatnonzero(label[row] == label[s.indices])
-        starts = np.concatenate([[0], np.cumsum(np.bincount(row[kept], minlength=n))])
-        k = total(communicator, scipy.sparse.bsr_matrix((s.data[kept], s.indices[kept], starts), shape=s.shape))
-        row = np.repeat(np.arange(n), np.diff(k.indptr))
+        row, column = row[kept], s.indices[kept]
         # Clusters as rows of a table of keyframes; what is left of a row stands for keyframe n, which is nowhere.
         order = np.argsort(label, kind="stable")
         size = np.bincount(label)
@@ -132,14 +149,16 @@ class _Inside:
         most = int(size.max())
         self._keyframe = np.full((len(size), most), n)
         self._keyframe[label, place] = np.arange(n)
-        self._label, self._place, self._d = label, place, d
+        share = slice(*(len(size) * i // communicator.size for i in (communicator.rank, communicator.rank + 1)))
         matrices = np.zeros((len(size), most, d, most, d))
-        matrices[label[row], place[row], :, place[k.indices], :] = k.data
-        matrices = matrices.reshape(len(size), most * d, most * d)
+        matrices[label[row], place[row], :, place[column], :] = s.data[kept]
+        matrices = communicator.sum(matrices)[share].reshape(-1, most * d, most * d)
+        self._keyframe, self._d = self._keyframe[share], d
         diagonal = np.arange(most * d)
-        own = matrices[:, diagonal, diagonal]
-        matrices[:, diagonal, diagonal] = np.where(own > 0.0, own, 1.0)
-        unit = 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0))
+        squares = matrices[:, diagonal, diagonal]
+        squares = np.where(squares > 0.0, squares, 1.0)
+        matrices[:, diagonal, diagonal] = squares
+        unit = 1.0 / np.sqrt(squares)
         inverses = blocks.positive_inverses(matrices * unit[:, :, None] * unit[:, None, :])
         self._inverses = (0.5 * (inverses + np.swapaxes(inverses, 1, 2))).astype(np.float32)
         self._unit = unit[:, :, None]
@@ -149,7 +168,9 @@ class _Inside:
         padded = np.concatenate([r.reshape(-1, self._d), np.zeros((1, self._d))])
         right = self._unit * padded[self._keyframe].reshape(len(self._inverses), -1, 1)
         solved = self._unit * (self._inverses @ right.astype(np.float32))
-        return np.asarray(solved.reshape(*self._keyframe.shape, self._d)[self._label, self._place].ravel())
+        padded[:] = 0.0
+        padded[self._keyframe] = solved.reshape(*self._keyframe.shape, self._d)
+        return self._communicator.sum(padded[:-1].ravel())
 
 
 def cluster(row: IntArray, column: IntArray, strength: FloatArray, n: int, most: int) -> IntArray:

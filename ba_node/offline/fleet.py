@@ -9,6 +9,7 @@ worker that dies costs the time of what it was doing, which another one begins a
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, as_completed
@@ -22,6 +23,8 @@ from ba_node import __version__
 _TRIES = 3
 _CONNECT_S = 15
 _LIBRARY = "several processes and clusters need dask.distributed: pip install ba_node[fleet]"
+# An interrupt ends the process at once, and leaves its semaphores to their tracker, which need not speak of it.
+_QUIET = "ignore::UserWarning:multiprocessing.resource_tracker"
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -75,6 +78,7 @@ class Fleet:
         connect: Any = distributed.Client
         address: Any = self._scheduler
         if not self.remote:
+            os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), _QUIET]))
             address = stack.enter_context(
                 cluster(n_workers=self._jobs, threads_per_worker=1, dashboard_address=None, silence_logs=50)
             )

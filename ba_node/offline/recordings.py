@@ -102,6 +102,8 @@ def _use(reader: BagReader, facts: RecordingFacts) -> None:
     facts.inputs = seen.as_dict()
     if seen.bare:
         facts.attention.append(f"{seen.bare} of {len(seen.keyframes)} keyframes have no tracks")
+    if seen.rigs > facts.inputs["sessions"]:
+        facts.attention.append(f"{seen.rigs} camera rigs that differ: a session keeps its first, and drops the others")
     facts.attention += [f"{reason}: {count} times" for reason, count in seen.malformed.most_common(_TOLD)]
 
 
@@ -114,7 +116,9 @@ class _Seen:
         self._tracked: set[tuple[int, int]] = set()
         self._views: Counter[int] = Counter()
         self._sizes: list[int] = []
-        self._cameras = self._guesses = self._depths = 0
+        self._cameras = 0
+        self._rigs: set[bytes] = set()
+        self._guesses = self._depths = 0
 
     def add(self, measurement: Measurement) -> None:
         """Count one."""
@@ -133,6 +137,13 @@ class _Seen:
             self._guesses += len(measurement.track_id)
         elif isinstance(measurement, CameraRig):
             self._cameras = len(measurement)
+            values = (measurement.intrinsics, *measurement.distortion, measurement.position, measurement.orientation)
+            self._rigs.add(b"".join(value.tobytes() for value in values))
+
+    @property
+    def rigs(self) -> int:
+        """Return how many camera rigs there are that differ."""
+        return len(self._rigs)
 
     @property
     def bare(self) -> int:

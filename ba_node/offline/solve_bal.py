@@ -21,7 +21,6 @@ from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
 from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated, write_bal
 from ba_node.io.bundler import BundlerScene, from_bal, is_bundler, read_bundler, write_bundler
-from ba_node.offline.solver_settings import describe
 
 # Points that lie so many times their own extent from the origin are moved there: coordinates of a whole country, as UTM
 # has them, leave too few digits to the steps of a solver.
@@ -117,7 +116,7 @@ def statistics(
         },
         "method": result.method,
         "linear_solver": result.linear_solver,
-        "options": describe(options),
+        "options": dataclasses.asdict(options),
         "status": result.status.name,
         "reason": result.reason,
         "objective_before": result.objective_before,

@@ -157,7 +157,8 @@ def solve_on_ranks(
 ) -> Solution | None:
     """Read and solve a file together with other ranks; return the solution on rank 0, None on others.
 
-    Every rank reads the file and keeps its share. ``on_iteration`` and ``warn`` are called on rank 0 alone.
+    Every rank reads the file and keeps its share; rank 0 keeps the whole as well, to tell of it and to write it.
+    ``on_iteration`` and ``warn`` are called on rank 0 alone.
 
     Raises:
         BalError, BundlerError: the file cannot be read.
@@ -168,11 +169,10 @@ def solve_on_ranks(
     began = clock()
     digest = _together(communicator, lambda: hashlib.sha256(path.read_bytes()).hexdigest())
     _require_same(communicator, digest, options)
-    solution: Solution
-    solution, kernels, part = _together(
+    solution: Solution | None
+    solution, options, kernels, part = _together(
         communicator, lambda: _prepared(path, options, digest, communicator, checkpoint)
     )
-    options, problem = solution.options, solution.problem
     ready = clock()
 
     def whole(state: State) -> State | None:
@@ -193,11 +193,10 @@ def solve_on_ranks(
 
     result = solve(part, options, clock=clock, on_iteration=seen, kernels=kernels)
     state = whole(result.state)
-    if state is None:
+    if state is None or solution is None:
         return None
     return dataclasses.replace(
         solution,
-        problem=problem,
         result=dataclasses.replace(result, state=state),
         setup_s=ready - began,
         solve_s=clock() - ready,
@@ -206,8 +205,8 @@ def solve_on_ranks(
 
 def _prepared(
     path: Path, options: SolverOptions, digest: str, communicator: Communicator, checkpoint: Checkpoint | None
-) -> tuple[Solution, _Watched, Problem]:
-    """Return the file as it begins, and the kernels and the problem of this rank's part."""
+) -> tuple[Solution | None, SolverOptions, _Watched, Problem]:
+    """Return the file as it begins (rank 0), and options, kernels and problem of this rank's part."""
     solution = read(path, options)
     problem = solution.problem
     if checkpoint is not None and checkpoint.resume:
@@ -222,7 +221,8 @@ def _prepared(
     part, _ = deal(problem, communicator.rank, communicator.size)
     if not options.threads:
         options = dataclasses.replace(options, threads=max(1, len(os.sched_getaffinity(0)) // communicator.size))
-    return dataclasses.replace(solution, problem=problem, options=options), _Watched(part, options, communicator), part
+    whole = None if communicator.rank else dataclasses.replace(solution, problem=problem, options=options)
+    return whole, options, _Watched(part, options, communicator), part
 
 
 def _together(communicator: Communicator, work: Callable[[], Any]) -> Any:

@@ -56,11 +56,6 @@ def solver_options(method: str, assignments: Iterable[str]) -> SolverOptions:
     return options
 
 
-def describe(options: SolverOptions) -> dict[str, Value]:
-    """Return all options by their bare names."""
-    return dataclasses.asdict(options)
-
-
 def _require_scale(options: SolverOptions, changes: Mapping[str, Value]) -> None:
     """Refuse a robust loss without a scale for a method that has none of its own."""
     loss = changes.get("loss", "squared")

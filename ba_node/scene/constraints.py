@@ -30,6 +30,8 @@ ENU = "enu"
 _TANGENT = np.array([3, 4, 5, 0, 1, 2])
 _SYMMETRIC = 1e-6
 _STRANGE_M = 1e7
+# Variances below this, m^2 and rad^2, are a mistake: nothing is measured to 1e-12.
+_LEAST_VARIANCE = 1e-24
 # Absolute measurements that are kept, the newest: keyframes may never come.
 _MOST = 200_000
 
@@ -71,6 +73,7 @@ class Constraints:
         renamed: tracks that were joined, by the id that they had: the one that they go on under.
         steps: covariance (6, 6) of the step from the keyframe before, by id of the keyframe.
         unchecked: relative poses that the map was not compared with yet; refused: those that it cannot meet.
+        steps_precise: the front-end's steps turned out to be more precise than stated; the map is still to follow.
         adjusted_at: how many keyframes there were when the map was last bent.
         map_from_world: rotation (3, 3) and translation (3,) m; None until enough is known.
         world_frame: name of the frame that all that is absolute is in; empty before the first.
@@ -88,6 +91,7 @@ class Constraints:
         self.steps: dict[int, FloatArray] = {}
         self.unchecked: list[tuple[int, int]] = []
         self.refused: set[tuple[int, int]] = set()
+        self.steps_precise = False
         self.adjusted_at = 0
         self.map_from_world: tuple[FloatArray, FloatArray] | None = None
         self.world_frame = ""
@@ -283,16 +287,16 @@ def _pose(name: str, position: FloatArray, orientation: FloatArray, log: Rejecti
 
 
 def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
-    """Return a covariance (size, size), or None (counted) if it is not positive definite."""
+    """Return a covariance (size, size), or None (counted) if it is not positive definite, or its inverse no number."""
     if np.size(values) != size * size:
         log.reject("bad_covariance", f"{name}: {np.size(values)} numbers, expected {size * size}")
         return None
     matrix = np.asarray(values, float).reshape(size, size)
     if np.isfinite(matrix).all() and np.abs(matrix - matrix.T).max() <= _SYMMETRIC * np.abs(matrix).max():
         lowest = float(np.linalg.eigvalsh(matrix).min())
-        if lowest > 0.0:
+        if lowest > _LEAST_VARIANCE:
             return np.asarray(0.5 * (matrix + matrix.T))
-        log.reject("bad_covariance", f"{name}: lowest eigenvalue {lowest:g}, expected > 0")
+        log.reject("bad_covariance", f"{name}: lowest eigenvalue {lowest:g}, expected > {_LEAST_VARIANCE:g}")
         return None
     log.reject("bad_covariance", f"{name}: {matrix.tolist()}, expected finite and symmetric")
     return None

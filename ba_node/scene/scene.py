@@ -50,6 +50,8 @@ class Scene(MapTables):
         self.refused_rig = ""  # why the last rig that was refused was, empty if none was
         self.log = RejectionLog()  # what was turned away
         self.memory: object | None = None  # what windows know of keyframes that left them, see window/old_keyframes.py
+        # what the front-end's steps' standard deviations of rotation and translation are multiplied by, as was learned
+        self.step_shares: tuple[float, float] = (1.0, 1.0)
         self.pending: list[FeatureTracks] = []
         self.constraints = Constraints()  # what is known beside pixels
         self._reused: set[int] = set()
@@ -58,7 +60,7 @@ class Scene(MapTables):
         """Return a scene of its own with the same content but for what waits and what was turned away."""
         other = Scene(self.config, self.session_id)
         other.frame_id, other.cameras = self.frame_id, self.cameras
-        other.refused_rig = self.refused_rig
+        other.refused_rig, other.step_shares = self.refused_rig, self.step_shares
         other.keyframes, other.landmarks = self.keyframes.clone(), self.landmarks.clone()
         other.observations, other.blocks = self.observations.clone(), [list(blocks) for blocks in self.blocks]
         other._index_keyframes()

@@ -141,6 +141,9 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
         )
     found = _merged(scene, config, final) if known.merges else None
     found = found or (_measured(scene, config) if known.unchecked else None)
+    if known.steps_precise and not found:
+        known.steps_precise = False
+        found = Due("the front-end's steps are more precise than was stated")
     return found or _left_the_world(scene, config, final)
 
 

@@ -10,7 +10,8 @@ standard deviations grow with the path between them, of length l and turn a, ove
 
 They are those of good odometry. Where that of a recording is worse, keyframes that see much tell: with d the distances
 between their refined steps and the front-end's, in standard deviations of three axes, all are multiplied by
-``median(d) / 1.54`` (1.54 is that of a normal distribution), for translation and rotation apart.
+``median(d) / 1.54`` (1.54 is that of a normal distribution), for translation and rotation apart. Where it is better
+than images are, precision.py learns by what share.
 
 So images decide where they see enough. Where these see little (no tracks, no parallax, a camera that stands still or
 turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
@@ -44,7 +45,7 @@ _SMALLEST_SIGMA = 1e-9
 _MAX_GAP = 100
 # Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
 _LEAST_STEPS = 8
-_MANY_OBSERVATIONS = 50
+MANY_OBSERVATIONS = 50
 # How many times as wide as stated the loss is once they have told, and before, where all keyframes see much.
 _WIDE = 5.0
 _WIDEST = 20.0
@@ -95,10 +96,10 @@ def factors(
     free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
     if not free.any():
         return ()
-    many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= _MANY_OBSERVATIONS
+    many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= MANY_OBSERVATIONS
     stated = _front_end(scene, config, keyframes, tied)
     much_moves = much_moves and not len(problem.observations.depth_m)
-    inflated = None if much_moves else _inflated(scene, config, keyframes, many, stated)
+    inflated = None if much_moves else _as_learned(scene, config, keyframes, many, stated)
     steps = stated if inflated is None else inflated
     if turned is not None:
         rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
@@ -127,13 +128,21 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
     )
 
 
-def _inflated(
+def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> _Steps:
+    """Return the front-end's steps between keyframes of a problem that are tied, as the parameters have them."""
+    return _front_end(scene, config, keyframes, np.flatnonzero(ties(scene, config, keyframes)))
+
+
+def _as_learned(
     scene: Scene, config: OdometryConfig, keyframes: IntArray, many: BoolArray, steps: _Steps
 ) -> _Steps | None:
-    """Return steps with standard deviations as well-determined keyframes show them to be, but no smaller ones.
+    """Return steps with standard deviations as well-determined keyframes show them to be.
 
-    None where too few of these are known.
+    Smaller ones where precision.py has learned that. None where too few are known.
     """
+    shares = scene.step_shares
+    if shares != (1.0, 1.0):
+        steps = dataclasses.replace(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
     table = scene.keyframes
     sure = many & table.refined[keyframes]
     rows = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
@@ -146,7 +155,8 @@ def _inflated(
         [turned / steps.sigma_rad[rows, None], (translation - steps.translation[rows]) / steps.sigma_m[rows, None]]
     )
     worse = np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1) / _MEDIAN_NORM
-    times = np.clip(worse, 1.0, config.max_inflation)
+    # Keyframes of before they were known to be precise are worse than they.
+    times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
     return dataclasses.replace(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
 
 

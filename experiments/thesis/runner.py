@@ -19,7 +19,6 @@ from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
 from ba_node.core.solver import solve
 from ba_node.io.files import write_json
-from ba_node.offline.solver_settings import describe
 from experiments.thesis import final_state, measures
 from experiments.thesis.problems import NAMES, Library, Posed
 from experiments.thesis.tasks import Measure, Run, Task, key
@@ -101,7 +100,7 @@ class Runner:
         return {
             "method": task.method,
             "settings": list(task.settings),
-            "options": describe(options),
+            "options": dataclasses.asdict(options),
             "iterations": task.iterations,
             "status": result.status.name,
             "reason": f"took {taken} steps" if taken >= task.iterations else result.reason,

@@ -8,13 +8,14 @@ it need not be made again, and a choice that changes makes a new one.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass, replace
 
 from ba_node.config import SolverOptions, Value
 from ba_node.core.scaling import INC_STEPS
-from ba_node.offline.solver_settings import describe, solver_options
+from ba_node.offline.solver_settings import solver_options
 from experiments.thesis.problems import Library
 
 # Rises when records hold something else than before.
@@ -48,7 +49,7 @@ class Run:
         """Return all that was chosen."""
         options: dict[str, Value] = {
             _NAMES_IN_KEYS.get(k, k): v
-            for k, v in describe(self.options()).items()
+            for k, v in dataclasses.asdict(self.options()).items()
             if k not in _WITHOUT_EFFECT and _LATER.get(k) != v
         }
         content: dict[str, object] = {"run": options, "inc": INC_STEPS}

@@ -362,6 +362,6 @@ def test_stamps_within_the_bound_are_sorted(limit_s: float) -> None:
     backend = Backend(Config().with_values({"scene.max_reorder_s": limit_s}))
     replay(backend, [m for m in stream if m is not keyframes[2]] + [keyframes[2]])
     assert backend.map.index == 0
-    assert backend.notices["reordered"] == 1
+    assert backend.scene.log.notices["reordered"] == 1
     stamps = backend.scene.keyframes.stamp_ns[backend.scene.order]
     assert (np.diff(stamps) > 0).all()

@@ -126,7 +126,7 @@ def test_a_frame_without_a_name_for_tf2_is_said(frame: str, words: str) -> None:
     played = Played(changed(messages(), frame_id=frame))
     assert played.ids == all_ids()
     assert words in played.scene.log.warnings["frame_name"]
-    assert played.notices["frame_name"] == N
+    assert played.scene.log.notices["frame_name"] == N
     correction = played.estimate().correction
     assert correction is not None
     assert correction.odom_frame == "odom"

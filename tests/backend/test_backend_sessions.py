@@ -136,7 +136,7 @@ def test_a_keyframe_that_comes_late_by_less_than_the_bound_is_sorted_in() -> Non
     parts = groups()
     played = Played(joined([*parts[:4], *parts[5:9], parts[4], *parts[9:]]))
     assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
-    assert played.notices["reordered"] == 1
+    assert played.scene.log.notices["reordered"] == 1
 
 
 REPEATS: dict[str, Callable[[Keyframe], Keyframe]] = {

@@ -164,6 +164,21 @@ def _stamps(factor: float) -> Wrong:
     return go
 
 
+def _late(by: int) -> Wrong:
+    """Return what sends tracks under the id of the keyframe so many later; those at the ends are lost."""
+
+    def go(data: SyntheticData) -> SyntheticData:
+        keep = range(max(by, 0), len(data.keyframes) + min(by, 0))
+        tracks = tuple(
+            tuple(dataclasses.replace(one, keyframe_id=data.keyframes[k].keyframe_id) for one in data.tracks[k - by])
+            for k in keep
+        )
+        keyframes = tuple(data.keyframes[k] for k in keep)
+        return dataclasses.replace(data, keyframes=keyframes, tracks=tracks)
+
+    return go
+
+
 WRONG: dict[str, Wrong] = {
     "baseline reversed": rig(_reversed),
     "rig swapped": rig(lambda r, p: (r[::-1], p[::-1])),
@@ -222,6 +237,17 @@ WRONG: dict[str, Wrong] = {
     "ids of each camera": images(
         lambda one: dataclasses.replace(one, track_id=one.track_id + np.uint64(37 * one.camera_index))
     ),
+    "mirrored": images(
+        lambda one: dataclasses.replace(one, uv=np.array([639.0, 0.0]) + np.array([-1.0, 1.0]) * one.uv)
+    ),
+    "upside down": images(lambda one: dataclasses.replace(one, uv=np.array([639.0, 479.0]) - one.uv)),
+    "u and v swapped": images(lambda one: dataclasses.replace(one, uv=one.uv[:, ::-1].copy())),
+    "tracks a keyframe late": _late(1),
+    "tracks a keyframe early": _late(-1),
+    "principal point 10 px": intrinsics(lambda k: k + np.array([0.0, 0.0, 10.0, 5.0])),
+    "focal 1.05": intrinsics(lambda k: k * [1.05, 1.05, 1.0, 1.0]),
+    "sigma times 100": images(lambda one: dataclasses.replace(one, sigma_px=100.0 * one.sigma_px)),
+    "sigma over 100": images(lambda one: dataclasses.replace(one, sigma_px=0.01 * one.sigma_px)),
     "stamps in us": _stamps(1e-3),
     "stamps in ms": _stamps(1e-6),
 }

@@ -62,6 +62,18 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "slots": (("stereo", "mono"), "ids reused"),
     "ids modulo 200": (("stereo", "mono", "rgbd"), "ids reused"),
     "rows for ids": (("stereo", "mono", "rgbd"), "ids reused"),
+    "mirrored": (("stereo", "mono", "rgbd"), "images mirrored: left and right are exchanged"),
+    "upside down": (("stereo", "mono"), "images upside down"),
+    "u and v swapped": (("stereo", "mono"), "u and v swapped"),
+    "tracks a keyframe late": (("stereo", "mono"), "^tracks are sent with the keyframe_id of the keyframe after"),
+    "tracks a keyframe early": (("rgbd",), "^tracks are sent with the keyframe_id of the keyframe before"),
+    "principal point 10 px": (
+        ("stereo", "mono"),
+        r"principal point wrong: the tracks fit \((319|320|321), (239|240|241)\)",
+    ),
+    "focal 1.05": (("stereo",), r"focal length off by a factor of about 1\.0[456]"),
+    "sigma times 100": (("mono",), r"sigma_px is 50 px, the tracks scatter by about 0\.[45]\d? px"),
+    "sigma over 100": (("stereo",), r"sigma_px is 0\.005 px, the tracks scatter by about 0\.[45]\d? px"),
     "stamps in us": (("mono",), "stamps in another unit.*microseconds"),
     "stamps in ms": (("mono",), "stamps in another unit.*milliseconds"),
 }
@@ -73,7 +85,7 @@ def test_mistake_is_named(wrong: str, mode: str) -> None:
     found = examine(seen(recording(wrong=wrong, mode=mode)))
     assert re.search(NAMED[wrong][1], found.causes()), found.summary()
     assert found.harmful == (
-        wrong not in ("slots", "ids modulo 200", "rows for ids") and not wrong.startswith("stamps")
+        wrong not in ("slots", "ids modulo 200", "rows for ids") and not wrong.startswith(("stamps", "sigma"))
     )
     assert all(finding.changes for finding in found.findings)
 

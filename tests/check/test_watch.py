@@ -119,7 +119,7 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(two_view, "available", lambda: False)
     backend = Backend(Config())
     play(backend, recording(), keyframes=12)
-    assert backend.notices["setup_unchecked"] == 1
+    assert backend.scene.log.notices["setup_unchecked"] == 1
     assert "setup" not in backend.scene.log.warnings
 
 

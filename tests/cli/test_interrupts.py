@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -121,3 +122,22 @@ def test_a_full_disk_names_the_file(bag: Path, tmp_path: Path) -> None:
     run = subprocess.run(limited, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (2, f"ba: error: {out / 'refined.mcap'}: File too large\n")
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_an_interrupt_of_all_processes_is_one_line(bag: Path, tmp_path: Path) -> None:
+    """As Ctrl-C in a terminal: it reaches the workers too. Trials that are done stay."""
+    pytest.importorskip("distributed")
+    words = ["tune", str(bag), "--out", str(tmp_path), "--trials", "500", "--jobs", "2"]
+    process = subprocess.Popen(
+        ["env", "--default-signal=INT,TERM", *BA, *words],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    end = time.monotonic() + 120.0
+    while not (tmp_path / "tuned.yaml").exists() and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err.endswith("others too does not show\nba: interrupted\n"), err
+    assert (tmp_path / "tuned.yaml").is_file()

@@ -63,6 +63,14 @@ def test_info_names_gaps_and_keyframes_without_tracks(
     assert "1 of 4 keyframes have no tracks" in found["attention"]
 
 
+def test_info_names_two_rigs(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other, both = tmp_path / "other.mcap", tmp_path / "both.mcap"
+    assert main(["synth", str(other), "--baseline-m", "0", "--keyframes", "5"]) == 0
+    assert main(["merge", str(bag), str(other), "--out", str(both)]) == 3
+    found = told(both, capsys, code=3)
+    assert "2 camera rigs that differ: a session keeps its first, and drops the others" in found["attention"]
+
+
 def test_info_says_why_a_replay_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     foreign = tmp_path / "images.mcap"
     with BagWriter(foreign) as writer:

@@ -19,7 +19,7 @@ from ba_node.core.result import Result
 from ba_node.core.solver import solve
 from ba_node.io.bal import BalProblem, behind, read_bal, translated, write_bal
 from ba_node.offline import solve_bal
-from ba_node.offline.solver_settings import describe, option_names, solver_options
+from ba_node.offline.solver_settings import option_names, solver_options
 
 ROW = {
     "iteration",
@@ -85,7 +85,7 @@ def test_settings_by_bare_name_and_by_parameter() -> None:
 
 def test_every_option_can_be_set_to_its_own_value() -> None:
     for method, options in methods.METHODS.items():
-        values = describe(options)
+        values = dataclasses.asdict(options)
         assert set(option_names()) == set(values) - {"method"}
         assert solver_options(method, [f"{name}={values[name]}" for name in option_names()]) == options
 
@@ -104,7 +104,7 @@ def test_kernels_that_cannot_do_it_are_named() -> None:
 def test_without_settings_the_method_is_as_declared() -> None:
     for name in methods.METHODS:
         assert solver_options(name, []) == methods.options(name)
-        assert describe(methods.options(name))["method"] == (name if name != "auto" else "local_irls")
+        assert dataclasses.asdict(methods.options(name))["method"] == (name if name != "auto" else "local_irls")
 
 
 @pytest.mark.parametrize("loss", ["truncated_quadratic", "geman_mcclure"])
@@ -138,7 +138,10 @@ def test_a_loss_with_a_plateau_is_led_up_to_unless_that_is_not_wanted(loss: str)
         ("damping=X", "choose one of none, identity, diag, inc"),
         ("damping_policy=X", "choose one of nielsen, fast"),
         ("linear_solver=X", "choose one of auto, cholesky, dense, sparse, pcg"),
-        ("preconditioner=X", "choose one of auto, none, schur_block, b_block, schur_diag, b_diag, two_level, b_literal"),
+        (
+            "preconditioner=X",
+            "choose one of auto, none, schur_block, b_block, schur_diag, b_diag, two_level, b_literal",
+        ),
         ("parameterisation=X", "choose one of local, global"),
     ],
 )

@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import methods, native_kernels
+from ba_node.core.communicator import Alone
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.ranks import RankKernels, deal
 from ba_node.core.result import Result
 from ba_node.core.solver import solve
+from experiments.benchmarks.generators import loop
+from experiments.benchmarks.problem_file import case_problem
 from tests.core.conftest import Spec, make
 
 
@@ -30,7 +33,7 @@ def random_problem(seed: int) -> Problem:
     return make(Spec(seed=seed, keyframes=6, points=40, noise_px=0.5))[0]
 
 
-class Threads:
+class Threads(Alone):
     """Ranks that are threads of this process."""
 
     def __init__(self, rank: int, size: int, board: list[Any], barrier: threading.Barrier) -> None:
@@ -139,3 +142,23 @@ def test_what_ranks_cannot_do_is_refused() -> None:
     for changes in ({"schur": "cameras"}, {"preconditioner": "b_block"}):
         with pytest.raises(ConfigError, match="several ranks"):
             RankKernels(random_problem(seed=1), options("numpy", **changes), Threads(0, 2, [], threading.Barrier(2)))
+
+
+@pytest.mark.parametrize("kernels", ["numpy", "native"])
+def test_ranks_take_the_same_steps_on_two_levels(kernels: str) -> None:
+    if kernels == "native" and native.kernels is None:
+        pytest.skip("not built")
+    problem = case_problem(loop(60, 1200))
+    chosen = dataclasses.replace(
+        methods.options("auto"),
+        kernels=kernels,
+        linear_solver="pcg",
+        preconditioner="two_level",
+        function_tolerance=1e-13,
+        t_eps=1e-8,
+        q_eps=0.0,
+    )
+    alone = solve(problem, chosen)
+    results, _ = on_ranks(problem, chosen, 3)
+    assert "two levels" in results[0].linear_solver
+    assert results[0].objective_after == pytest.approx(alone.objective_after, rel=1e-9)

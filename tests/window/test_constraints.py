@@ -241,7 +241,7 @@ def test_what_cannot_be_is_counted(street: SyntheticData) -> None:
     backend, estimate = replayed(short, lambda k, _: [prior, *sent] if k == 7 else [])
     counts = dict(backend.report.rejected)
     assert counts == {"unknown_keyframe": 2, "bad_factor": 4, "bad_covariance": 3, "other_world": 2}
-    assert backend.notices["no_fix"] == 1
+    assert backend.scene.log.notices["no_fix"] == 1
     np.testing.assert_allclose(estimate.trajectory.position, plain.trajectory.position, atol=0.05)
 
 

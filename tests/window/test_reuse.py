@@ -56,7 +56,7 @@ def test_slots_do_no_harm_and_are_named(baseline_m: float) -> None:
     before = absolute_error(data.odometry, data.truth, kind).translation.rmse  # type: ignore[arg-type]
     after = absolute_error(backend.estimate().trajectory, data.truth, kind).translation.rmse  # type: ignore[arg-type]
     assert after < 0.3 * before, f"{before:.3f} -> {after:.3f} m"
-    assert backend.notices["ids_reused"] > 100
+    assert backend.scene.log.notices["ids_reused"] > 100
     assert "give every track an id of its own" in backend.scene.log.warnings["ids_reused"]
 
 
@@ -64,5 +64,5 @@ def test_slots_do_no_harm_and_are_named(baseline_m: float) -> None:
 def test_ids_that_are_not_reused_are_left_alone(baseline_m: float) -> None:
     data = generate(SyntheticOptions(keyframes=40, length_m=35.0, baseline_m=baseline_m, outlier_share=0.2))
     backend = replayed(measurement for _, _, measurement in data.timeline())
-    assert backend.notices["ids_reused"] <= 2
+    assert backend.scene.log.notices["ids_reused"] <= 2
     assert "ids_reused" not in backend.scene.log.warnings

@@ -28,6 +28,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
+
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig
@@ -112,9 +114,9 @@ class Component:
         options = qos.for_subscription(self.host.node, topic.name, self.host.log) | options
         return self._owned("subscription", kind, topic.name, take, profile, **options)
 
-    def timer(self, *arguments: Any, **options: Any) -> Any:
-        """Make a timer that is destroyed at cleanup. Without ``clock=`` it stands still when /clock does."""
-        return self._owned("timer", *arguments, **options)
+    def timer(self, period_s: float, call: Callable[[], None]) -> Any:
+        """Make a timer that is destroyed at cleanup. It goes by a steady clock, also while /clock stands still."""
+        return self._owned("timer", period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _owned(self, kind: str, *arguments: Any, **options: Any) -> Any:
         entity = getattr(self.host.node, f"create_{kind}")(*arguments, **options)

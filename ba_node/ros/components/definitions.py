@@ -8,8 +8,6 @@ which comments and parameters do not change.
 
 from __future__ import annotations
 
-from rclpy.clock import Clock, ClockType
-
 from ba_node.messages.topics import INPUT_TYPES, INTERFACE_VERSION, OUTPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
@@ -24,7 +22,7 @@ class Definitions(Component):
     def __init__(self, host: Host) -> None:
         super().__init__(host)
         self._counts: dict[str, int] = {}
-        self.timer(_CHECK_S, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.timer(_CHECK_S, self._check)
 
     def _check(self) -> None:
         node = self.host.node

@@ -9,8 +9,6 @@ import time
 from collections import Counter, deque
 from pathlib import Path
 
-from rclpy.clock import Clock, ClockType
-
 from ba_node.messages.diagnostics import Health, diagnose, diagnostics_message
 from ba_node.messages.topics import DIAGNOSTICS, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
@@ -36,7 +34,7 @@ class Diagnostics(Component):
         self._arrived = deque([(self._heard_s, Counter(host.arrived))])
         self._lost = deque([(self._heard_s, self._all_lost())])
         self._publisher = self.publisher(TOPICS[DIAGNOSTICS], qos.reliable(_DEPTH))
-        self.timer(_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.timer(_PERIOD_S, self._tick)
 
     def _tick(self) -> None:
         node = self.host.node

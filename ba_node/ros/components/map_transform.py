@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from rclpy.clock import Clock, ClockType
-
 from ba_node.estimate import Estimate
 from ba_node.messages.topics import TF, TOPICS
 from ba_node.messages.transforms import tf_message
@@ -42,7 +40,7 @@ class MapTransform(Component):
         self._say("")
         period_s = host.config.frames.publish_period_s
         if period_s > 0.0:
-            self.timer(period_s, self._repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.timer(period_s, self._repeat)
 
     def deactivate(self) -> None:
         """Say nothing any more; what was said grows old."""

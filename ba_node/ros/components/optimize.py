@@ -10,7 +10,6 @@ longer the current one: after a reset, another map, or a new session.
 from __future__ import annotations
 
 import math
-import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -99,7 +98,7 @@ class Optimize(Component):
         try:
             with answer.guarded():
                 self._server.begin(handle)
-                self.host.inbox.post(lambda backend: self._copy(backend, goal))
+                self.host.inbox.post(answer.working(lambda backend: self._copy(backend, goal)))
         except Exception:
             log(self.host.node, Severity.ERROR, f"~/{_NAME}: {traceback.format_exc()}")
 
@@ -114,25 +113,23 @@ class Optimize(Component):
             self._goal.stop = CLEANED_UP
 
     def _copy(self, backend: Backend, goal: _Goal) -> None:
-        """Copy the map, on the solver's thread."""
-        with goal.answer.guarded():
-            arguments = backend, goal, backend.copied()
-            # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
-            threading.Thread(target=self._solve, args=arguments, name=_NAME, daemon=False).start()
+        """Copy the map, on the solver's thread, and solve the copy on another."""
+        begin = backend.copied()
+        # Not a daemon, as the solver's thread is that starts it: Python must not end while the kernels run.
+        goal.answer.in_thread(lambda: self._solve(backend, goal, begin), _NAME)
 
     def _solve(self, backend: Backend, goal: _Goal, begin: Callable[[], Optimization | str]) -> None:
         """Solve the copy, on a thread of its own."""
-        with goal.answer.guarded():
-            taken = begin()
-            if isinstance(taken, str):
-                goal.end(Status.SKIPPED, taken)
-                return
-            taken = self._solved(backend, goal, taken)
-            goal.result = taken.statistics()
-            if goal.stop:
-                goal.end(Status.SKIPPED, goal.stop)
-            else:
-                self.host.inbox.post(lambda backend: self._merge(backend, goal, taken))
+        taken = begin()
+        if isinstance(taken, str):
+            goal.end(Status.SKIPPED, taken)
+            return
+        taken = self._solved(backend, goal, taken)
+        goal.result = taken.statistics()
+        if goal.stop:
+            goal.end(Status.SKIPPED, goal.stop)
+        else:
+            self.host.inbox.post(goal.answer.working(lambda backend: self._merge(backend, goal, taken)))
 
     def _solved(self, backend: Backend, goal: _Goal, taken: Optimization) -> Optimization:
         request = goal.handle.request
@@ -154,19 +151,18 @@ class Optimize(Component):
 
     def _merge(self, backend: Backend, goal: _Goal, taken: Optimization) -> Estimate | None:
         """Put the result in, on the solver's thread; what it returns is published."""
-        with goal.answer.guarded():
-            merged = None if goal.stop or goal.answer.sent else backend.merge(taken)
-            if merged is None:
-                lost = taken.result.status.usable
-                reason = (goal.stop or backend.refusal or _GONE) if lost else taken.result.reason
-                held = lost and not goal.stop and backend.refusal
-                goal.end(Status.HELD if held else Status.SKIPPED if lost else taken.result.status, reason)
-                return None
-            estimate, goal.result["followed_keyframes"] = merged
-            cameras = [] if taken.calibration is None else taken.calibration.lines()
-            words = [taken.result.reason, *(f"camera {i}: {text}" for i, text in enumerate(cameras))]
-            goal.end(taken.result.status, "; ".join(words))
-            return estimate
+        merged = None if goal.stop or goal.answer.sent else backend.merge(taken)
+        if merged is None:
+            lost = taken.result.status.usable
+            reason = (goal.stop or backend.refusal or _GONE) if lost else taken.result.reason
+            held = lost and not goal.stop and backend.refusal
+            goal.end(Status.HELD if held else Status.SKIPPED if lost else taken.result.status, reason)
+            return None
+        estimate, goal.result["followed_keyframes"] = merged
+        cameras = [] if taken.calibration is None else taken.calibration.lines()
+        words = [taken.result.reason, *(f"camera {i}: {text}" for i, text in enumerate(cameras))]
+        goal.end(taken.result.status, "; ".join(words))
+        return estimate
 
     def _tell(self, goal: _Goal, row: Iteration, elapsed_s: float) -> None:
         """Publish feedback."""

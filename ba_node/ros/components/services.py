@@ -8,8 +8,6 @@ Files are written and read by a thread of their own, one at a time.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from ba_node.ros.convert import message_class
 from ba_node.ros.rclpy_compat.deferred import Answer, DeferredService
 
 _PAUSED = "paused"
+_THREAD = "map file"
 
 
 class Services(Component):
@@ -45,7 +44,7 @@ class Services(Component):
             answer.send_later(success=True, message=text)
             return backend.estimate()
 
-        self._post(answer, reset)
+        self.host.inbox.post(answer.working(reset))
 
     def _pause(self, request: Any, answer: Answer) -> None:
         """Ignore data, or take it again. What a solver has begun with goes on."""
@@ -63,9 +62,9 @@ class Services(Component):
         def copy(backend: Backend) -> None:
             content = backend.snapshot()
             # A file is written to the end when the node ends.
-            self._in_thread(answer, lambda: self._write(path, content, answer), daemon=False)
+            answer.in_thread(lambda: self._write(path, content, answer), _THREAD)
 
-        self._post(answer, copy)
+        self.host.inbox.post(answer.working(copy))
 
     def _write(self, path: Path, content: MapContent, answer: Answer) -> None:
         try:
@@ -81,7 +80,7 @@ class Services(Component):
         path = self._begin_file(request.path, answer, to_write=False)
         if path is not None:
             # Nothing is lost with a read that does not come to its end.
-            self._in_thread(answer, lambda: self._read(path, answer), daemon=True)
+            answer.in_thread(lambda: self._read(path, answer), _THREAD, daemon=True)
 
     def _read(self, path: Path, answer: Answer) -> None:
         try:
@@ -97,7 +96,7 @@ class Services(Component):
             answer.send_later(success=True, message=text, **counts, session_id=backend.map.session_id)
             return backend.estimate()
 
-        self._post(answer, take_over)
+        self.host.inbox.post(answer.working(take_over))
 
     def _begin_file(self, name: str, answer: Answer, *, to_write: bool) -> Path | None:
         """Return the path to work on, or None after saying why not."""
@@ -112,22 +111,6 @@ class Services(Component):
             return None
         self._busy = answer
         return path
-
-    def _post(self, answer: Answer, command: Callable[[Backend], Estimate | None]) -> None:
-        """Have the solver's thread do something."""
-
-        def guarded(backend: Backend) -> Estimate | None:
-            with answer.guarded():
-                return command(backend)
-
-        self.host.inbox.post(guarded)
-
-    def _in_thread(self, answer: Answer, action: Callable[[], None], *, daemon: bool) -> None:
-        def guarded() -> None:
-            with answer.guarded():
-                action()
-
-        threading.Thread(target=guarded, name="map file", daemon=daemon).start()
 
 
 def _listed(counts: dict[str, int]) -> str:

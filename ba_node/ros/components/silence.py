@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import time
 
-from rclpy.clock import Clock, ClockType
-
 from ba_node.messages.topics import CAMERAS, CLOCK, INPUT_TYPES
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
@@ -51,8 +49,7 @@ class Silence(Component):
     def __init__(self, host: Host) -> None:
         super().__init__(host)
         self._waits = {topic: _Wait() for topic in _NEEDED}
-        # Silence is silence also while /clock stands still.
-        self.timer(_CHECK_S, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.timer(_CHECK_S, self._check)
 
     def activate(self) -> None:
         """Wait anew."""
@@ -87,7 +84,7 @@ class SimulatedTime(Component):
     def __init__(self, host: Host) -> None:
         super().__init__(host)
         self._wait = _Wait()
-        self.timer(_CHECK_S, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.timer(_CHECK_S, self._check)
 
     def _check(self) -> None:
         node = self.host.node

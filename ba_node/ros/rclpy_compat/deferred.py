@@ -18,13 +18,14 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.clock import Clock, ClockType
 
 from ba_node.ros.log import Severity, fault, log, printable
 from ba_node.ros.rclpy_compat.private import RCLError
 
+T = TypeVar("T")
 # Sends success, message and further fields of an answer, on the executor's thread.
 Send = Callable[[bool, str, dict[str, Any]], None]
 
@@ -139,6 +140,19 @@ class Answer:
         except BaseException as error:
             self.send_later(success=False, message=fault(error))
             raise
+
+    def working(self, action: Callable[..., T]) -> Callable[..., T]:
+        """Return an action that works on the answer, in any thread: what it raises becomes the answer, and goes on."""
+
+        def guarded(*arguments: Any) -> T:
+            with self.guarded():
+                return action(*arguments)
+
+        return guarded
+
+    def in_thread(self, action: Callable[[], None], name: str, *, daemon: bool = False) -> None:
+        """Work on the answer on a thread of its own; Python does not end before it has ended, unless it is a daemon."""
+        threading.Thread(target=self.working(action), name=name, daemon=daemon).start()
 
 
 class DeferredService:

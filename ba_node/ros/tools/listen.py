@@ -9,10 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import rclpy
 from numpy.typing import NDArray
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 
 from ba_node.estimate import Poses
 from ba_node.messages.factory import stamp_ns_from_message
@@ -20,6 +17,7 @@ from ba_node.messages.outputs import POINT_DTYPE
 from ba_node.messages.topics import TOPICS, WHOLE_MAP
 from ba_node.ros import qos
 from ba_node.ros.convert import message_class
+from ba_node.ros.tools.node import node_apart
 
 _POLL_S = 0.05
 
@@ -33,28 +31,22 @@ class NodeListener:
         self.points_stamp_ns: int | None = None  # its stamp, ns
         self.points_frame = ""  # its frame
         self._node_name = node_name
-        self._domain = domain
+        self._apart = node_apart("ba_listener", domain=domain)
         self._poses: dict[int, tuple[int, NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def __enter__(self) -> NodeListener:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=self._domain)
-        self._node = Node("ba_listener", context=self._context, start_parameter_services=False, enable_rosout=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        node, self._executor = self._apart.__enter__()
         receivers = {"refined_keyframes": self._on_keyframes, "points": self._on_points, "report": self.reports.append}
         self._subscriptions = []
         for name, receive in receivers.items():
             topic = TOPICS[name]
             kind, full_name = message_class(topic.type_name), f"{self._node_name}/{name}"
             profile = qos.profile(topic) if name in WHOLE_MAP else qos.reliable(qos.OUTPUT_DEPTH)
-            self._subscriptions.append(self._node.create_subscription(kind, full_name, receive, profile))
+            self._subscriptions.append(node.create_subscription(kind, full_name, receive, profile))
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        self._apart.__exit__(None, None, None)
 
     @property
     def connected(self) -> bool:

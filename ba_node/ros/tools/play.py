@@ -24,7 +24,6 @@ from typing import Any, NoReturn
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException
-from rclpy.node import Node
 from rclpy.time import Time
 
 from ba_node.io.mcap import BagReader
@@ -34,6 +33,7 @@ from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
+from ba_node.ros.tools.node import node_apart
 
 _WRONG_OPTIONS = (*ARGUMENT_ERRORS, InvalidNamespaceException)
 _POLL_S = 0.02
@@ -108,28 +108,18 @@ def play(bag: Path | str, options: PlayOptions = PlayOptions(), listener: Listen
 
 @contextlib.contextmanager
 def _node(options: PlayOptions) -> Iterator[Any]:
-    """Make a node in a ROS context of its own, which leaves the signal handlers of the process alone."""
-    context = rclpy.Context()
+    """Make the node that publishes."""
+    apart = node_apart("ba_play", args=options.ros_args, namespace=options.namespace)
     try:
-        try:
-            rclpy.init(args=list(options.ros_args), context=context)
-            node = Node(
-                "ba_play",
-                context=context,
-                namespace=options.namespace,
-                start_parameter_services=False,
-                enable_rosout=False,
-            )
-        except _WRONG_OPTIONS as error:
-            raise PlayError(f"--namespace or --remap: {error}") from error
-        _playing.append(node)
-        try:
-            yield node
-        finally:
-            _playing.remove(node)
-            node.destroy_node()
+        node, _ = apart.__enter__()
+    except _WRONG_OPTIONS as error:
+        raise PlayError(f"--namespace or --remap: {error}") from error
+    _playing.append(node)
+    try:
+        yield node
     finally:
-        rclpy.try_shutdown(context=context)
+        _playing.remove(node)
+        apart.__exit__(None, None, None)
 
 
 def publish_rig(rig: CameraRig, namespace: str, said: Callable[[str], None]) -> NoReturn:

@@ -16,15 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from ba_node.io import ros_types
 from ba_node.io.bag_writer import BagWriter
 from ba_node.messages.topics import INPUT_TYPES, TF_STATIC, TOPICS
 from ba_node.ros.convert import message_class
+from ba_node.ros.tools.node import node_apart
 
 _POLL_S, _LOOK_S = 0.05, 0.5
 _WANTED = frozenset(INPUT_TYPES.values())
@@ -66,29 +64,19 @@ class Recorder:
             RecordError: no message came.
             OSError: the file is there already, or cannot be written.
         """
-        context = rclpy.Context()
-        rclpy.init(context=context)
-        node = Node("ba_record", context=context, start_parameter_services=False, enable_rosout=False)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        began = time.monotonic()
         looked = -_LOOK_S
-        try:
-            with BagWriter(self._path, streaming=True) as writer:
-                while not self._stopped and not self._is_over(time.monotonic() - began):
-                    if time.monotonic() - looked >= _LOOK_S:
-                        looked = time.monotonic()
-                        self._look(node, writer)
-                    executor.spin_once(timeout_sec=_POLL_S)
-                seen = self._seen(node)
-        finally:
-            executor.shutdown()
-            node.destroy_node()
-            rclpy.try_shutdown(context=context)
+        with node_apart("ba_record") as (node, executor), BagWriter(self._path, streaming=True) as writer:
+            began = time.monotonic()
+            while not self._stopped and not self._is_over(time.monotonic() - began):
+                if time.monotonic() - looked >= _LOOK_S:
+                    looked = time.monotonic()
+                    self._look(node, writer)
+                executor.spin_once(timeout_sec=_POLL_S)
+            seen, lasted_s = self._seen(node), time.monotonic() - began
         if not self.counts:
             self._path.unlink()
             raise RecordError(f"{self._path}: no message came{seen}")
-        return time.monotonic() - began
+        return lasted_s
 
     def _is_over(self, seconds: float) -> bool:
         return 0.0 < self._options.duration_s <= seconds

@@ -7,14 +7,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from ba_node.config import find
 from ba_node.io.parameters import configure, read_parameters
+from ba_node.ros.tools.node import node_apart
 
 _FIND_S, _ANSWER_S = 10.0, 10.0
 
@@ -37,16 +35,8 @@ def set_parameters(node_name: str, path: Path, domain: int | None = None) -> lis
     said = [f"{node_name}: {name} takes effect at its start only: give it {path} as --params-file" for name in others]
     if not live:
         return [*said, f"{path}: nothing to set on {node_name}"]
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=domain)
-    try:
-        node = Node("ba_tune", context=context, start_parameter_services=False, enable_rosout=False)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
+    with node_apart("ba_tune", domain=domain) as (node, executor):
         _set(node, executor, node_name, live)
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown(context=context)
     return [*said, *(f"{node_name}: {name} = {value}" for name, value in live.items())]
 
 

@@ -1,0 +1,147 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Learn how much more precise the front-end's steps are than stated, where nobody told their covariance.
+
+Once for so many keyframes as a window holds it is solved again without the steps. A step then differs from the
+front-end's by e, of which images explain the covariance C (``core/covariance.py``) and the front-end the rest:
+``e ~ N(0, C + s^2 sigma^2 I)``, with sigma as the parameters state it. The likelihood of the share s is added up over
+windows, for rotation and translation apart, with Student's distribution (5 degrees of freedom) of each component along
+the axes of C, so that single wild steps do not decide, and older windows fade. A share below 1 is taken where it is far
+more likely than 1. So a front-end that is more precise than images holds the keyframes, in place of being spoilt by
+them; the keyframes of before follow by a solve of everything (``adjustment.py``).
+
+A front-end that sees the same images has steps whose errors are not its own: with the images they agree too well, or as
+its tracks do not. So steps count as precise only where e is what C alone says, ``e' C^-1 e`` near 3 for rotation and
+translation, and where images tell less than a fifth of a stated sigma at least: where they tell more, steps as stated
+have no weight that could do harm, and none is to be had by mistake. Where the first windows tell nothing of the kind it
+is not asked any more; larger shares are odometry.py's.
+
+Only where images have a scale of their own: several cameras, or depths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ba_node.arrays import FloatArray
+from ba_node.config import Config
+from ba_node.core import covariance, methods, solver
+from ba_node.core.factors import RelativePoses
+from ba_node.core.problem import Problem, State
+from ba_node.scene.scene import Scene
+from ba_node.window import odometry
+from ba_node.window.selection import Selection
+
+_SHARES = 0.5 ** np.arange(7)
+_FREEDOM = 5.0
+# Logarithm of how much more likely a share is than 1, to be taken; windows without one, after which that is that; and
+# what a window counts once another has come.
+_TELLING, _ENOUGH, _FADES = 6.0, 3, 0.8
+# How many windows tell it at least; bounds of e' C^-1 e / 3; what C is of a stated sigma, at least.
+_WINDOWS, _LOW, _HIGH, _COARSE = 2, 0.5, 1.3, 0.2
+_LEAST_STEPS = 5
+
+
+@dataclass
+class Precision:
+    """What was learned in a map."""
+
+    likelihood: FloatArray  # (2, n_shares) of rotation and translation, logarithms
+    fit: FloatArray  # (2,) sum over windows of e' C^-1 e / 3
+    coarse: FloatArray  # (2,) likewise of the standard deviation by images, in stated ones
+    windows: int = 0
+    seen: int = 0  # keyframes of the map at the last of them
+
+    def shares(self) -> tuple[float, float]:
+        """Return what the standard deviations of rotation and translation are to be multiplied by."""
+        fit, coarse = self.fit / max(self.windows, 1), self.coarse / max(self.windows, 1)
+        if self.windows < _WINDOWS or fit.min() < _LOW or fit.max() > _HIGH or coarse.min() < _COARSE:
+            return 1.0, 1.0
+        best = np.argmax(self.likelihood, axis=1)
+        gain = self.likelihood[[0, 1], best] - self.likelihood[:, 0]
+        rotation, translation = np.where(gain > _TELLING, _SHARES[best], 1.0).tolist()
+        return rotation, translation
+
+
+def learn(scene: Scene, config: Config, known: Precision | None, selection: Selection, state: State) -> Precision:
+    """Return what is known after a window that was taken, with its solution; the scene's steps count accordingly."""
+    known = known or Precision(np.zeros((2, len(_SHARES))), np.zeros(2), np.zeros(2))
+    n, problem = len(scene.keyframes), selection.problem
+    told_little = known.windows >= _ENOUGH and scene.step_shares == (1.0, 1.0)
+    has_scale = len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
+    due = n - known.seen >= config.window.max_keyframes and config.window.old_keyframes == "fix"
+    if told_little or not (due and has_scale and config.odometry.enabled) or selection.much_moves:
+        return known
+    found = _steps_without(scene, config, selection, state)
+    if found is not None:
+        likelihood = _FADES * known.likelihood + np.stack([_likelihood(*part) for part in found])
+        fit = known.fit + [_fit(*part[:2]) for part in found]
+        coarse = known.coarse + [float(np.median(_spread(part[1]) / part[2])) for part in found]
+        known = Precision(likelihood, fit, coarse, known.windows + 1, n)
+        before, scene.step_shares = scene.step_shares, known.shares()
+        newly = any(then == 1.0 and now < 1.0 for then, now in zip(before, scene.step_shares, strict=True))
+        scene.constraints.steps_precise |= newly and n > config.window.max_keyframes
+    return known
+
+
+def _steps_without(
+    scene: Scene, config: Config, selection: Selection, state: State
+) -> list[tuple[FloatArray, FloatArray, FloatArray]] | None:
+    """Return errors (n, 3), their covariance by images (n, 3, 3), stated sigmas (n,), of rotation and translation."""
+    options = methods.from_config(config.solver)
+    problem = Problem(
+        state, selection.problem.fixed, selection.problem.cameras, selection.problem.observations, selection.beside
+    )
+    result = solver.solve(problem, options)
+    if not result.status.usable or not result.state.is_finite():
+        return None
+    free = np.flatnonzero(~problem.fixed)
+    uncertainty = covariance.uncertainty_of(problem, result.state, options, np.empty((len(free), 6, 0)))
+    steps = odometry.stated(scene, config.odometry, selection.keyframes)
+    column = np.full(problem.n_keyframes, -1)
+    column[free] = np.arange(len(free))
+    many = np.bincount(problem.observations.keyframe, minlength=problem.n_keyframes) >= odometry.MANY_OBSERVATIONS
+    sure = many & ~problem.fixed
+    kept = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
+    if uncertainty is None or len(kept) < _LEAST_STEPS:
+        return None
+    pairs = np.stack([steps.first, steps.first + 1], axis=1)[kept]
+    unit = np.tile(np.eye(6), (len(kept), 1, 1))
+    factors = RelativePoses(pairs, steps.rotation[kept], steps.translation[kept], unit)
+    error, by_pose = factors.residuals(result.state), factors.jacobians(result.state)
+    whole = uncertainty.of(np.arange(6 * len(free))).reshape(len(free), 6, len(free), 6)
+    ends = column[pairs]
+    covariances = sum(
+        by_pose[:, a] @ whole[ends[:, a], :, ends[:, b], :] @ np.swapaxes(by_pose[:, b], 1, 2)
+        for a in (0, 1)
+        for b in (0, 1)
+    )
+    assert isinstance(covariances, np.ndarray)
+    if not np.isfinite(covariances).all():
+        return None
+    rotation, translation = slice(0, 3), slice(3, 6)
+    return [
+        (error[:, rotation], covariances[:, rotation, rotation], steps.sigma_rad[kept]),
+        (error[:, translation], covariances[:, translation, translation], steps.sigma_m[kept]),
+    ]
+
+
+def _fit(error: FloatArray, covariances: FloatArray) -> float:
+    """Return the mean of ``e' C^-1 e / 3``."""
+    return float(np.mean(np.sum(error * np.linalg.solve(covariances, error[:, :, None])[..., 0], axis=1))) / 3.0
+
+
+def _spread(covariances: FloatArray) -> FloatArray:
+    """Return the standard deviation of an axis, (n,)."""
+    return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 3.0))
+
+
+def _likelihood(error: FloatArray, covariances: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Return the logarithm of the likelihood of each share, (n_shares,)."""
+    variance, axes = np.linalg.eigh(covariances)
+    along = (np.swapaxes(axes, 1, 2) @ error[:, :, None])[..., 0]
+    total = np.maximum(variance, 0.0) + (_SHARES[:, None, None] * sigma[:, None]) ** 2
+    odd = (_FREEDOM + 1.0) * np.log1p(along**2 / (_FREEDOM * total))
+    return np.asarray(-0.5 * np.sum(np.log(total) + odd, axis=(1, 2)))

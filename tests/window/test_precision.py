@@ -1,0 +1,63 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of a front-end that are more precise than stated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.window import precision
+
+
+def replayed(drift_rotation_deg: float, drift_translation: float, keyframes: int) -> tuple[Backend, float, float]:
+    """Return a back-end after noisy images of a straight road, and the errors of input and result, rms, m."""
+    data = generate(
+        SyntheticOptions(
+            seed=3, keyframes=keyframes, length_m=0.5 * keyframes, landmarks=25 * keyframes, tracks=60, noise_px=1.0,
+            path="line", reobserve=False, drift_rotation_deg=drift_rotation_deg, drift_translation=drift_translation,
+        )
+    )  # fmt: skip
+    backend = Backend(Config())
+    for _ in backend.replay(m for _, _, m in data.timeline()):
+        pass
+    given = np.array([keyframe.position for keyframe in data.keyframes])
+    found = backend.estimate().trajectory.position
+    errors = [float(np.sqrt(np.mean(np.sum((x - data.truth.position) ** 2, axis=1)))) for x in (given, found)]
+    return backend, errors[0], errors[1]
+
+
+def test_a_front_end_ten_times_as_precise_as_images_is_not_spoilt() -> None:
+    backend, given, found = replayed(0.01, 0.002, 80)
+    assert max(backend.scene.step_shares) < 0.2, backend.scene.step_shares
+    assert found < 1.05 * given, (given, found)
+    assert backend.report.adjustments in (1, 2), "the keyframes of before it was known follow"
+    assert not backend.report.warnings
+
+
+def test_steps_as_stated_or_worse_stay_as_they_are() -> None:
+    backend, given, found = replayed(0.3, 0.02, 50)
+    assert backend.scene.step_shares == (1.0, 1.0)
+    assert backend.report.adjustments == 0
+    assert found < given
+
+
+@pytest.mark.parametrize("share", [1.0, 0.25, 1.0 / 32.0])
+def test_the_likeliest_share_is_that_of_the_noise(share: float) -> None:
+    rng = np.random.default_rng(1)
+    root = 0.3 * share * rng.normal(size=(400, 3, 3))
+    covariances = root @ np.swapaxes(root, 1, 2)
+    error = (root @ rng.normal(size=(400, 3, 1)))[..., 0] + share * rng.normal(size=(400, 3))
+    found = precision._SHARES[np.argmax(precision._likelihood(error, covariances, np.ones(400)))]
+    assert found == share
+
+
+def test_errors_that_images_share_tell_nothing() -> None:
+    """Too good or too bad an agreement with images, or images that are far more precise than stated steps."""
+    sure = np.tile(10.0 * np.arange(7), (2, 1))
+    for fit, coarse, taken in ((1.0, 1.0, True), (0.2, 1.0, False), (2.0, 1.0, False), (1.0, 0.05, False)):
+        known = precision.Precision(sure, np.array([2.0, 2.0 * fit]), np.array([2.0, 2.0 * coarse]), 2)
+        assert (known.shares() != (1.0, 1.0)) == taken, (fit, coarse)
