@@ -22,7 +22,7 @@ from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Result, Status
 from ba_node.core.solver import solve
 from ba_node.io import bal
-from ba_node.offline.solver_settings import describe, solver_options
+from ba_node.offline.solver_settings import solver_options
 
 Make = Callable[..., tuple[Problem, State]]
 CHOICES = {option.name: option.choices for option in declared(SolverOptions)}
@@ -251,10 +251,10 @@ def test_methods_are_the_table_of_the_thesis() -> None:
     }
     parts = ("damping", "trust_region", "linear_solver", "schur", "parameterisation", "loss")
     for name, row in expected.items():
-        values = describe(methods.options(name))
+        values = dataclasses.asdict(methods.options(name))
         assert tuple(values[part] for part in parts) == row, name
-    assert describe(methods.options("bal"))["preconditioner"] == "b_literal"
-    assert describe(methods.options("bal_scaled"))["preconditioner"] == "b_block"
+    assert dataclasses.asdict(methods.options("bal"))["preconditioner"] == "b_literal"
+    assert dataclasses.asdict(methods.options("bal_scaled"))["preconditioner"] == "b_block"
     assert methods.options("auto") is methods.options("local_irls")
 
 
