@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -68,6 +68,7 @@ class ImageRequest:
     rectified: bool = False  # p of camera_info is the camera; so it is where topics are called image_rect
     base: str = ""  # body frame in /tf_static, empty for the first camera
     rate_hz: float = 10.0  # of a folder whose pictures have no stamps
+    poses: OdometryBuffer | None = None  # of an odometry that comes from elsewhere
 
 
 @dataclass
@@ -101,9 +102,14 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     chosen = _image_topics(reader, request)
     mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
     rig = _first_cameras(request.rig or _recorded_rig(reader, request, chosen, mode), mode, str(reader.path))
-    odometry = request.topics.get("odometry")
+    odometry = absolute(request.topics["odometry"]) if "odometry" in request.topics else ""
     topics = {topic: name for name, topic in chosen.items()}
-    source = ImageSource(rig, mode, 0, lambda: _frames(reader, source, topics, odometry and absolute(odometry)))
+
+    def read() -> Iterator[tuple[Images, Transform | None]]:
+        poses = OdometryBuffer() if odometry else request.poses
+        return _paired(source, _messages(reader, source, topics, odometry, poses), poses)
+
+    source = ImageSource(rig, mode, 0, read)
     source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
     return source
 
@@ -163,12 +169,28 @@ def _info_of(reader: BagReader, image: str, *, alone: bool = False) -> str:
     return infos[0] if alone and beside not in infos and len(infos) == 1 else beside
 
 
-def _frames(
-    reader: BagReader, source: ImageSource, topics: Mapping[str, str], odometry: str | None
+def _paired(
+    source: ImageSource, entries: Iterator[tuple[str, int, Any]], poses: OdometryBuffer | None
 ) -> Iterator[tuple[Images, Transform | None]]:
-    """Yield frames by time. Odometry comes from its topic, each frame waiting until it is known."""
-    streams, buffer = Streams(MODES[source.mode], frozenset(), _QUEUE), OdometryBuffer()
-    tree, waiting = static_tree(reader), []
+    """Yield images by time, of entries (stream, stamp in ns, message) in order; each waits until its pose is known."""
+    streams, waiting = Streams(MODES[source.mode], frozenset(), _QUEUE), deque[Frame]()
+    source.counted.clear()
+    for name, stamp_ns, message in entries:
+        waiting += streams.put(name, stamp_ns, message)
+        while waiting and (poses is None or poses.covers(waiting[0].stamp_ns)):
+            yield from _read(source, waiting.popleft(), poses)
+    for frame in (*waiting, *streams.flush()):
+        yield from _read(source, frame, poses)
+    source.counted.update(streams.counted)
+    for name, apart_ns in streams.apart_ns.items():
+        source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+
+
+def _messages(
+    reader: BagReader, source: ImageSource, topics: Mapping[str, str], odometry: str, poses: OdometryBuffer | None
+) -> Iterator[tuple[str, int, Any]]:
+    """Yield images of a recording; poses of its odometry go into the buffer."""
+    tree = static_tree(reader)
     for topic, _, _, data in reader.messages([*topics, *([odometry] if odometry else [])]):
         try:
             message = reader.decode(topic, data)
@@ -176,42 +198,30 @@ def _frames(
             _leave(source, "undecodable", str(error))
             continue
         stamp_ns = stamp_ns_from_message(message.header.stamp)
-        if topic == odometry:
-            pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
-            child, body = str(message.child_frame_id), source.rig.frame_id
-            place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
-            if place is None:
-                words = f"it is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
-                source.counted["odometry of another frame"], source.notes["odometry of another frame"] = 1, words
-            buffer.add(stamp_ns, pose if place is None else pose.after(place))
-        else:
-            waiting += streams.put(topics[topic], stamp_ns, message)
-        while waiting and (odometry is None or buffer.covers(waiting[0].stamp_ns)):
-            yield from _with_odometry(source, waiting.pop(0), buffer if odometry else None)
-    for frame in (*waiting, *streams.flush()):
-        yield from _with_odometry(source, frame, buffer if odometry else None)
-    source.counted.update(streams.counted)
-    for name, apart_ns in streams.apart_ns.items():
-        source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+        if topic != odometry or poses is None:
+            yield topics[topic], stamp_ns, message
+            continue
+        pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
+        child, body = str(message.child_frame_id), source.rig.frame_id
+        place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
+        if place is None:
+            words = f"it is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
+            source.counted["odometry of another frame"], source.notes["odometry of another frame"] = 1, words
+        poses.add(stamp_ns, pose if place is None else pose.after(place))
 
 
-def _with_odometry(source: ImageSource, frame: Frame, buffer: OdometryBuffer | None) -> Iterator[Any]:
-    """Yield a frame with the odometry of its time; nothing where that is not known, which is counted."""
-    pose = None if buffer is None else buffer.at(frame.stamp_ns)
-    if buffer is not None and pose is None:
+def _read(source: ImageSource, frame: Frame, poses: OdometryBuffer | None) -> Iterator[tuple[Images, Transform | None]]:
+    """Yield what a frame shows and the pose of its time; nothing where either is not to be had, which is counted."""
+    pose = None if poses is None else poses.at(frame.stamp_ns)
+    if poses is not None and pose is None:
         _leave(source, "no odometry", f"none at stamp {frame.stamp_ns} ns")
-    else:
-        yield from _read(source, frame, pose)
-
-
-def _read(source: ImageSource, frame: Frame, odometry: Transform | None) -> Iterator[tuple[Images, Transform | None]]:
-    """Yield what a frame shows; nothing where it cannot be read, which is counted."""
+        return
     try:
         images = images_of(frame, source.mode)
     except FrontEndError as error:
         _leave(source, "unreadable", f"image of stamp {frame.stamp_ns} ns: {error}")
         return
-    yield images, odometry
+    yield images, pose
 
 
 def _leave(source: ImageSource, reason: str, words: str) -> None:
@@ -234,9 +244,31 @@ def _of_folder(path: Path, request: ImageRequest) -> ImageSource:
             f"{path}: no pictures ({', '.join(PICTURES)}), neither here nor in left/ and right/, rgb/ and depth/"
         )
     rig = _first_cameras(request.rig or _rig_of_folder(path, request, len(cameras_of(mode))), mode, str(path))
-    stamps = [_stamps(path, files, request.rate_hz) for files in pictures]
-    source = ImageSource(rig, mode, len(pictures[0]), lambda: _read_folder(source, pictures, stamps))
+    entries = sorted(
+        (stamp_ns, place, file)
+        for place, files in enumerate(pictures)
+        for stamp_ns, file in zip(_stamps(path, files, request.rate_hz), files, strict=True)
+    )
+    streams = MODES[mode]
+
+    def read() -> Iterator[tuple[Images, Transform | None]]:
+        files = ((streams[place], stamp_ns, _Picture(file)) for stamp_ns, place, file in entries)
+        return _paired(source, files, request.poses)
+
+    source = ImageSource(rig, mode, len(pictures[0]), read)
     return source
+
+
+class _Picture:
+    """A file, with the fields of a CompressedImage."""
+
+    def __init__(self, file: Path) -> None:
+        self._file, self.format = file, file.suffix[1:]
+
+    @property
+    def data(self) -> bytes:
+        """Return its content, which is read when it is looked at."""
+        return self._file.read_bytes()
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -293,29 +325,3 @@ def _stamps(path: Path, files: Sequence[Path], rate_hz: float) -> list[int]:
     if all(re.fullmatch(r"\d{6,}\.\d+", file.stem) for file in files):
         return [round(float(file.stem) * 1e9) for file in files]
     return [_BEGIN_NS + round(i / rate_hz * 1e9) for i in range(len(files))]
-
-
-def _read_folder(
-    source: ImageSource, pictures: Sequence[Sequence[Path]], stamps: Sequence[Sequence[int]]
-) -> Iterator[tuple[Images, Transform | None]]:
-    names = MODES[source.mode]
-    streams = Streams(names, frozenset(), _QUEUE)
-    entries = [
-        (stamp_ns, place, file)
-        for place, files in enumerate(pictures)
-        for stamp_ns, file in zip(stamps[place], files, strict=True)
-    ]
-    for stamp_ns, place, file in sorted(entries):
-        message = SimpleNamespace(format=file.suffix[1:], data=file)
-        for frame in streams.put(names[place], stamp_ns, message):
-            yield from _read(source, _loaded(frame), None)
-    for frame in streams.flush():
-        yield from _read(source, _loaded(frame), None)
-    source.counted.update(streams.counted)
-
-
-def _loaded(frame: Frame) -> Frame:
-    """Return a frame with the content of its files."""
-    files = frame.messages.items()
-    data = {name: SimpleNamespace(format=one.format, data=one.data.read_bytes()) for name, one in files}
-    return frame._replace(messages=data)
