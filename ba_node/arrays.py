@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the types of arrays; shape and unit stand beside each use."""
 
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,3 +11,10 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 IdArray = NDArray[np.uint64]
+
+Record = TypeVar("Record")
+
+
+def take_rows(record: Record, rows: Any) -> Record:
+    """Return a dataclass of arrays with some rows of each; fields that are no arrays stay."""
+    return type(record)(*(value[rows] if isinstance(value, np.ndarray) else value for value in vars(record).values()))

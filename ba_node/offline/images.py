@@ -301,24 +301,35 @@ def _first_cameras(rig: CameraRig, mode: str, where: str) -> CameraRig:
 
 def _kitti_rig(path: Path, cameras: int) -> CameraRig:
     """Return the rectified cameras of rows of 12 numbers, each with or without a name before it."""
-    rows = [re.sub(r"^\w+:", "", line).split() for line in path.read_text().splitlines()]
+    rows = _numbers(path, 12)
+    if len(rows) < cameras:
+        raise BagError(f"{path}: {len(rows)} rows of 12 numbers, the projection of a camera each: expected {cameras}")
     infos = [
         SimpleNamespace(
             header=SimpleNamespace(frame_id=f"camera{i}"), width=0, height=0, k=[], d=[], r=np.eye(3).reshape(-1),
-            p=[float(value) for value in row], distortion_model="", binning_x=0, binning_y=0,
+            p=row, distortion_model="", binning_x=0, binning_y=0,
         )
-        for i, row in enumerate(row for row in rows if len(row) == 12)
-    ][:cameras]  # fmt: skip
+        for i, row in enumerate(rows[:cameras])
+    ]  # fmt: skip
     return rig_from_infos(infos, rectified=True)
+
+
+def _numbers(path: Path, least: int) -> list[list[float]]:
+    """Return the numbers of each line of so many words at least, without a name before them."""
+    lines = [re.sub(r"^\w+:", "", line).split() for line in path.read_text(errors="replace").splitlines()]
+    try:
+        return [[float(word) for word in words] for words in lines if len(words) >= least]
+    except ValueError as error:
+        raise BagError(f"{path}: {error}") from None
 
 
 def _stamps(path: Path, files: Sequence[Path], rate_hz: float) -> list[int]:
     """Return when each picture was taken, ns."""
     times = path / "times.txt"
     if times.exists():
-        seconds = [float(line.split()[0]) for line in times.read_text().splitlines() if line.strip()]
-        if len(seconds) < len(files):
-            raise BagError(f"{times}: {len(seconds)} lines for {len(files)} pictures")
+        seconds = [row[0] for row in _numbers(times, 1)]
+        if len(seconds) < len(files) or not np.isfinite(seconds).all():
+            raise BagError(f"{times}: {len(seconds)} lines for {len(files)} pictures, expected a time in s for each")
         return [_BEGIN_NS + round(one * 1e9) for one in seconds[: len(files)]]
     if all(file.stem.isdigit() and len(file.stem) >= _NS_DIGITS for file in files):
         return [int(file.stem) for file in files]

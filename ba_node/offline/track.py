@@ -77,7 +77,7 @@ def track(
             options = dataclasses.replace(request.options, stereo_yaw_px=float(turn[0]), stereo_roll_px=float(turn[1]))
             run = _Run(source, dataclasses.replace(request, options=options), clock).track(progress)
         if not run.keyframes:
-            why = run.notes[-1] if run.notes else _left_out(source) or "no image could be used"
+            why = "; ".join(run.notes) or "no image could be used"
             raise TrackError(f"{path}: no keyframe came of {source.total} images: {why}")
         truth = _truth(path, source, run)
         count = record(out, run.timeline(), truth)
