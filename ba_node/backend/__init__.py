@@ -3,7 +3,7 @@
 """The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
 
 from ba_node.backend.archive import MapState
-from ba_node.backend.backend import FINISHED_KEPT, Admitted, Backend, Check
+from ba_node.backend.backend import FINISHED_KEPT, Adjustment, Admitted, Backend, Check
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
@@ -14,6 +14,7 @@ from ba_node.window.quality import Residuals
 
 __all__ = [
     "FINISHED_KEPT",
+    "Adjustment",
     "Admitted",
     "Backend",
     "Calibration",

@@ -46,8 +46,9 @@ from ba_node.scene.map_content import MapContent
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import adjustment, full, guard, quality
+from ba_node.window.adjustment import Adjustment
 
-__all__ = ["FINISHED_KEPT", "Admitted", "Backend", "Check"]
+__all__ = ["FINISHED_KEPT", "Adjustment", "Admitted", "Backend", "Check"]
 
 FINISHED_KEPT = 8
 _REFUSED_KEPT = 1000
@@ -66,6 +67,9 @@ class Backend:
         self.extras = Extras()  # what the next solve is to work out beside the estimate
         self.setup = SetUpWatch()  # the check of the set-up; while it gives a reason, every solve is held
         self.refusal = ""  # why the last solve of everything was held, in words; empty if it was not
+        # runs an adjustment on another thread, which then goes to :meth:`take_adjustment`; None: at once
+        self.adjust_elsewhere: Callable[[Adjustment], None] | None = None
+        self._adjusting: Adjustment | None = None
         self._clock = clock
         self._sessions = Sessions()
 
@@ -203,32 +207,36 @@ class Backend:
     def adjust(self, *, final: bool = False) -> Estimate | None:
         """Bend the map and refine all of it, if a loop or what is absolute asks for it, see ``window/adjustment.py``.
 
-        ``final``: nothing more will come. Returns what is known then, None if nothing changed.
+        ``final``: nothing more will come. Returns what is known then, None if nothing changed, or not yet, as it is
+        being worked on elsewhere.
         """
+        if self._adjusting is not None and self._adjusting.scene is self.scene:
+            return None
         what = adjustment.due(self.scene, self.config, final=final)
         if what is None:
             return None
-        before = self.scene.poses_and_points()
-        why = adjustment.bend(self.scene, self.config, what)
-        merged = None
-        if not why:
-            large = len(self.scene.keyframes) > self.config.factors.adjust_max_keyframes
-            begun = "" if large else self.begin_optimization()
-            if isinstance(begun, str):
-                self.map.adjustments += 1
-                self.map.correct(int(self.scene.order[-1]))
-                return self.estimate()  # no images to refine it by
-            begun.solve(self.config.solver)
-            merged = self.merge(begun)
-            why = self.refusal or ("" if merged else "nothing came of a solve of everything")
-        if why:
-            self.scene.restore(before)
-            if what.key is not None:
-                self.scene.constraints.refused.add(what.key)
-            self.scene.log.warn("not_adjusted", f"{what.cause}; the map stays as it is: {why}")
+        begun = self._adjusting = Adjustment(self.scene, what, self.config, self.extras)
+        if self.adjust_elsewhere is not None and not final:
+            self.adjust_elsewhere(begun)
             return None
-        assert merged is not None
-        return merged[0]
+        begun.run()
+        return self.take_adjustment(begun)
+
+    def take_adjustment(self, done: Adjustment) -> Estimate | None:
+        """Take in an adjustment that was run; return what is known then, None if the map stays as it is."""
+        if done is not self._adjusting or done.scene is not self.scene:
+            return None
+        self._adjusting = None
+        why, merged = done.why, None
+        if not why and done.taken is not None:
+            merged = self.merge(done.taken, done.put)
+            why = self.refusal or ("" if merged else "nothing came of a solve of everything")
+        elif not why:
+            done.put()
+            self.map.adjustments += 1
+            self.map.correct(int(self.scene.order[-1]))
+        done.end(why)
+        return None if why else merged[0] if merged else self.estimate()
 
     def replay(self, stream: Iterable[Measurement]) -> Iterator[Estimate | Keyframe | MapEnded]:
         """Take in a stream to its end, with a solve for every keyframe, just before the next one begins.
@@ -298,8 +306,12 @@ class Backend:
         """Return True if a solve of everything is of the current map."""
         return optimization.scene is self.scene
 
-    def merge(self, optimization: full.Optimization) -> tuple[Estimate, int] | None:
+    def merge(
+        self, optimization: full.Optimization, first: Callable[[], None] = lambda: None
+    ) -> tuple[Estimate, int] | None:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
+
+        ``first`` is done to the map before, once it is known that the result is taken.
 
         Returns:
             What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
@@ -316,6 +328,7 @@ class Backend:
             self.map.hold(f"a solve of everything: {self.refusal}")
             return None
         assert found.state is not None
+        first()
         if taken.calibration is not None:
             self.map.calibrate(taken.calibration)
         followed = full.merge_snapshot(self.scene, self.config, taken, found.state)

@@ -172,7 +172,7 @@ class FactorsConfig:
     )
     adjust_max_keyframes: int = option(
         3000,
-        "Maps of more keyframes are bent alone then: to refine all of it would keep windows waiting (~/optimize does).",
+        "Maps of more keyframes are bent alone then, and not refined as a whole (~/optimize does that).",
         within=(0, 10_000_000),
     )
     adjust_m: float = option(

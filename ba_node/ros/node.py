@@ -130,6 +130,7 @@ class BaNode(ManagedNode):
             raise RefusedError(str(error)) from error
         worker = Worker(backend, inbox, config.node.settle_time_s, self._wake.trigger)
         backend.setup.elsewhere = worker.check_elsewhere
+        backend.adjust_elsewhere = worker.adjust_elsewhere
         deferred = DeferredAnswers(self, lambda: worker.alive)
         self._host = host = Host(self, config, inbox, worker, deferred, self._log)
         host.at_cleanup.callback(deferred.close)

@@ -204,21 +204,6 @@ class MapTables:
             place, size = begin, 2 * size
         return -1
 
-    def poses_and_points(self) -> tuple[FloatArray | BoolArray, ...]:
-        """Return a copy of where keyframes and points are, to be restored as long as none comes or goes."""
-        table, points = self.keyframes, self.landmarks
-        columns = table.rotation, table.position, table.refined, points.position, points.has_position
-        return tuple(column.copy() for column in columns)
-
-    def restore(self, known: tuple[FloatArray | BoolArray, ...]) -> None:
-        """Put keyframes and points back to where :meth:`poses_and_points` had them."""
-        table, points = self.keyframes, self.landmarks
-        columns = table.rotation, table.position, table.refined, points.position, points.has_position
-        for column, was in zip(columns, known, strict=True):
-            column[:] = was
-        self.moved()
-        points.changed()
-
     def forget_solutions(self) -> None:
         """Put keyframes back to where the front-end has them; forget where points are and which views are outliers."""
         table = self.keyframes

@@ -62,6 +62,7 @@ class Scene(MapTables):
         other.keyframes, other.landmarks = self.keyframes.clone(), self.landmarks.clone()
         other.observations, other.blocks = self.observations.clone(), [list(blocks) for blocks in self.blocks]
         other._index_keyframes()
+        other._landmark_rows.insert(other.landmarks.track_id, np.arange(len(other.landmarks)))
         other.constraints = self.constraints.clone()
         return other
 

@@ -10,6 +10,8 @@ what is measured beside pixels pulls. Points follow the keyframe that saw them f
 Where tracks are the same points as older ones, the keyframe that sees most of them is placed by where these lie, as
 one that the front-end has put in a wrong place (``arrival.py``): that is the loop. Pairs that do not agree with the
 others stay apart.
+
+All this is done to a copy of the map, on any thread, while windows go on being solved; the map then follows it.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from ba_node.core import geometry, native_kernels, solver
 from ba_node.core.factors import RelativePoses
 from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
+from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, full
 from ba_node.window.problems import problem_of
@@ -55,6 +58,68 @@ class Due:
     key: tuple[int, int] | None = None  # keyframes of the relative pose that the map does not meet
 
 
+@dataclass
+class Adjustment:
+    """A copy of the map that is bent and refined."""
+
+    scene: Scene  # that it is a copy of
+    due: Due
+    config: Config
+    wanted: Extras  # what is to be worked out beside the solution
+    why: str = "it broke off"  # why the map is to stay as it is, in words; empty where it is not
+    taken: full.Optimization | None = None  # the solve of everything; None where the map is bent alone
+
+    def __post_init__(self) -> None:
+        """Copy the map."""
+        self._copy = self.scene.clone()
+        self._before = self._copy.keyframes.rotation.copy(), self._copy.keyframes.position.copy()
+
+    def run(self) -> None:
+        """Bend and refine the copy, on any thread."""
+        self.why = bend(self._copy, self.config, self.due) or self._refine()
+
+    def _refine(self) -> str:
+        """Refine all of the copy if that can be; return why the map is to stay as it is."""
+        if len(self._copy.keyframes) > self.config.factors.adjust_max_keyframes:
+            return ""
+        begun = full.take_snapshot(self._copy, self.config, self.wanted, self.scene)
+        if isinstance(begun, str):
+            # Where no point has a place, images have nothing to say against it.
+            return f"no solve of everything can begin: {begun}" if self._copy.landmarks.has_position.any() else ""
+        begun.solve(self.config.solver)
+        self.taken, result = begun, begun.result
+        usable = result.status.usable and result.state.is_finite()
+        return "" if usable else f"nothing came of a solve of everything: {result.reason}"
+
+    def put(self) -> None:
+        """Move the map as its copy was bent; what came later follows the newest keyframe of that. Join tracks."""
+        scene, bent = self.scene, self._copy
+        rows = scene.find_keyframes(bent.keyframes.keyframe_id)
+        here = np.flatnonzero(rows >= 0)
+        which = np.full(len(scene.keyframes), int(bent.order[-1]))
+        which[rows[here]] = here
+        turn = bent.keyframes.rotation @ np.swapaxes(self._before[0], 1, 2)
+        shift = bent.keyframes.position - (turn @ self._before[1][:, :, None])[..., 0]
+        rotation = geometry.nearest_rotation(turn[which] @ scene.keyframes.rotation)
+        position = (turn[which] @ scene.keyframes.position[:, :, None])[..., 0] + shift[which]
+        scene.propagate_corrections()
+        _move(scene, rotation, position)
+        scene.keyframes.refined[rows[here]] |= bent.keyframes.refined[here]
+        join(scene, self.due.joined)
+        scene.constraints.map_from_world = bent.constraints.map_from_world
+
+    def end(self, why: str) -> None:
+        """Take note that it is over, and why the map stays as it was, in words; empty if it does not."""
+        known = self.scene.constraints
+        known.adjusted_at = len(self.scene.keyframes)
+        if not why:
+            return
+        if self.due.key is not None:
+            known.refused.add(self.due.key)
+        known.merges = [pair for pair in known.merges if pair not in self.due.joined]
+        self.scene.log.warn("not_adjusted", f"{self.due.cause}; the map stays as it is: {why}")
+
+
 def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
     """Return why the whole map is to be bent now, None if it is not; join tracks whose places agree already.
 
@@ -81,7 +146,7 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
 
 def bend(scene: Scene, config: Config, what: Due) -> str:
     """Bend the map, join tracks; return why not, in words, in which case nothing was changed."""
-    known, table, order = scene.constraints, scene.keyframes, scene.order
+    table, order = scene.keyframes, scene.order
     scene.propagate_corrections()
     steps, place, origin = _steps(scene, config.odometry), scene.places(), table.position[order[0]]
     others = tuple(kind.take(np.arange(len(kind)), place) for kind in (*what.loops, *_loops(scene)))
@@ -109,7 +174,6 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
     # Where the world holds them they need no images.
     table.refined[:] |= bool(world)
     join(scene, what.joined)
-    known.adjusted_at = len(table)
     return ""
 
 

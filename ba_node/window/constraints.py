@@ -223,6 +223,7 @@ def factors(
     free = ~problem.fixed
     if known.relative or known.steps:
         out += _relative(scene, config, number, free)
+        out += _loops(scene, config, number, free, origin)
     if known.gravity:
         out += _gravity(scene, config, number, free)
     if known.absolute and known.map_from_world is not None and free.any():
@@ -274,6 +275,40 @@ def _relative(scene: Scene, config: Config, number: IntArray, free: BoolArray) -
         return []
     pairs, rotation, position, root = (np.array(values) for values in zip(*found, strict=True))
     return [RelativePoses(pairs, rotation, position, root, _LOSS, config.factors.loss_scale)]
+
+
+def _loops(
+    scene: Scene, config: Config, number: IntArray, free: BoolArray, origin: FloatArray
+) -> list[KeyframeFactors]:
+    """Return loops by pose to refined keyframes that take no part: priors, as these are where the map has them.
+
+    Without them a window would forget the loop that its keyframes were moved by. With i outside, j's pose is ``T_i
+    T_ij``; with j outside, the point t_ij of the body i is where j is, turned likewise.
+    """
+    known, table = scene.constraints, scene.keyframes
+    found = []
+    for key in _keys(scene, number):
+        one, ends = known.relative[key], [scene.find_keyframe(end) for end in key]
+        if not one.is_loop or None in ends or key in known.unchecked:
+            continue
+        rows = np.array(ends, np.intp)
+        inside = number[rows] >= 0
+        if inside.sum() != 1 or not free[number[rows[inside]]][0] or not table.refined[rows[~inside]][0]:
+            continue
+        rotation, position = table.rotation[rows[~inside]][0], table.position[rows[~inside]][0] - origin
+        turn = np.eye(6)
+        if inside[1]:
+            turn[3:, 3:] = rotation.T
+            measured = rotation @ one.rotation, position + rotation @ one.position, np.zeros(3)
+        else:
+            turned = rotation @ one.rotation.T
+            turn[:3, :3], turn[3:, 3:] = one.rotation.T, turned.T
+            measured = turned, position, one.position
+        found.append((number[rows[inside]], *measured, one.root @ turn))
+    if not found:
+        return []
+    at, turns, positions, arms, roots = (np.array(values) for values in zip(*found, strict=True))
+    return [PosePriors(at, turns, positions, arms, roots, _LOSS, config.factors.loss_scale)]
 
 
 def _keys(scene: Scene, number: IntArray) -> list[tuple[int, int]]:

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 from experiments.thesis.catalogue import EXPERIMENTS, PRINTED, REPEATED
 from experiments.thesis.claims import CLAIMS
@@ -13,6 +14,8 @@ from experiments.thesis.problems import DATA, Library
 from experiments.thesis.tables import Table, escaped
 from experiments.thesis.tasks import Run, key
 from experiments.thesis.verdicts import HOLDS, HOLDS_NOT, PARTLY, Found, Results, Verdict, verdict_on
+
+SecondRun = Mapping[str, Any]
 
 _INTRO = """\
 # The claims of the thesis
@@ -119,8 +122,13 @@ def old_cases(results: Results) -> set[tuple[str, str]]:
     }
 
 
-def claims_page(results: Results) -> str:
-    """Return docs/thesis.md."""
+def claims_page(results: Results, second: SecondRun | None = None) -> str:
+    """Return docs/thesis.md.
+
+    Args:
+        results: the recorded figures.
+        second: verdicts.json of a run with the kernels and the linear algebra of another processor.
+    """
     verdicts, old = [verdict_on(claim, results, PRINTED) for claim in CLAIMS], old_cases(results)
     counts = Counter(verdict.word for verdict in verdicts)
     summary = f"Of {len(verdicts)} claims {counts[HOLDS]} hold, {counts[PARTLY]} partly, {counts[HOLDS_NOT]} do not."
@@ -129,9 +137,19 @@ def claims_page(results: Results) -> str:
             ' "(old)": the options of the method have changed since its figures were recorded; `ba thesis --all` and a'
             " copy of its results.json renew them."
         )
+    summary += _second(verdicts, second) if second else ""
     table = verdict_table(verdicts, old).markdown()
     how = _HOW.replace("{starts}", _starts(results))
     return f"{_INTRO}{summary}\n\n{table}\n{how}\n## What the verdicts rest on\n\n{grounds(verdicts)}"
+
+
+def _second(verdicts: Sequence[Verdict], second: SecondRun) -> str:
+    """Return in words what a second run found otherwise; claims by their numbers in the table."""
+    numbered = [(n, verdict, second["verdicts"][verdict.claim.text]) for n, verdict in enumerate(verdicts, start=1)]
+    other = [(n, verdict, word) for n, verdict, word in numbered if word != verdict.word]
+    said = f" A second run ({second['kernels']}) gives the same verdict on {len(verdicts) - len(other)} of them"
+    parts = [f"{n} ({word}{', as it warns' * (not verdict.steady)})" for n, verdict, word in other]
+    return f"{said}; another one on {', '.join(parts)}." if parts else f"{said}."
 
 
 def _starts(results: Results) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ba_node import native
 from ba_node.io.files import write_json
 from experiments.thesis.catalogue import PRINTED
 from experiments.thesis.claims import CLAIMS
@@ -65,10 +66,12 @@ class Repetition:
         ]
 
     def write(self, sections: Sequence[Section]) -> Path:
-        """Write the pages and results.json; return the page that holds all."""
+        """Write the pages, results.json and verdicts.json; return the page that holds all."""
         found = results(sections)
         write_json(self._out / "results.json", found)
         verdicts = [] if self._quick else verdicts_on((*CLAIMS, *FINDINGS), found, PRINTED)
+        words = {verdict.claim.text: verdict.word for verdict in verdicts}
+        write_json(self._out / "verdicts.json", {"kernels": native.description(), "verdicts": words})
         return write_report(self._out, sections, verdicts)
 
     def _tasks(self) -> list[Task]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ba_node.arrays import FloatArray
-from ba_node.backend import Backend
+from ba_node.backend import Adjustment, Backend
 from ba_node.backend.archive import unpack
 from ba_node.config import Config
 from ba_node.core import geometry
@@ -316,18 +316,8 @@ def test_priors_without_keyframes_or_a_path_to_align_by_are_said(street: Synthet
 def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None:
     """A relative pose of the first and last keyframe; one that is 300 m off leaves the map as it is, and is said."""
     data = first(round_trip(0.5), 60)
-    rotation = geometry.matrix_from_quaternion(data.truth.orientation)
-    back = geometry.inverse(rotation[0], data.truth.position[0])
-    turn, move = geometry.compose(*back, rotation[59], data.truth.position[59])
-    loop = RelativePose(
-        0,
-        int(data.truth.keyframe_id[0]),
-        int(data.truth.keyframe_id[59]),
-        True,
-        move + np.array([off_m, 0.0, 0.0]),
-        geometry.quaternion_from_matrix(turn),
-        np.diag([1e-4] * 3 + [1e-6] * 3).ravel(),
-    )
+    true = loop_of(data, 60)
+    loop = dataclasses.replace(true, position=true.position + np.array([off_m, 0.0, 0.0]))
     _, plain = replayed(data)
     backend, estimate = replayed(data, lambda k, _: [loop] if k == 30 else [])
     ends = [float(np.linalg.norm(e.trajectory.position[-1] - data.truth.position[59])) for e in (plain, estimate)]
@@ -338,3 +328,56 @@ def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None
     else:
         assert ends[1] < 1.1 * ends[0]
         assert any("the map stays as it is" in text for text in backend.report.warnings)
+
+
+def loop_of(data: SyntheticData, n: int) -> RelativePose:
+    """Return the true pose of keyframe n - 1 in the first one."""
+    rotation = geometry.matrix_from_quaternion(data.truth.orientation)
+    back = geometry.inverse(rotation[0], data.truth.position[0])
+    turn, move = geometry.compose(*back, rotation[n - 1], data.truth.position[n - 1])
+    first_id, last_id = (int(data.truth.keyframe_id[k]) for k in (0, n - 1))
+    covariance = np.diag([1e-4] * 3 + [1e-6] * 3).ravel()
+    return RelativePose(0, first_id, last_id, True, move, geometry.quaternion_from_matrix(turn), covariance)
+
+
+def test_a_loop_is_closed_while_windows_go_on() -> None:
+    """The solve of everything runs elsewhere; keyframes that come meanwhile are solved, and follow."""
+    data = first(round_trip(0.5), 46)
+    backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
+    backend.adjust_elsewhere = handed.append
+    for _ in backend.replay(stream(data, lambda k, _: [loop_of(data, 40)] if k == 39 else [])):
+        if handed and len(backend.scene.keyframes) == 44:
+            break
+    assert len(handed) == 1 and backend.report.adjustments == 0
+    ids, solves = backend.scene.keyframes.keyframe_id.copy(), backend.solve_count
+
+    def error(k: int) -> float:
+        row = backend.scene.find_keyframe(int(data.truth.keyframe_id[k]))
+        return float(np.linalg.norm(backend.scene.keyframes.position[row] - data.truth.position[k]))
+
+    before = [error(k) for k in (39, len(ids) - 2)]
+    handed[0].run()
+    assert [error(k) for k in (39, len(ids) - 2)] == before, "nothing moves before it is taken in"
+    assert backend.take_adjustment(handed[0]) is not None
+    assert backend.report.adjustments == 1 and backend.solve_count == solves + 1
+    assert max(error(39), error(len(ids) - 2)) < 0.3 * min(before), (before, error(39), error(len(ids) - 2))
+    assert backend.take_adjustment(handed[0]) is None, "it is taken in once"
+
+
+def test_why_no_solve_of_everything_begins_is_said() -> None:
+    """Points have a place, and no keyframe sees enough of them: the map is not bent behind their back."""
+    data = first(round_trip(0.5), 40)
+    backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
+    backend.adjust_elsewhere = handed.append
+    list(backend.replay(stream(data, lambda k, _: [loop_of(data, 36)] if k == 35 else [])))
+    copy = handed[0]._copy
+    handed[0].config = handed[0].config.with_values({"guard.min_points": 1000})
+    before = backend.scene.keyframes.position.copy()
+    handed[0].run()
+    assert handed[0].why.startswith("no solve of everything can begin: no keyframe of the window sees enough points")
+    assert backend.take_adjustment(handed[0]) is None
+    np.testing.assert_array_equal(backend.scene.keyframes.position, before)
+    assert handed[0].why in " ".join(backend.report.warnings)
+    copy.landmarks.has_position[:] = False
+    handed[0].run()
+    assert not handed[0].why and handed[0].taken is None, "without images there is nothing to refine"

@@ -17,11 +17,11 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ba_node.backend import Backend, Check
+from ba_node.backend import Adjustment, Backend, Check
 from ba_node.estimate import Estimate, Iteration, SolveReport, Status
 from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
-from ba_node.ros.worker.inbox import Arrival, Inbox
+from ba_node.ros.worker.inbox import Arrival, Command, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
 from ba_node.ros.worker.latency import Budget, Lag
 
@@ -116,13 +116,21 @@ class Worker:
 
     def check_elsewhere(self, check: Check) -> None:
         """Check a set-up on a thread of its own, so that no keyframe waits; what is found comes back as a command."""
+        self._elsewhere("setup_check", check.run, lambda backend: backend.take_check(check))
+
+    def adjust_elsewhere(self, adjustment: Adjustment) -> None:
+        """Bend and refine a copy of the map likewise."""
+        self._elsewhere("adjustment", adjustment.run, lambda backend: backend.take_adjustment(adjustment))
+
+    def _elsewhere(self, name: str, work: Callable[[], object], then: Command) -> None:
+        """Do something on a thread of its own, and then something on the solver's."""
 
         def run() -> None:
-            check.run()
-            self._inbox.post(lambda backend: backend.take_check(check))
+            self._guard(work)
+            self._inbox.post(then)
 
         # Not a daemon: Python must not end while the kernels run.
-        threading.Thread(target=run, name="setup_check", daemon=False).start()
+        threading.Thread(target=run, name=name, daemon=False).start()
 
     def outputs(self) -> list[Output]:
         """Return what has come out since the last call, oldest first."""
@@ -262,7 +270,7 @@ class Worker:
         for notice in notices:
             self._put(notice)
 
-    def _guard(self, action: Callable[..., None], *arguments: object) -> None:
+    def _guard(self, action: Callable[..., object], *arguments: object) -> None:
         """Run one step of the work; a fault in it is reported and costs that step only.
 
         One that would end the thread, as SystemExit does, is none of its business either.

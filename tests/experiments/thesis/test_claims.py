@@ -185,6 +185,14 @@ class TestRecorded:
             "a table that nobody can read"
         )
 
+    def test_a_second_run_is_set_beside_them(self, recorded: Results) -> None:
+        words = {claim.text: verdict_on(claim, recorded).word for claim in CLAIMS}
+        same = claims_page(recorded, {"kernels": "C++, avx2", "verdicts": words})
+        assert f"A second run (C++, avx2) gives the same verdict on {len(CLAIMS)} of them.\n" in same
+        first = CLAIMS[0].text
+        other = claims_page(recorded, {"kernels": "numpy", "verdicts": words | {first: HOLDS_NOT}})
+        assert f"verdict on {len(CLAIMS) - 1} of them; another one on 1 (holds not).\n" in other
+
     def test_the_other_page_shows_every_finding_and_its_pictures(self, recorded: Results) -> None:
         page = open_page(recorded)
         assert all(finding.text in page for finding in FINDINGS)
