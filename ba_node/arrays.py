@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the types of arrays (shape and unit stand beside each use), and what numpy lacks."""
 
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +12,15 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 IdArray = NDArray[np.uint64]
 
+Record = TypeVar("Record")
+
 
 def ranges(begin: IntArray, end: IntArray) -> IntArray:
     """Return the integers from each of ``begin`` (n,) up to its ``end``, one after the other."""
     count = end - begin
     return np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
+
+
+def take_rows(record: Record, rows: Any) -> Record:
+    """Return a dataclass of arrays with some rows of each; fields that are no arrays stay."""
+    return type(record)(*(value[rows] if isinstance(value, np.ndarray) else value for value in vars(record).values()))

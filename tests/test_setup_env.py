@@ -279,8 +279,8 @@ def test_only_interfaces_that_no_wheel_brought_are_built(tmp_path: Path, monkeyp
     environment.interfaces()
     (tmp_path / "share" / "tf2_msgs").mkdir(parents=True)
     environment.interfaces()
-    assert sorted(built[:2]) == ["ba_msgs", "tf2_msgs"]
-    assert built[2:] == ["ba_msgs"]
+    assert sorted(built[:3]) == ["ba_msgs", "rtabmap_msgs", "tf2_msgs"]
+    assert sorted(built[3:]) == ["ba_msgs", "rtabmap_msgs"]
 
 
 def test_what_was_built_before_is_removed_first(tmp_path: Path) -> None:

@@ -3,8 +3,8 @@
 """Make .venv: ROS 2 Jazzy from wheels, ba_msgs built into it, ba_node installed from this folder.
 
 Needs Python's standard library only, and does nothing when .venv is up to date. Three steps, each with a
-digest of its inputs in .venv/setup.json: `packages` (a new environment), `interfaces` (ba_msgs, and for the tests
-tf2_msgs, which is not among the wheels), `project`.
+digest of its inputs in .venv/setup.json: `packages` (a new environment), `interfaces` (ba_msgs, and for the tests what
+of tf2_msgs and rtabmap_msgs they use, which are not among the wheels), `project`.
 """
 
 from __future__ import annotations  # so that an older Python comes as far as check_python
@@ -45,7 +45,11 @@ STATE = "setup.json"
 LOG = "setup.log"
 STEPS = ("packages", "interfaces", "project")
 # Interface packages to build, and where they are defined. One that a wheel has brought is left as it is.
-INTERFACES = {"ba_msgs": "msg_defs", "tf2_msgs": "tests/ros/interfaces/tf2_msgs"}
+INTERFACES = {
+    "ba_msgs": "msg_defs",
+    "rtabmap_msgs": "tests/ros/interfaces/rtabmap_msgs",
+    "tf2_msgs": "tests/ros/interfaces/tf2_msgs",
+}
 
 # What makes the environment: a change in it makes it anew.
 TOOLS = ("env_checks.py", "setup_env.py", "venv_hook.py")

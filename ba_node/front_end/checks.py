@@ -20,6 +20,8 @@ from ba_node.measurements import CameraRig
 # Spread of grey values below which there is nothing in an image.
 _DARK = 2.5
 _BACK_NS = 1_000_000_000
+# An optical axis farther from the middle than this share of the image is that of another image.
+_OFF_CENTRE = 0.25
 # A pair of which so few features have a partner is looked at with left and right exchanged.
 _FEW_PARTNERS = 0.25
 # Share of an image that is found in any other by chance.
@@ -67,6 +69,15 @@ class ImageWatch:
                     notes,
                 )
                 return None
+            centre = self._rig.intrinsics[index, 2:] / size
+            if (np.abs(centre - 0.5) > _OFF_CENTRE).any():
+                at, name = self._rig.intrinsics[index, 2:], self._rig.names[index]
+                self.say(
+                    "centre",
+                    f"camera {index} ({name!r}): its optical axis is at {at[0]:.0f}, {at[1]:.0f} px in images of"
+                    f" {size[0]} x {size[1]} px: check that its calibration is of this resolution",
+                    notes,
+                )
         if float(images.grey[0][::4, ::4].std()) < _DARK:
             self.say(
                 "dark",

@@ -37,30 +37,19 @@ class Depths:
         """Return where something was found: (n,)."""
         return np.isfinite(self.inverse_depth)
 
-    def __getitem__(self, rows: BoolArray) -> Depths:
-        """Return some of them."""
-        return Depths(
-            self.measures,
-            self.inverse_depth[rows],
-            self.sigma[rows],
-            self.slant[rows],
-            self.disparity[rows],
-            self.disparity_sigma[rows],
-        )
-
 
 def measure_depths(
     frame: Frame, rig: IdealRig, uv: FloatArray, first: FloatArray, side: int, alignment: StereoAlignment
 ) -> Depths:
     """Measure inverse depths at uv (n, 2), px; ``first`` are inverse depths (n,) that are known, NaN where none is."""
-    n = len(uv)
-    blank = [np.full(n, np.nan) for _ in range(4)]
-    nothing = Depths(False, blank[0], blank[1], np.zeros((n, 2)), blank[2], blank[3])
     if frame.right is not None and rig.baseline:
         return _stereo(frame, rig, uv, first, side, alignment)
+    w, none = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
     if frame.depth is not None:
-        return _depth(frame, uv, nothing)
-    return nothing
+        at = np.round(uv).astype(int)
+        z = frame.depth[at[:, 1], at[:, 0]].astype(np.float64)
+        w[z > 0.0] = 1.0 / z[z > 0.0]
+    return Depths(frame.depth is not None, w, w * _DEPTH_SHARE, np.zeros((len(uv), 2)), none, none)
 
 
 def _stereo(
@@ -93,11 +82,3 @@ def _learn_rows(frame: Frame, uv: FloatArray, found: stereo.Disparities, side: i
     sigma = np.sqrt(np.maximum(there.covariance[:, 1, 1], 0.0))
     good = (there.correlation > _SAME) & (sigma < _SURE_PX) & (np.abs(there.uv - first).max(axis=1) < _MOST_OFF_PX)
     alignment.learn_rows(uv[rows][good], (there.uv[:, 1] - uv[rows, 1])[good], sigma[good])
-
-
-def _depth(frame: Frame, uv: FloatArray, nothing: Depths) -> Depths:
-    assert frame.depth is not None
-    at = np.round(uv).astype(int)
-    z = frame.depth[at[:, 1], at[:, 0]].astype(np.float64)
-    w = np.where(z > 0.0, 1.0 / np.where(z > 0.0, z, 1.0), np.nan)
-    return Depths(True, w, w * _DEPTH_SHARE, nothing.slant, nothing.disparity, nothing.disparity_sigma)

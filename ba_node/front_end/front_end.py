@@ -257,7 +257,7 @@ class FrontEnd:
             else:
                 found = tracker.locate()
             if found is not None:
-                self._motion = _IDENTITY if self._lost else tracker.pose.after(before.pose.inverse())
+                self._motion = _IDENTITY if self._lost else tracker.pose.after(before["pose"].inverse())
                 self._odometry = odometry
                 return found
             tracker.restore(before)

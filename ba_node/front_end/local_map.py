@@ -38,10 +38,6 @@ class Warp:
     bend: FloatArray  # (n, 2) g, 1/px
     depth: FloatArray  # (n,) m in that camera
 
-    def __getitem__(self, rows: IntArray) -> Warp:
-        """Return some of them."""
-        return Warp(self.uv[rows], self.affine[rows], self.bend[rows], self.depth[rows])
-
     @property
     def scale(self) -> FloatArray:
         """Return how much larger patches appear than in their anchor: (n,)."""

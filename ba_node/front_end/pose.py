@@ -10,6 +10,7 @@ depth, which matters for a camera that has come nearer and not for its turn.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,24 +35,13 @@ class Seen:
     sigma: FloatArray  # (n,) of u and of v, px
     along: FloatArray  # (n, 3) one standard deviation of the point by its depth, a vector in the map, m
 
-    def __getitem__(self, rows: BoolArray) -> Seen:
-        """Return some of them."""
-        return Seen(self.points[rows], self.uv[rows], self.sigma[rows], self.along[rows])
-
 
 def consensus(rig: IdealRig, seen: Seen, error_px: float) -> tuple[Transform, BoolArray] | None:
     """Return camera from map, and which points agree with it to so many pixels; None where RANSAC finds nothing."""
     if len(seen.points) < 4:
         return None
-    width, height = rig.size
-    camera = {"model": "PINHOLE", "width": width, "height": height, "params": [rig.focal, rig.focal, *rig.centre]}
-    pose, info = poselib().estimate_absolute_pose(
-        seen.uv,
-        seen.points,
-        camera,
-        {"max_reproj_error": error_px, "min_iterations": 50, "max_iterations": 1000, "seed": 1},
-        {},
-    )
+    options = {"max_reproj_error": error_px, "min_iterations": 50, "max_iterations": 1000, "seed": 1}
+    pose, info = poselib().estimate_absolute_pose(seen.uv, seen.points, _camera(rig), options, {})
     agree = np.array(info.get("inliers", []), dtype=bool)
     if agree.shape != (len(seen.points),) or agree.sum() < 4:
         return None
@@ -62,15 +52,18 @@ def relative(rig: IdealRig, before: FloatArray, now: FloatArray, error_px: float
     """Return camera now from camera before, 1 apart, by what both see (n, 2), px, and which agree."""
     if len(before) < 8:
         return None
-    width, height = rig.size
-    camera = {"model": "PINHOLE", "width": width, "height": height, "params": [rig.focal, rig.focal, *rig.centre]}
     options = {"max_epipolar_error": error_px, "min_iterations": 100, "max_iterations": 2000, "seed": 1}
-    pose, info = poselib().estimate_relative_pose(before, now, camera, camera, options, {})
+    pose, info = poselib().estimate_relative_pose(before, now, _camera(rig), _camera(rig), options, {})
     agree = np.array(info.get("inliers", []), dtype=bool)
     length = float(np.linalg.norm(pose.t))
     if agree.shape != (len(before),) or agree.sum() < 8 or length < 1e-9:
         return None
     return Transform(np.array(pose.R), np.array(pose.t) / length), agree
+
+
+def _camera(rig: IdealRig) -> dict[str, Any]:
+    width, height = rig.size
+    return {"model": "PINHOLE", "width": width, "height": height, "params": [rig.focal, rig.focal, *rig.centre]}
 
 
 def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Transform, FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ Features are looked for there and told in pixels of the raw images, which are wh
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -44,7 +45,6 @@ class Camera:
     # (h, w) each: where the pixels of the ideal image are in the raw one; None where both are the same
     maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None
     inside: BoolArray | None  # (h, w) pixels of the ideal image that the raw one has; None if all
-    size: tuple[int, int]  # width and height of the raw image, px; 0 if not known
 
 
 @dataclass(frozen=True)
@@ -105,11 +105,11 @@ def ideal_rig(rig: CameraRig, first_size: tuple[int, int]) -> IdealRig:
     turns = [rotation.T @ axes for rotation in body_from_raw]
     focal, centre, size = _common(lenses, turns, sizes)
     ideal = IdealRig(focal, centre, size, baseline, Transform(axes, rig.position[0]), ())
-    made = tuple(_camera(ideal, *of) for of in zip(lenses, turns, sizes, strict=True))
-    if all(camera.maps is None for camera in made):
-        return IdealRig(focal, centre, size, baseline, ideal.body_from_camera, made)
-    made = tuple(_camera(ideal, *of, keep=True) for of in zip(lenses, turns, sizes, strict=True))
-    return IdealRig(focal, centre, size, baseline, ideal.body_from_camera, made)
+    plain = _is_ideal(lenses, turns) and len(set(sizes)) == 1
+    made = [Camera(*lens, turn, None, None) for lens, turn in zip(lenses, turns, strict=True)]
+    if not plain:
+        made = [_mapped(ideal, camera, size) for camera, size in zip(made, sizes, strict=True)]
+    return dataclasses.replace(ideal, cameras=tuple(made))
 
 
 def _axes(rig: CameraRig, body_from_raw: FloatArray) -> tuple[FloatArray, float]:
@@ -149,10 +149,8 @@ def _common(
         ray = cameras.rays(_border(size), np.full(4 * _STEPS, model), np.tile(params, (4 * _STEPS, 1))) @ turn
         seen = ray[np.isfinite(ray).all(axis=1) & (ray[:, 2] > 1e-3)]
         flat = seen[:, :2] / seen[:, 2:]
-        low, high = (
-            np.minimum(low, flat.min(axis=0, initial=np.inf)),
-            np.maximum(high, flat.max(axis=0, initial=-np.inf)),
-        )
+        low = np.minimum(low, flat.min(axis=0, initial=np.inf))
+        high = np.maximum(high, flat.max(axis=0, initial=-np.inf))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise FrontEndError("camera rig: the border of the image has no rays: check distortion and image size")
     reach = _LARGEST * np.array(sizes[0]) / 2.0 / focal
@@ -182,23 +180,14 @@ def _is_ideal(lenses: list[tuple[cameras.Model, FloatArray]], turns: list[FloatA
     return bool(flat and alike and square and tilt * first[cameras.FX] < _SAME_PX)
 
 
-def _camera(
-    ideal: IdealRig, lens: tuple[cameras.Model, FloatArray], turn: FloatArray, size: tuple[int, int], keep: bool = False
-) -> Camera:
-    bare = Camera(lens[0], lens[1], turn, None, None, size)
-    if (
-        not keep
-        and _is_ideal([lens], [turn])
-        and ideal.size == size
-        and np.allclose([ideal.focal, *ideal.centre], lens[1][[cameras.FX, cameras.CX, cameras.CY]], atol=_SAME_PX)
-    ):
-        return bare
+def _mapped(ideal: IdealRig, bare: Camera, size: tuple[int, int]) -> Camera:
+    """Return a camera with the maps from its ideal image to the raw one."""
     x, y = np.meshgrid(np.arange(ideal.size[0], dtype=float), np.arange(ideal.size[1], dtype=float))
     uv = _project(bare, ideal.rays(np.column_stack([x.ravel(), y.ravel()]))).reshape(*x.shape, 2)
     inside: BoolArray = np.logical_and((uv >= 0.0).all(axis=2), (uv <= np.array(size) - 1.0).all(axis=2))
     flat = np.nan_to_num(uv, nan=-1e4).astype(np.float32)
     maps = (np.ascontiguousarray(flat[..., 0]), np.ascontiguousarray(flat[..., 1]))
-    return Camera(*lens, turn, maps, None if inside.all() else inside, size)
+    return dataclasses.replace(bare, maps=maps, inside=None if inside.all() else inside)
 
 
 def _project(camera: Camera, rays: FloatArray) -> FloatArray:

@@ -27,7 +27,8 @@ MASK = "mask"
 RECTIFIED = "image_rect"
 # Images further apart are never of one time, ns; what is nearer but not near enough, the front-end says.
 MAX_APART_NS = 50_000_000
-_KEPT_POSES = 2000
+# A pose so near is that of a time; stamps are rounded in files. Between poses further apart nothing is known.
+_SAME_NS, _GAP_NS = 100_000, 1_000_000_000
 
 
 class Frame(NamedTuple):
@@ -125,9 +126,10 @@ class Streams:
 
 
 class OdometryBuffer:
-    """Poses of the body by time."""
+    """Poses of the body by time; the newest ``keep`` of them at least half."""
 
-    def __init__(self) -> None:
+    def __init__(self, keep: int = 2000) -> None:
+        self._keep = keep
         self._stamps: list[int] = []
         self._poses: list[Transform] = []
 
@@ -141,8 +143,8 @@ class OdometryBuffer:
                 return
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
-        if len(self._stamps) > _KEPT_POSES:
-            del self._stamps[: _KEPT_POSES // 2], self._poses[: _KEPT_POSES // 2]
+        if len(self._stamps) > self._keep:
+            del self._stamps[: self._keep // 2], self._poses[: self._keep // 2]
 
     def covers(self, stamp_ns: int) -> bool:
         """Return True if no later pose is needed to tell the one at a time."""
@@ -151,10 +153,11 @@ class OdometryBuffer:
     def at(self, stamp_ns: int) -> Transform | None:
         """Return the pose at a time, between its neighbours on a straight way at even speed; None outside."""
         i = bisect_left(self._stamps, stamp_ns)
-        if i == len(self._stamps) or (i == 0 and self._stamps[0] != stamp_ns):
+        for near in (i, i - 1):
+            if 0 <= near < len(self._stamps) and abs(self._stamps[near] - stamp_ns) <= _SAME_NS:
+                return self._poses[near]
+        if i in (0, len(self._stamps)) or self._stamps[i] - self._stamps[i - 1] > _GAP_NS:
             return None
-        if self._stamps[i] == stamp_ns:
-            return self._poses[i]
         before, after = self._poses[i - 1], self._poses[i]
         share = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
         turn = geometry.so3_log((before.rotation.T @ after.rotation)[None])[0]

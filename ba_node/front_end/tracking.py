@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray, take_rows
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.estimate import Transform
 from ba_node.front_end import features, patches, pose
@@ -59,16 +60,6 @@ class Content:
     sigma: FloatArray  # (n,) px
     depths: Depths  # of the same rows
     added: FloatArray  # (n,) how disparities were corrected, px
-
-
-@dataclass(frozen=True)
-class Followed:
-    """Where the tracker was."""
-
-    rows: IntArray
-    uv: FloatArray
-    frame: Frame | None
-    pose: Transform
 
 
 class Tracker:
@@ -120,7 +111,7 @@ class Tracker:
         if found is None or found[1].sum() < self.options.min_points:
             return None
         start, agree = found
-        refined, covariance, _ = pose.refine(self.rig, seen[agree], start)
+        refined, covariance, _ = pose.refine(self.rig, take_rows(seen, agree), start)
         keep = np.ones(len(self.rows), bool)
         keep[known] = self._agreeing(seen, refined)
         if keep[known].sum() < self.options.min_points:
@@ -151,13 +142,13 @@ class Tracker:
         """Take a first image and where it was taken."""
         self.frame, self.pose = frame, camera_from_map
 
-    def state(self) -> Followed:
-        """Return what :meth:`restore` needs."""
-        return Followed(self.rows, self.uv, self.frame, self.pose)
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`restore` undoes, what was done with images since, by."""
+        return {name: getattr(self, name) for name in ("rows", "uv", "frame", "pose")}
 
-    def restore(self, before: Followed) -> None:
-        """Undo what was done with images since."""
-        self.rows, self.uv, self.frame, self.pose = before.rows, before.uv, before.frame, before.pose
+    def restore(self, before: Mapping[str, Any]) -> None:
+        """Be again as before an image."""
+        vars(self).update(before)
 
     @property
     def keyframe_pose(self) -> Transform:
@@ -241,7 +232,7 @@ class Tracker:
             keep[old:] = depths.found[old:]
         fresh_rows = self.map.add(place, uv[old:][keep[old:]], patches.cut(frame.soft, uv[old:][keep[old:]], self.side))
         rows = np.concatenate([self.rows, fresh_rows])
-        uv, sigma, depths = uv[keep], sigma[keep], depths[keep]
+        uv, sigma, depths = uv[keep], sigma[keep], take_rows(depths, keep)
         fresh = np.arange(len(rows)) >= old
         self._renew(frame, place, rows, uv, depths, fresh)
         self.map.last_seen[rows] = place
@@ -371,7 +362,7 @@ class Tracker:
         rows_of = rows_of[np.argsort(-self.map.last_seen[rows[rows_of]], kind="stable")[:_LOOKED_FOR]]
         at = np.round(warp.uv[rows_of]).astype(int)
         rows_of = rows_of[frame.allowed[at[:, 1], at[:, 0]]]
-        rows, warp = rows[rows_of], warp[rows_of]
+        rows, warp = rows[rows_of], take_rows(warp, rows_of)
         uv, sigma, good = self._aligned(frame, rows, warp.uv, warp, _SAME_AGAIN, _AGAIN_PX)
         if not good.any():
             return

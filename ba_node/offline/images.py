@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -68,6 +68,7 @@ class ImageRequest:
     rectified: bool = False  # p of camera_info is the camera; so it is where topics are called image_rect
     base: str = ""  # body frame in /tf_static, empty for the first camera
     rate_hz: float = 10.0  # of a folder whose pictures have no stamps
+    poses: OdometryBuffer | None = None  # of an odometry that comes from elsewhere
 
 
 @dataclass
@@ -101,9 +102,14 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     chosen = _image_topics(reader, request)
     mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
     rig = _first_cameras(request.rig or _recorded_rig(reader, request, chosen, mode), mode, str(reader.path))
-    odometry = request.topics.get("odometry")
+    odometry = absolute(request.topics["odometry"]) if "odometry" in request.topics else ""
     topics = {topic: name for name, topic in chosen.items()}
-    source = ImageSource(rig, mode, 0, lambda: _frames(reader, source, topics, odometry and absolute(odometry)))
+
+    def read() -> Iterator[tuple[Images, Transform | None]]:
+        poses = OdometryBuffer() if odometry else request.poses
+        return _paired(source, _messages(reader, source, topics, odometry, poses), poses)
+
+    source = ImageSource(rig, mode, 0, read)
     source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
     return source
 
@@ -163,12 +169,28 @@ def _info_of(reader: BagReader, image: str, *, alone: bool = False) -> str:
     return infos[0] if alone and beside not in infos and len(infos) == 1 else beside
 
 
-def _frames(
-    reader: BagReader, source: ImageSource, topics: Mapping[str, str], odometry: str | None
+def _paired(
+    source: ImageSource, entries: Iterator[tuple[str, int, Any]], poses: OdometryBuffer | None
 ) -> Iterator[tuple[Images, Transform | None]]:
-    """Yield frames by time. Odometry comes from its topic, each frame waiting until it is known."""
-    streams, buffer = Streams(MODES[source.mode], frozenset(), _QUEUE), OdometryBuffer()
-    tree, waiting = static_tree(reader), []
+    """Yield images by time, of entries (stream, stamp in ns, message) in order; each waits until its pose is known."""
+    streams, waiting = Streams(MODES[source.mode], frozenset(), _QUEUE), deque[Frame]()
+    source.counted.clear()
+    for name, stamp_ns, message in entries:
+        waiting += streams.put(name, stamp_ns, message)
+        while waiting and (poses is None or poses.covers(waiting[0].stamp_ns)):
+            yield from _read(source, waiting.popleft(), poses)
+    for frame in (*waiting, *streams.flush()):
+        yield from _read(source, frame, poses)
+    source.counted.update(streams.counted)
+    for name, apart_ns in streams.apart_ns.items():
+        source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+
+
+def _messages(
+    reader: BagReader, source: ImageSource, topics: Mapping[str, str], odometry: str, poses: OdometryBuffer | None
+) -> Iterator[tuple[str, int, Any]]:
+    """Yield images of a recording; poses of its odometry go into the buffer."""
+    tree = static_tree(reader)
     for topic, _, _, data in reader.messages([*topics, *([odometry] if odometry else [])]):
         try:
             message = reader.decode(topic, data)
@@ -176,42 +198,30 @@ def _frames(
             _leave(source, "undecodable", str(error))
             continue
         stamp_ns = stamp_ns_from_message(message.header.stamp)
-        if topic == odometry:
-            pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
-            child, body = str(message.child_frame_id), source.rig.frame_id
-            place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
-            if place is None:
-                words = f"it is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
-                source.counted["odometry of another frame"], source.notes["odometry of another frame"] = 1, words
-            buffer.add(stamp_ns, pose if place is None else pose.after(place))
-        else:
-            waiting += streams.put(topics[topic], stamp_ns, message)
-        while waiting and (odometry is None or buffer.covers(waiting[0].stamp_ns)):
-            yield from _with_odometry(source, waiting.pop(0), buffer if odometry else None)
-    for frame in (*waiting, *streams.flush()):
-        yield from _with_odometry(source, frame, buffer if odometry else None)
-    source.counted.update(streams.counted)
-    for name, apart_ns in streams.apart_ns.items():
-        source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+        if topic != odometry or poses is None:
+            yield topics[topic], stamp_ns, message
+            continue
+        pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
+        child, body = str(message.child_frame_id), source.rig.frame_id
+        place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
+        if place is None:
+            words = f"it is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
+            source.counted["odometry of another frame"], source.notes["odometry of another frame"] = 1, words
+        poses.add(stamp_ns, pose if place is None else pose.after(place))
 
 
-def _with_odometry(source: ImageSource, frame: Frame, buffer: OdometryBuffer | None) -> Iterator[Any]:
-    """Yield a frame with the odometry of its time; nothing where that is not known, which is counted."""
-    pose = None if buffer is None else buffer.at(frame.stamp_ns)
-    if buffer is not None and pose is None:
+def _read(source: ImageSource, frame: Frame, poses: OdometryBuffer | None) -> Iterator[tuple[Images, Transform | None]]:
+    """Yield what a frame shows and the pose of its time; nothing where either is not to be had, which is counted."""
+    pose = None if poses is None else poses.at(frame.stamp_ns)
+    if poses is not None and pose is None:
         _leave(source, "no odometry", f"none at stamp {frame.stamp_ns} ns")
-    else:
-        yield from _read(source, frame, pose)
-
-
-def _read(source: ImageSource, frame: Frame, odometry: Transform | None) -> Iterator[tuple[Images, Transform | None]]:
-    """Yield what a frame shows; nothing where it cannot be read, which is counted."""
+        return
     try:
         images = images_of(frame, source.mode)
     except FrontEndError as error:
         _leave(source, "unreadable", f"image of stamp {frame.stamp_ns} ns: {error}")
         return
-    yield images, odometry
+    yield images, pose
 
 
 def _leave(source: ImageSource, reason: str, words: str) -> None:
@@ -234,9 +244,31 @@ def _of_folder(path: Path, request: ImageRequest) -> ImageSource:
             f"{path}: no pictures ({', '.join(PICTURES)}), neither here nor in left/ and right/, rgb/ and depth/"
         )
     rig = _first_cameras(request.rig or _rig_of_folder(path, request, len(cameras_of(mode))), mode, str(path))
-    stamps = [_stamps(path, files, request.rate_hz) for files in pictures]
-    source = ImageSource(rig, mode, len(pictures[0]), lambda: _read_folder(source, pictures, stamps))
+    entries = sorted(
+        (stamp_ns, place, file)
+        for place, files in enumerate(pictures)
+        for stamp_ns, file in zip(_stamps(path, files, request.rate_hz), files, strict=True)
+    )
+    streams = MODES[mode]
+
+    def read() -> Iterator[tuple[Images, Transform | None]]:
+        files = ((streams[place], stamp_ns, _Picture(file)) for stamp_ns, place, file in entries)
+        return _paired(source, files, request.poses)
+
+    source = ImageSource(rig, mode, len(pictures[0]), read)
     return source
+
+
+class _Picture:
+    """A file, with the fields of a CompressedImage."""
+
+    def __init__(self, file: Path) -> None:
+        self._file, self.format = file, file.suffix[1:]
+
+    @property
+    def data(self) -> bytes:
+        """Return its content, which is read when it is looked at."""
+        return self._file.read_bytes()
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -269,53 +301,38 @@ def _first_cameras(rig: CameraRig, mode: str, where: str) -> CameraRig:
 
 def _kitti_rig(path: Path, cameras: int) -> CameraRig:
     """Return the rectified cameras of rows of 12 numbers, each with or without a name before it."""
-    rows = [re.sub(r"^\w+:", "", line).split() for line in path.read_text().splitlines()]
+    rows = _numbers(path, 12)
+    if len(rows) < cameras:
+        raise BagError(f"{path}: {len(rows)} rows of 12 numbers, the projection of a camera each: expected {cameras}")
     infos = [
         SimpleNamespace(
             header=SimpleNamespace(frame_id=f"camera{i}"), width=0, height=0, k=[], d=[], r=np.eye(3).reshape(-1),
-            p=[float(value) for value in row], distortion_model="", binning_x=0, binning_y=0,
+            p=row, distortion_model="", binning_x=0, binning_y=0,
         )
-        for i, row in enumerate(row for row in rows if len(row) == 12)
-    ][:cameras]  # fmt: skip
+        for i, row in enumerate(rows[:cameras])
+    ]  # fmt: skip
     return rig_from_infos(infos, rectified=True)
+
+
+def _numbers(path: Path, least: int) -> list[list[float]]:
+    """Return the numbers of each line of so many words at least, without a name before them."""
+    lines = [re.sub(r"^\w+:", "", line).split() for line in path.read_text(errors="replace").splitlines()]
+    try:
+        return [[float(word) for word in words] for words in lines if len(words) >= least]
+    except ValueError as error:
+        raise BagError(f"{path}: {error}") from None
 
 
 def _stamps(path: Path, files: Sequence[Path], rate_hz: float) -> list[int]:
     """Return when each picture was taken, ns."""
     times = path / "times.txt"
     if times.exists():
-        seconds = [float(line.split()[0]) for line in times.read_text().splitlines() if line.strip()]
-        if len(seconds) < len(files):
-            raise BagError(f"{times}: {len(seconds)} lines for {len(files)} pictures")
+        seconds = [row[0] for row in _numbers(times, 1)]
+        if len(seconds) < len(files) or not np.isfinite(seconds).all():
+            raise BagError(f"{times}: {len(seconds)} lines for {len(files)} pictures, expected a time in s for each")
         return [_BEGIN_NS + round(one * 1e9) for one in seconds[: len(files)]]
     if all(file.stem.isdigit() and len(file.stem) >= _NS_DIGITS for file in files):
         return [int(file.stem) for file in files]
     if all(re.fullmatch(r"\d{6,}\.\d+", file.stem) for file in files):
         return [round(float(file.stem) * 1e9) for file in files]
     return [_BEGIN_NS + round(i / rate_hz * 1e9) for i in range(len(files))]
-
-
-def _read_folder(
-    source: ImageSource, pictures: Sequence[Sequence[Path]], stamps: Sequence[Sequence[int]]
-) -> Iterator[tuple[Images, Transform | None]]:
-    names = MODES[source.mode]
-    streams = Streams(names, frozenset(), _QUEUE)
-    entries = [
-        (stamp_ns, place, file)
-        for place, files in enumerate(pictures)
-        for stamp_ns, file in zip(stamps[place], files, strict=True)
-    ]
-    for stamp_ns, place, file in sorted(entries):
-        message = SimpleNamespace(format=file.suffix[1:], data=file)
-        for frame in streams.put(names[place], stamp_ns, message):
-            yield from _read(source, _loaded(frame), None)
-    for frame in streams.flush():
-        yield from _read(source, _loaded(frame), None)
-    source.counted.update(streams.counted)
-
-
-def _loaded(frame: Frame) -> Frame:
-    """Return a frame with the content of its files."""
-    files = frame.messages.items()
-    data = {name: SimpleNamespace(format=one.format, data=one.data.read_bytes()) for name, one in files}
-    return frame._replace(messages=data)

@@ -3,7 +3,8 @@
 """Track the images of a recording or a folder, and write what comes of it as a recording of keyframes and tracks.
 
 The back-end runs along: what it refines goes back to the tracker, as it does live. The recording holds what the tracker
-told, not what was refined.
+told, not what was refined. Where the second camera turns out to be far from where the rig has it, images are tracked
+once more with what was learned.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.config.front_end import FrontEndOptions
@@ -25,14 +27,15 @@ from ba_node.core import geometry
 from ba_node.estimate import Poses, Transform
 from ba_node.front_end import FrontEnd, Images, State, Tracked
 from ba_node.front_end.images import read_mask
+from ba_node.front_end.streams import OdometryBuffer
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.offline.images import ImageRequest, ImageSource, open_images
 from ba_node.offline.recording import record
 
-# Poses of an odometry further from an image than this are none of its time.
-_APART_NS = 50_000_000
 _TRUTH = "poses.txt"
+# A second camera that is turned by more, px, spoils the keyframes from before that is known.
+_FAR_OFF_PX = 0.5
 
 
 class TrackError(ValueError):
@@ -65,18 +68,31 @@ def track(
         TrackError: no keyframe came of the images.
         OSError: a file cannot be read or written.
     """
-    with open_images(path, request.images) as source:
-        run = _Run(source, request, clock)
-        for done, (images, odometry) in enumerate(source.read(), start=1):
-            run.take(images, odometry)
-            progress(done, source.total)
-        run.end()
+    poses = None if request.odometry is None else _poses(request.odometry)
+    with open_images(path, dataclasses.replace(request.images, poses=poses)) as source:
+        run = _Run(source, request, clock).track(progress)
+        turn = run.learned()
+        if turn is not None and np.abs(turn).max() > _FAR_OFF_PX and run.keyframes:
+            # The first keyframes were measured before it was known: once more, with what is known now.
+            options = dataclasses.replace(request.options, stereo_yaw_px=float(turn[0]), stereo_roll_px=float(turn[1]))
+            run = _Run(source, dataclasses.replace(request, options=options), clock).track(progress)
         if not run.keyframes:
-            why = run.notes[-1] if run.notes else _left_out(source) or "no image could be used"
+            why = "; ".join(run.notes) or "no image could be used"
             raise TrackError(f"{path}: no keyframe came of {source.total} images: {why}")
         truth = _truth(path, source, run)
         count = record(out, run.timeline(), truth)
         return run.report() | {"source": path.name, "messages": count, "truth": truth is not None}
+
+
+def _poses(path: Path) -> OdometryBuffer:
+    """Return the poses of an odometry, fixed frame from body, in a TUM file."""
+    poses = read_tum(path)
+    buffer = OdometryBuffer(len(poses))
+    for stamp_ns, *pose in zip(
+        poses.stamp_ns.tolist(), geometry.matrix_from_quaternion(poses.orientation), poses.position, strict=True
+    ):
+        buffer.add(stamp_ns, Transform(*pose))
+    return buffer
 
 
 class _Run:
@@ -94,15 +110,29 @@ class _Run:
         self._clock = clock
         self._front_end: FrontEnd | None = None
         self._backend = Backend(request.config)
-        self._odometry = None if request.odometry is None else read_tum(request.odometry)
-        if self._odometry is not None:
-            self._rotation = geometry.matrix_from_quaternion(self._odometry.orientation)
 
-    def take(self, images: Images, odometry: Transform | None) -> None:
+    def track(self, progress: Callable[[int, int], None]) -> _Run:
+        """Track all images; say what was left out."""
+        for done, (images, odometry) in enumerate(self.source.read(), start=1):
+            self._take(images, odometry)
+            progress(done, self.source.total)
+        left = _left_out(self.source)
+        if left:
+            self.notes.append(left)
+        if self.states[State.LOST.value]:
+            self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
+        return self
+
+    def learned(self) -> FloatArray | None:
+        """Return yaw and roll of the second camera as learned, px; None of one camera."""
+        turn = None if self._front_end is None else self._front_end.alignment
+        return None if turn is None or len(self.rig) < 2 else turn[0]
+
+    def _take(self, images: Images, odometry: Transform | None) -> None:
         """Track images."""
         began = self._clock()
         front_end = self._front_end or self._begin(images)
-        tracked = front_end.process(images, odometry or self._pose_at(images.stamp_ns))
+        tracked = front_end.process(images, odometry)
         self.busy_s += self._clock() - began
         self.stamps.append(images.stamp_ns)
         self.states[tracked.state.value] += 1
@@ -121,22 +151,6 @@ class _Run:
         self._backend.add(self.rig)
         return self._front_end
 
-    def _pose_at(self, stamp_ns: int) -> Transform | None:
-        """Return the odometry of a time from the file: the nearest pose, if it is near."""
-        if self._odometry is None:
-            return None
-        stamps = self._odometry.stamp_ns
-        after = bisect_left(stamps, stamp_ns)
-        near = min(
-            (i for i in (after - 1, after) if 0 <= i < len(stamps)), key=lambda i: abs(int(stamps[i]) - stamp_ns)
-        )
-        if abs(int(stamps[near]) - stamp_ns) > _APART_NS:
-            raise TrackError(
-                f"{self.request.odometry}: no pose within {_APART_NS * 1e-9:g} s of the image at {stamp_ns} ns;"
-                f" the nearest is at {int(stamps[near])} ns"
-            )
-        return Transform(self._rotation[near], self._odometry.position[near])
-
     def _add(self, tracked: Tracked, front_end: FrontEnd) -> None:
         """Keep what came of images, and refine the tracker's map."""
         for measurement in tracked.measurements():
@@ -149,14 +163,6 @@ class _Run:
             estimate = self._backend.solve()
             if estimate is not None and estimate.report.status.usable:
                 front_end.refine(estimate.refined, estimate.cloud)
-
-    def end(self) -> None:
-        """Say what was left out."""
-        left = _left_out(self.source)
-        if left:
-            self.notes.append(left)
-        if self.states[State.LOST.value]:
-            self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
 
     def timeline(self) -> Iterator[tuple[str, int, Measurement]]:
         """Yield topic, stamp and measurement of all that is to be recorded."""

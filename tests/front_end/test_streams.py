@@ -84,7 +84,7 @@ def test_odometry_is_interpolated() -> None:
     end = buffer.at(100 * MS)
     assert end is not None and np.array_equal(end.rotation, turn)
     assert buffer.covers(100 * MS) and not buffer.covers(101 * MS)
-    assert buffer.at(101 * MS) is None and buffer.at(-1) is None
+    assert buffer.at(101 * MS) is None and buffer.at(-MS) is None
 
 
 def test_odometry_begins_anew_when_time_goes_back() -> None:

@@ -118,6 +118,34 @@ def test_black_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "no keyframe came of 3 images" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("file", "text", "words", "code"),
+    [
+        ("calib.txt", "P0: no numbers", "calib.txt: 0 rows of 12 numbers", 2),
+        ("calib.txt", "P0:" + " x" * 12, "could not convert string to float: 'x'", 2),
+        (
+            "calib.txt",
+            f"P0: {' '.join(['400 0 300 0 0 400 240 0 0 0 1 0'])}",
+            "check that its calibration is of this",
+            3,
+        ),
+        ("times.txt", "0.0\nlater\n" + "1.0\n" * 10, "could not convert string to float: 'later'", 2),
+        ("times.txt", "0.0\n0.1", "2 lines for 12 pictures", 2),
+    ],
+)
+def test_files_beside_pictures_that_cannot_be(
+    pictures: Path, tmp_path: Path, file: str, text: str, words: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One clear line each; a calibration of larger images is used, and said."""
+    for one in (pictures / "left").iterdir():
+        (tmp_path / one.name).write_bytes(one.read_bytes())
+    if file != "calib.txt":
+        (tmp_path / "rig.yaml").write_text(rig_yaml(world.rig(1), "own")[0])
+    (tmp_path / file).write_text(text)
+    assert main(["track", str(tmp_path), str(tmp_path / "x.mcap")]) == code
+    assert words in capsys.readouterr().err
+
+
 def segments(estimate: Path, truth: Path) -> tuple[float, float]:
     """Return the mean error of segments of 10 to 40 m as a share of them (KITTI), and the scale of the whole (sim3)."""
     ours, theirs = read_tum(estimate), read_tum(truth)

@@ -25,42 +25,8 @@ from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 ODOMETRY, CLOUD = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-DEFINITIONS = {
-    "Point2f": "float32 x\nfloat32 y",
-    "Point3f": "float32 x\nfloat32 y\nfloat32 z",
-    "KeyPoint": "Point2f pt\nfloat32 size\nfloat32 angle\nfloat32 response\nint32 octave\nint32 class_id",
-    "CameraModel": "sensor_msgs/CameraInfo camera_info\ngeometry_msgs/Transform local_transform",
-    "CameraModels": "CameraModel[] models",
-    "OdomInfo": """\
-std_msgs/Header header
-bool lost
-bool key_frame_added
-int32[] local_bundle_ids
-CameraModels[] local_bundle_models
-geometry_msgs/Pose[] local_bundle_poses
-int32 type
-int32[] words_keys
-KeyPoint[] words_values
-int32[] word_matches
-int32[] word_inliers
-int32[] local_map_keys
-Point3f[] local_map_values""",
-    "SensorData": """\
-sensor_msgs/CameraInfo[] left_camera_info
-sensor_msgs/CameraInfo[] right_camera_info
-geometry_msgs/Transform[] local_transform""",
-    "Node": """\
-int32 id
-int32 map_id
-float64 stamp
-geometry_msgs/Pose pose
-int32[] word_id_keys
-int32[] word_id_values
-KeyPoint[] word_kpts
-Point3f[] word_pts
-SensorData data""",
-    "MapData": "std_msgs/Header header\nNode[] nodes",
-}
+# The fields of rtabmap_msgs that matter here; the tests over a middleware are built from the same files.
+DEFINITIONS = Path(__file__).resolve().parents[2] / "ros" / "interfaces" / "rtabmap_msgs" / "msg"
 
 
 class Sent(NamedTuple):
@@ -76,8 +42,8 @@ class Sent(NamedTuple):
 def store() -> Typestore:
     """Return the types of Jazzy with those of rtabmap."""
     made = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in DEFINITIONS.items():
-        made.register(get_types_from_msg(text.replace("\n\n", "\n"), f"rtabmap_msgs/msg/{name}"))
+    for file in sorted(DEFINITIONS.glob("*.msg")):
+        made.register(get_types_from_msg(file.read_text(), f"rtabmap_msgs/msg/{file.stem}"))
     return made
 
 

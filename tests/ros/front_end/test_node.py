@@ -274,6 +274,34 @@ def test_depth_and_masks(start_node: StartNode, make_peer: MakePeer, kitti: Kitt
     assert node.stop() == 0
 
 
+def test_darkness_raises_the_covariance_and_then_the_session(
+    start_node: StartNode, make_peer: MakePeer, kitti: Kitti
+) -> None:
+    """The keyframe after two black pairs tells its step with what they left open; after six another map begins."""
+    node, peer = start_node("--ros-args", "-p", "max_lost:=4", program=PROGRAM), make_peer()
+    keyframes, poses = peer.received["keyframes"], peer.received["odometry"]
+    as_back_end(peer)
+    kind = message_class("nav_msgs/msg/Odometry")
+    peer.node.create_subscription(kind, "ba_front_end/odometry", poses.append, qos.reliable(1000))
+    camera = begin(peer, "left", "right")
+    shown: list[int | None] = [0, 1, 2, 3, None, None, 4, 5, *[None] * 6, 40, 41]
+    for n, i in enumerate(shown):
+        for side, p in zip(("left", "right"), kitti.p, strict=True):
+            pixels = kitti.image(side, i or 0)
+            camera.publish(side, BEGIN_NS + n * STEP_NS, pixels if i is not None else 0 * pixels, p)
+    peer.until(lambda: poses and stamp_of(poses[-1]) == BEGIN_NS + (len(shown) - 1) * STEP_NS, "the last pose")
+    sigma_m = {(stamp_of(one) - BEGIN_NS) // STEP_NS: float(one.pose.covariance[0]) ** 0.5 for one in poses}
+    assert [sigma_m[n] for n in (4, 5, 8, 13)] == pytest.approx([0.2, 0.3, 0.2, 0.7])
+    assert max(sigma_m[n] for n in (1, 2, 3, 6, 7)) < 0.1
+    told = {(stamp_of(one) - BEGIN_NS) // STEP_NS: one for one in keyframes}
+    assert told[6].pose.covariance[0] ** 0.5 == pytest.approx(0.3)
+    assert not any(np.any(told[n].pose.covariance) for n in told if n < 6 or n == 14)
+    assert told[14].session_id == told[6].session_id + 1
+    for words in ("shows nothing", "now lost", "images without a pose; the map of the one before stays as it is"):
+        assert words in node.err, node.err
+    assert node.stop() == 0
+
+
 @pytest.mark.slow
 def test_a_restart_of_the_node_is_another_session(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
     node, peer = start_node(program=PROGRAM), make_peer()
