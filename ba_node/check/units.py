@@ -145,7 +145,9 @@ def _alike(ratio: list[float], most: float) -> bool:
     They are not if their median is beyond a factor ``most``, or clearly beyond a small one.
     """
     middle = abs(float(np.median(ratio)))
-    error = 1.25 * 1.48 * _deviation(ratio) / np.sqrt(len(ratio))
+    # Ratios of steps that follow each other gather: their median deviation would make the error too small.
+    low, high = np.percentile(ratio, (10.0, 90.0))
+    error = 1.25 * (high - low) / 2.56 / np.sqrt(len(ratio))
     clear = len(ratio) >= _MANY_PAIRS and middle > max(np.log(_SMALL_FACTOR), _STANDARD_ERRORS * error)
     return middle < np.log(most) and not clear
 

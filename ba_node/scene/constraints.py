@@ -280,7 +280,7 @@ class Constraints:
 
 def _pose(name: str, position: FloatArray, orientation: FloatArray, log: RejectionLog) -> ingest.Pose | None:
     position, quaternion = np.asarray(position, float), np.asarray(orientation, float)
-    if not _finite(position) or not ingest.is_rotation(quaternion):
+    if not _finite(position) or quaternion.shape != (4,) or not ingest.is_rotation(quaternion):
         log.reject("bad_factor", f"{name}: position {position} m, quaternion {quaternion}, expected finite, not zero")
         return None
     return ingest.Pose(geometry.matrix_from_quaternion(quaternion), position)
