@@ -66,14 +66,17 @@ def sample(image: Floats, x: Floats, y: Floats) -> Floats:
     return out
 
 
-def cut(image: Floats, uv: FloatArray, side: int) -> Floats:
-    """Return patches around uv (n, 2), with a border of one pixel: (n, side + 2, side + 2)."""
+def cut(image: Floats, uv: FloatArray, side: int, rows: bool = False) -> Floats:
+    """Return patches around uv (n, 2), with a border of one pixel: (n, side + 2, side + 2).
+
+    ``rows`` leaves out those rows that are not compared, for what moves along rows alone: (n, rows, side + 2).
+    """
     half = side // 2 + 1
     along = np.arange(-half, half + 1, dtype=np.float32)
-    x, y = np.meshgrid(along, along)
+    x, y = np.meshgrid(along, along[1:-1:_STRIDE] if rows else along)
     at = uv.astype(np.float32)
     values = sample(image, at[:, :1] + x.ravel(), at[:, 1:] + y.ravel())
-    return values.reshape(-1, side + 2, side + 2)
+    return values.reshape(-1, *x.shape)
 
 
 @dataclass(frozen=True)
@@ -92,15 +95,15 @@ class Templates:
         """Prepare patches as :func:`cut` gives them.
 
         Args:
-            patches: (n, side + 2, side + 2).
+            patches: whole ones for ``place``, of rows for ``row``.
             basis: ``place`` (2 movements: x, y), or ``row`` (3: x, x by p_x, x by p_y).
             prior: (k,) added to the diagonal of the Hessian, grey values squared.
         """
-        side = patches.shape[1] - 2
+        side, k = patches.shape[2] - 2, _STRIDE
         w = window(side)
-        k = _STRIDE
-        values = patches[:, 1:-1:k, 1:-1:k].reshape(len(patches), len(w))
-        dx = (0.5 * (patches[:, 1:-1:k, 2::k] - patches[:, 1:-1:k, :-2:k])).reshape(values.shape)
+        rows = patches if basis == "row" else patches[:, 1:-1:k]
+        values = rows[:, :, 1:-1:k].reshape(len(patches), len(w))
+        dx = (0.5 * (rows[:, :, 2::k] - rows[:, :, :-2:k])).reshape(values.shape)
         values = values - (values @ w)[:, None]
         weighted = values * w
         variance = np.einsum("np,np->n", values, weighted)

@@ -22,7 +22,7 @@ from ba_node.front_end.rectify import IdealRig
 
 _STEPS = 8
 # A step that ends it, rad and m.
-_SMALL = 1e-5
+_SMALL = 3e-5
 _CAUCHY = 2.0
 
 
@@ -40,7 +40,7 @@ def consensus(rig: IdealRig, seen: Seen, error_px: float) -> tuple[Transform, Bo
     """Return camera from map, and which points agree with it to so many pixels; None where RANSAC finds nothing."""
     if len(seen.points) < 4:
         return None
-    options = {"max_reproj_error": error_px, "min_iterations": 50, "max_iterations": 1000, "seed": 1}
+    options = {"max_reproj_error": error_px, "min_iterations": 25, "max_iterations": 1000, "seed": 1}
     pose, info = poselib().estimate_absolute_pose(seen.uv, seen.points, _camera(rig), options, {})
     agree = np.array(info.get("inliers", []), dtype=bool)
     if agree.shape != (len(seen.points),) or agree.sum() < 4:

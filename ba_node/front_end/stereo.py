@@ -158,7 +158,7 @@ def _along(
     left: Floats, right: Floats, uv: FloatArray, shift: FloatArray, slant: FloatArray, side: int, prior: FloatArray
 ) -> tuple[FloatArray, ...]:
     """Return disparity, its sigma, slant and correlation of patches of one image in the rows of another."""
-    templates = patches.Templates.of(patches.cut(left, uv, side), "row", prior)
+    templates = patches.Templates.of(patches.cut(left, uv, side, rows=True), "row", prior)
     affine = np.tile(np.eye(2), (len(uv), 1, 1))
     affine[:, 0] -= slant
     found = patches.align(templates, right, uv + shift, affine)

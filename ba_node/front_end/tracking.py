@@ -38,7 +38,7 @@ _EPIPOLAR_PX = 1.0
 # Patches are cut anew when they appear larger or smaller by this.
 _ZOOM = 1.5
 # Lost points that are looked for at once, newest first.
-_LOOKED_FOR = 200
+_LOOKED_FOR = 160
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
 
 
