@@ -19,7 +19,7 @@ from ba_node.check.two_view import Pose
 _PARALLAX = 4.0
 _POINTS = 8
 _PAIRS = 4
-_MANY_PAIRS = 10
+_MANY_PAIRS = 20
 # Factors of a depth and of a length beyond which they are wrong, however few pairs of images tell.
 _DEPTH_FACTOR = 1.5
 _LENGTH_FACTOR = 1.3
@@ -145,9 +145,7 @@ def _alike(ratio: list[float], most: float) -> bool:
     They are not if their median is beyond a factor ``most``, or clearly beyond a small one.
     """
     middle = abs(float(np.median(ratio)))
-    # Ratios of steps that follow each other gather: their median deviation would make the error too small.
-    low, high = np.percentile(ratio, (10.0, 90.0))
-    error = 1.25 * (high - low) / 2.56 / np.sqrt(len(ratio))
+    error = 1.25 * 1.48 * _deviation(ratio) / np.sqrt(len(ratio))
     clear = len(ratio) >= _MANY_PAIRS and middle > max(np.log(_SMALL_FACTOR), _STANDARD_ERRORS * error)
     return middle < np.log(most) and not clear
 

@@ -22,7 +22,11 @@ pytestmark = pytest.mark.dds
 
 
 @pytest.fixture(params=["events", "wait_sets"])
-def spun(domain: int, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Node, Any]]:  # noqa: ARG001
+def spun(
+    domain: int,  # noqa: ARG001
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[tuple[Node, Any]]:
     """Return a node and the executor that it is in."""
     if request.param == "wait_sets":
         monkeypatch.setattr(made_here, "EventsExecutor", None)
