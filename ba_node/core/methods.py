@@ -44,8 +44,9 @@ _HUBER = dataclasses.replace(_LOCAL, loss="huber")
 # Without M most of its few iterations at each level are spent on what PCG has not reached.
 _TQ = dataclasses.replace(_LOCAL, loss="truncated_quadratic", annealing="gnc", preconditioner="schur_block")
 
-# Local DINM/IRLS as a window wants it: D of damping and region is Marquardt's, which has no unit, so that nothing needs
-# to be known of the scene; what costs less is solved exactly, the limit t_eps -> 0; points follow each step.
+# Local DINM/IRLS as a window wants it: D of the damping is Marquardt's, which has no unit, so that nothing needs to be
+# known of the scene; no region, as it cuts off exact steps where points are far away; what costs less is solved
+# exactly, the limit t_eps -> 0; points follow each step.
 _LOCAL_IRLS = SolverOptions(q_eps=0.1)
 
 _CHOICES = {

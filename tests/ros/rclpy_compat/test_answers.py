@@ -291,7 +291,9 @@ def test_the_solvers_thread_dies(start_alone: Callable[..., Client], folder: Pat
     alone = start_alone(prepare=put_faults, folder=str(folder))
     peer = alone.peer
     alone.arm("solver")
-    assert alone.call("reset").message == "the solver's thread has ended: start the node anew"
+    # The round that is under way when the fault is put in may still serve the first.
+    messages = [alone.call("reset").message for _ in range(2)]
+    assert messages[1] == "the solver's thread has ended: start the node anew"
     assert not alone.call("save_map").success
     response = alone.optimize()
     assert (response.status, response.result.success) == (GoalStatus.STATUS_ABORTED, False)
