@@ -111,7 +111,7 @@ class Constraints:
             log.reject("bad_factor", f"{name}: expected two keyframes")
             return
         pose = _pose(name, measured.position, measured.orientation, log)
-        covariance = _covariance(name, measured.covariance, 6, log)
+        covariance = positive_covariance(name, measured.covariance, 6, log)
         if pose is None or covariance is None:
             return
         if key in self.relative or key[::-1] in self.relative:
@@ -122,15 +122,19 @@ class Constraints:
         turn[:3, :3] = pose.rotation.T
         covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
         root = root_information(covariance)
-        self.relative[key] = RelativeMeasure(pose.rotation, pose.position, root, measured.is_loop)
+        self.put_relative(key, RelativeMeasure(pose.rotation, pose.position, root, measured.is_loop))
         self.unchecked.append(key)
+
+    def put_relative(self, key: tuple[int, int], measured: RelativeMeasure) -> None:
+        """Take in a relative pose that is sound, by the ids of both keyframes."""
+        self.relative[key] = measured
         for one in key:
             self.relative_of.setdefault(one, []).append(key)
 
     def add_step(self, keyframe_id: int, covariance: FloatArray, log: RejectionLog) -> None:
         """Take in the covariance of the step to a keyframe; one that cannot be is counted, and its step has none."""
         if len(covariance):
-            known = _covariance(f"step to keyframe {keyframe_id}", covariance, 6, log)
+            known = positive_covariance(f"step to keyframe {keyframe_id}", covariance, 6, log)
             if known is not None:
                 self.steps[keyframe_id] = known[np.ix_(_TANGENT, _TANGENT)]
 
@@ -187,7 +191,7 @@ class Constraints:
             priors.track_id.tolist(), priors.position, priors.covariance, strict=True
         ):
             name = f"prior of track {track}"
-            known = _covariance(name, covariance, 3, log)
+            known = positive_covariance(name, covariance, 3, log)
             if known is None:
                 continue
             if not _finite(position):
@@ -199,7 +203,7 @@ class Constraints:
         """Take in a pose of the body in the world."""
         name = f"pose prior at {prior.stamp_ns * 1e-9:.3f} s"
         pose = _pose(name, prior.position, prior.orientation, log)
-        covariance = _covariance(name, prior.covariance, 6, log)
+        covariance = positive_covariance(name, prior.covariance, 6, log)
         if pose is None or covariance is None or not self._same_world(name, prior.frame_id, log):
             return
         turn = np.eye(6)
@@ -217,7 +221,7 @@ class Constraints:
             log.reject("bad_factor", f"{name}: latitude, longitude, altitude {place}, expected within 90, 180 deg")
             return
         told = np.asarray(fix.covariance, float)
-        covariance = _covariance(name, told, 3, log) if told.any() else np.zeros((3, 3))
+        covariance = positive_covariance(name, told, 3, log) if told.any() else np.zeros((3, 3))
         if covariance is None or not self._same_world(name, ENU, log):
             return
         try:
@@ -286,7 +290,7 @@ def _pose(name: str, position: FloatArray, orientation: FloatArray, log: Rejecti
     return ingest.Pose(geometry.matrix_from_quaternion(quaternion), position)
 
 
-def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
+def positive_covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
     """Return a covariance (size, size), or None (counted) if it is not positive definite, or its inverse no number."""
     if np.size(values) != size * size:
         log.reject("bad_covariance", f"{name}: {np.size(values)} numbers, expected {size * size}")
