@@ -75,6 +75,7 @@ class Constraints:
         unchecked: relative poses that the map was not compared with yet; refused: those that it cannot meet.
         steps_precise: the front-end's steps turned out to be more precise than stated; the map is still to follow.
         adjusted_at: how many keyframes there were when the map was last bent.
+        seams: ids of keyframes with which the front-end began anew: no step leads there from the one before.
         map_from_world: rotation (3, 3) and translation (3,) m; None until enough is known.
         world_frame: name of the frame that all that is absolute is in; empty before the first.
         origin: (3,) latitude, longitude (deg), altitude (m) of the origin of east, north, up; None before a fix.
@@ -93,6 +94,7 @@ class Constraints:
         self.refused: set[tuple[int, int]] = set()
         self.steps_precise = False
         self.adjusted_at = 0
+        self.seams: set[int] = set()
         self.map_from_world: tuple[FloatArray, FloatArray] | None = None
         self.world_frame = ""
         self.origin: FloatArray | None = None
@@ -237,12 +239,31 @@ class Constraints:
             return
         self._insert(Absolute(fix.stamp_ns, position, None, covariance, of_antenna=True))
 
+    def put_before(self, older: Constraints, seam: int, log: RejectionLog) -> None:
+        """Take in what was known of an older session, whose map this one's is now; ``seam`` is its first keyframe."""
+        if older.world_frame and self.world_frame not in ("", older.world_frame):
+            lost = len(self.absolute) + len(self.landmarks)
+            log.reject("other_world", f"priors in frame {self.world_frame!r}, expected {older.world_frame!r}", lost)
+            self.absolute, self.landmarks, self.map_from_world = [], {}, None
+        for name in ("relative", "relative_of", "gravity", "landmarks", "steps"):
+            setattr(self, name, {**getattr(self, name), **getattr(older, name)})
+        self.unchecked, self.merges = older.unchecked + self.unchecked, older.merges + self.merges
+        self.refused, self.seams = self.refused | older.refused, self.seams | older.seams | {seam}
+        self.steps.pop(seam, None)
+        self.absolute = sorted(older.absolute + self.absolute, key=lambda one: one.stamp_ns)[-_MOST:]
+        renamed, self.renamed = self.renamed, dict(older.renamed)
+        self.renamed |= {track: other for track, other in renamed.items() if self.name_of(other) != track}
+        self.world_frame = older.world_frame or self.world_frame
+        self.origin = self.origin if older.origin is None else older.origin
+        self.map_from_world = older.map_from_world or self.map_from_world
+
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
         """Drop what belongs to keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
         gone = set(keyframes.tolist())
         self._drop([key for key in self.relative if not gone.isdisjoint(key)])
         self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}
         self.steps = {key: value for key, value in self.steps.items() if key not in gone}
+        self.seams -= gone
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
         self.adjusted_at = max(0, self.adjusted_at - len(gone))
 

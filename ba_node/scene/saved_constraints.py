@@ -54,6 +54,7 @@ def take(known: Constraints) -> MapContent:
         "renamed": [list(pair) for pair in known.renamed.items()],
         "adjusted_at": known.adjusted_at,
         "steps_precise": known.steps_precise,
+        "seams": sorted(known.seams),
     }
     rows: dict[str, Iterable[tuple[Any, ...]]] = {
         "relative_poses": (
@@ -171,6 +172,9 @@ def _restore_world(facts: MapContent, known: Constraints) -> None:
         known.renamed[pair[0]] = pair[1]
     if "adjusted_at" in facts.facts:
         known.adjusted_at, known.steps_precise = facts.fact("adjusted_at", int), facts.fact("steps_precise", bool)
+        seams = facts.fact("seams", list)
+        require(all(type(one) is int and 0 <= one < 2**64 for one in seams), f"world: seams = {seams!r}")
+        known.seams = set(seams)
 
 
 def _numbers(values: Any, n: int, name: str) -> FloatArray:
