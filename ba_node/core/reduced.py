@@ -7,8 +7,8 @@ inside the trust region (Algorithm 4). In the scaled space ``x~ = D x`` (3.94-3.
 ``D^-1 S D^-1 x~ = D^-1 rhs``; the region, the residual that ends PCG, and the preconditioner all live there. Without a
 region D is that of the damping (Algorithm 7).
 
-An exact solution is the limit of PCG for t_eps -> 0. If it leaves the region it is cut off at the boundary: PCG would get
-there on a curve, by hundreds of steps where S is badly conditioned, for the same progress.
+An exact solution is the limit of PCG for t_eps -> 0. If it leaves the region it is cut off at the boundary: PCG would
+get there on a curve, by hundreds of steps where S is badly conditioned, for the same progress.
 
 Where a step of PCG costs next to nothing beside an exact solution, PCG is tried first, as long as it gets there.
 """
