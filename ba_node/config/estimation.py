@@ -61,6 +61,11 @@ class SceneConfig:
         " back, and one alone is rejected; closer ones are sorted in. One this far ahead waits for the next. 0: never.",
         within=(0.0, 1e9),
     )
+    join_sessions: bool = option(
+        False,
+        "Sessions become one map where tracks connect them, by their ids or by merges; the ids of keyframes and tracks"
+        " have to be unique over all sessions then.",
+    )
     max_pending: int = option(
         200,
         "Track messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",

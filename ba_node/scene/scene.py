@@ -145,6 +145,12 @@ class Scene(MapTables):
         span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
         self.constraints.end(self.keyframes.keyframe_id, span, self.log)
 
+    def sessions_of(self, keyframes: IntArray) -> IntArray:
+        """Return how many sessions of a map that was joined had begun before each of some keyframes (rows)."""
+        rows = [row for row in map(self.find_keyframe, self.constraints.seams) if row is not None]
+        begun = np.sort(self.places()[np.array(rows, np.intp)])
+        return np.asarray(np.searchsorted(begun, self.places()[keyframes], side="right"))
+
     def refine_cameras(self, cameras: Cameras) -> None:
         """Take refined cameras in the place of the rig that came, which stays known as the same one."""
         self.given_cameras = self.given_cameras or self.cameras
