@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, settings
 
 from ba_node.cli import checkout
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import (
     CameraRig,

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_all(args: argparse.Namespace, config: Config) -> int:
     """Check many recordings."""
-    from ba_node.io.mcap import TopicChoice  # noqa: PLC0415
+    from ba_node.io.bag_topics import TopicChoice  # noqa: PLC0415
     from ba_node.offline import batch  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet, expand  # noqa: PLC0415
 

@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose
 from ba_node.cli.main import main
 from ba_node.core.cameras import parameters, project
 from ba_node.core.geometry import inverse, matrix_from_quaternion
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import read_bal
-from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.offline.recording import read_truth
 

@@ -16,10 +16,10 @@ import pytest
 from ba_node.cli import solve as solve_command
 from ba_node.cli.main import main
 from ba_node.estimate import Poses
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import read_bal
 from ba_node.io.bundler import read_bundler
 from ba_node.io.g2o import read_g2o
-from ba_node.io.mcap import BagReader
 from ba_node.io.model import Reconstruction
 from ba_node.io.ply import read_ply
 from ba_node.io.reference import read_poses

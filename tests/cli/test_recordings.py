@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 
 from ba_node.cli.main import main
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_writer import BagWriter
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from tests.cli.conftest import KEYFRAMES
 

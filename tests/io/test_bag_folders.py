@@ -20,7 +20,9 @@ from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.io import ros_types
 from ba_node.io.bag_files import find_files
-from ba_node.io.mcap import BagError, BagReader, BagWriter
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
+from ba_node.io.bag_writer import BagWriter
 from ba_node.measurements import CameraRig
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay

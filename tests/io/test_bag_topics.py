@@ -13,9 +13,11 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.config import Config
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_source import BagChannel
-from ba_node.io.bag_topics import NO_CHOICE, Chooser, TopicChoice, parse_topic
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
+from ba_node.io.bag_topics import NO_CHOICE, BagError, Chooser, TopicChoice, parse_topic
+from ba_node.io.bag_writer import BagWriter
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES

@@ -13,7 +13,7 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.estimate import Poses
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.rig_file import rig_yaml
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.adapters import SOURCES
