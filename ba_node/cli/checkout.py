@@ -18,24 +18,6 @@ class CheckoutError(ValueError):
     """There are no experiments beside the package."""
 
 
-def present() -> bool:
-    """Return True if the package is used from a checkout of its repository."""
-    return all((ROOT / name).is_file() for name in ("setup.py", "experiments/__init__.py"))
-
-
-def load(name: str, what: str) -> ModuleType:
-    """Import a module of ``experiments``, such as ``thesis.steps``; ``what`` the user asked for is for the error.
-
-    Raises:
-        CheckoutError: the package is installed without its repository.
-    """
-    if not present():
-        raise CheckoutError(f"{what} needs a checkout of the repository: experiments are not installed with ba_node")
-    if str(ROOT) not in sys.path:
-        sys.path.append(str(ROOT))
-    return importlib.import_module(f"experiments.{name}")
-
-
 @dataclass(frozen=True)
 class CheckoutCommand:
     """A command of ``ba`` that a checkout has."""
@@ -45,8 +27,16 @@ class CheckoutCommand:
     SUMMARY: str  # one line for ``ba --help``, which does not import the module
 
     def load(self) -> ModuleType:
-        """Import the module of the command, or raise CheckoutError."""
-        return load(self.module, self.name)
+        """Import the module of the command.
+
+        Raises:
+            CheckoutError: the package is installed without its repository.
+        """
+        if not all((ROOT / name).is_file() for name in ("setup.py", "experiments/__init__.py")):
+            raise CheckoutError(f"{self.name} needs a checkout of the repository: experiments are not installed")
+        if str(ROOT) not in sys.path:
+            sys.path.append(str(ROOT))
+        return importlib.import_module(f"experiments.{self.module}")
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the command."""

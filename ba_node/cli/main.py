@@ -59,12 +59,14 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "in a checkout of the repository": (
         "steps",
+        "sphere",
         "robustness",
         "thesis",
     ),
 }
 _IN_A_CHECKOUT = (
     CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
+    CheckoutCommand("sphere", "thesis.sphere_file", "make a BAL problem of points on a sphere, with its truth"),
     CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
     CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
 )

@@ -23,22 +23,19 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
     assert f"example:\n  ba {command}" in text
 
 
-@pytest.mark.parametrize("command", ["steps", "robustness", "thesis"])
+@pytest.mark.parametrize("command", ["steps", "sphere", "robustness", "thesis"])
 def test_commands_of_a_checkout_say_so_elsewhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(checkout, "ROOT", tmp_path)
     for arguments in ([command], [command, "--help"]):
         assert refused(capsys, *arguments) == (
-            f"ba: error: {command} needs a checkout of the repository: experiments are not installed with ba_node\n"
+            f"ba: error: {command} needs a checkout of the repository: experiments are not installed\n"
         )
 
 
-def test_an_installed_package_makes_recordings_and_no_spheres(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_installed_package_makes_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkout, "ROOT", tmp_path)
-    assert "--kind sphere needs a checkout" in refused(capsys, "synth", str(tmp_path / "ball.txt"), "--kind", "sphere")
     assert main(["synth", str(tmp_path / "short.mcap"), "--keyframes", "3"]) == 0
     assert (tmp_path / "short.mcap").stat().st_size > 1000
 
