@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from ba_node.backend import Diagnosis, Row
     from ba_node.config import Config
 
-SUMMARY = "test calibration and conventions of a recording against its tracks"
 EXAMPLE = "ba check bags/stereo_loop.mcap"
 TOO_LITTLE, MISTAKE = 2, 3
 

@@ -69,6 +69,10 @@ def progress_bar(name: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
+class CheckoutError(ValueError):
+    """A command whose code stands beside the package in a checkout, and is not installed with it."""
+
+
 class TargetError(ValueError):
     """A file that is asked for in a format that is not written."""
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from ba_node.cli.console import add_declared_options, declared_options, require_mcap, write_result
 
-SUMMARY = "make a recording with ground truth"
 EXAMPLE = "ba synth loop.mcap --seed 3 --keyframes 100 --outlier-share 0.1"
 
 

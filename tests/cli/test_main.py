@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from ba_node.cli import checkout
+from ba_node.cli import main as command_line
+from ba_node.cli import params
 from ba_node.cli.main import COMMANDS, GROUPS, main
 
 
@@ -27,7 +28,7 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
 def test_commands_of_a_checkout_say_so_elsewhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(checkout, "ROOT", tmp_path)
+    monkeypatch.setattr(command_line, "ROOT", tmp_path)
     for arguments in ([command], [command, "--help"]):
         assert refused(capsys, *arguments) == (
             f"ba: error: {command} needs a checkout of the repository: experiments are not installed\n"
@@ -35,7 +36,7 @@ def test_commands_of_a_checkout_say_so_elsewhere(
 
 
 def test_an_installed_package_makes_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkout, "ROOT", tmp_path)
+    monkeypatch.setattr(command_line, "ROOT", tmp_path)
     assert main(["synth", str(tmp_path / "short.mcap"), "--keyframes", "3"]) == 0
     assert (tmp_path / "short.mcap").stat().st_size > 1000
 
@@ -149,7 +150,7 @@ def test_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     def interrupted(_: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(COMMANDS["params"], "run", interrupted)
+    monkeypatch.setattr(params, "run", interrupted)
     assert main(["params"]) == 130
     assert capsys.readouterr().err == "ba: interrupted\n"
 
@@ -168,7 +169,7 @@ def test_faults_of_our_own_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> No
     def faulty(_: object) -> int:
         raise ValueError("a fault")
 
-    monkeypatch.setattr(COMMANDS["params"], "run", faulty)
+    monkeypatch.setattr(params, "run", faulty)
     with pytest.raises(ValueError, match="a fault"):
         main(["params"])
 
