@@ -303,6 +303,18 @@ class Constraints:
         return False
 
 
+def joined_step(one: FloatArray, other: FloatArray, turn: FloatArray, move: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of two steps in a row from those of each, about the axes of the body it begins at.
+
+    ``turn`` (3, 3) is that of the first step, ``move`` (3,) m the way of the second in the body where the first begins.
+    With the rotation phi and the translation t of the steps a and b: ``phi = phi_a + R_a phi_b``, ``t = t_a + R_a t_b -
+    [move]x phi_a``.
+    """
+    first, second = np.eye(6), np.kron(np.eye(2), turn)
+    first[3:, :3] = -geometry.hat(move[None])[0]
+    return np.asarray(first @ one @ first.T + second @ other @ second.T)
+
+
 def _pose(name: str, position: FloatArray, orientation: FloatArray, log: RejectionLog) -> ingest.Pose | None:
     position, quaternion = np.asarray(position, float), np.asarray(orientation, float)
     if not _finite(position) or quaternion.shape != (4,) or not ingest.is_rotation(quaternion):

@@ -283,12 +283,16 @@ class MapTables:
         forgotten = table.keyframe_id[self.order[:n_drop]]
         keep = np.ones(len(table), bool)
         keep[self.order[:n_drop]] = False
+        self._drop_keyframes(keep)
+        return forgotten
+
+    def _drop_keyframes(self, keep: BoolArray) -> None:
+        """Forget all keyframes but those marked, with their observations."""
         self._drop_observations(keep[self.observations.keyframe])
-        renumbered = table.keep(keep)
+        renumbered = self.keyframes.keep(keep)
         self.observations.keyframe[:] = renumbered[self.observations.keyframe]
         self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
         self._index_keyframes()
-        return forgotten
 
     def _limit_landmarks(self) -> None:
         """Forget the landmarks seen longest ago, ties by row, once there are too many; again a tenth at once."""
