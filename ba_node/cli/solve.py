@@ -204,9 +204,7 @@ def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:
         return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
     usual = DEFAULT_GROUPS if args.problem.is_dir() else ()
     groups = [group for group in args.refine or usual if group != "none"]
-    # Cameras are refined without a region, which the default has; a method that is asked for by name is not changed.
-    own = [*_OF_MODELS, "trust_region=none"] if groups and args.method == "auto" else _OF_MODELS
-    options = solver_options(args.method, [*own, *assignments])
+    options = solver_options(args.method, [*_OF_MODELS, *assignments])
     return solve_model(args.problem, options, groups, clock=time.perf_counter, on_iteration=_show)
 
 
