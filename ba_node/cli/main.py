@@ -154,8 +154,7 @@ def build_parser(command: str) -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         module.add_arguments(sub)
-        if module is entry:
-            add_json_option(sub)
+        add_json_option(sub)
     return parser
 
 
