@@ -24,7 +24,6 @@ from ba_node.cli.console import (
     write_result,
 )
 
-SUMMARY = "refine the cameras of a recording from its tracks"
 EXAMPLE = "ba calibrate bags/stereo_loop.mcap --out out/rig.yaml --refine intrinsics extrinsics"
 NOTHING_TOLD = 3
 _PARTS = ("intrinsics", "extrinsics", "time_offset")

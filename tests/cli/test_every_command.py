@@ -36,7 +36,7 @@ CASES = {
 }
 SLOW = {"calibrate", "report", "sweep", "tune"}
 # Tried with a node, with images or for long in tests of their own.
-ELSEWHERE = {"demo", "play", "record", "robustness", "run", "steps", "track"}
+ELSEWHERE = {"demo", "play", "record", "robustness", "run", "sphere", "steps", "track"}
 
 
 @pytest.fixture(scope="module")

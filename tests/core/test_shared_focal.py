@@ -18,7 +18,9 @@ from ba_node.core.problem import Cameras, Observations, Problem, State
 from ba_node.core.shared_focal import FocalKernels, applies, solve_cameras
 
 pytestmark = pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
-AUTO = dataclasses.replace(options("auto"), function_tolerance=1e-12, max_iterations=40, cheirality="drop")
+AUTO = dataclasses.replace(
+    options("auto"), trust_region="none", function_tolerance=1e-12, max_iterations=40, cheirality="drop"
+)
 FOCAL, K1, K2 = (0, 1), (4,), (5,)
 
 
