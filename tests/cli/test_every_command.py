@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ CASES = {
     "view": ("{bag} --port 0 --rounds 1 --rate 0", "messages"),
 }
 SLOW = {"calibrate", "report", "sweep", "tune"}
+# What may take over two seconds, and so shows a bar where somebody looks; `ba solve` prints a line an iteration.
+BARS = {"calibrate", "convert", "cut", "info", "merge", "regress", "replay", "report", "sweep", "tune"}
 # Tried with a node, with images or for long in tests of their own.
 ELSEWHERE = {"demo", "play", "record", "robustness", "run", "sphere", "steps", "track"}
 
@@ -54,7 +57,13 @@ def test_no_command_is_left_out() -> None:
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
 def test_a_command_gives_json(
-    name: str, bag: Path, bal_file: Path, replay: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    bag: Path,
+    bal_file: Path,
+    replay: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, holds = CASES[name]
     words = line.format(bag=bag, bal=bal_file, replay=replay, out=tmp_path).split()
@@ -64,9 +73,13 @@ def test_a_command_gives_json(
     alone: dict[str, Any] = json.loads(shown.out)
     assert code in (0, 3), shown.err
     assert holds in alone, sorted(alone)
+    assert "\r" not in shown.err, "a bar in a file"
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert main([name, *words, "--json", str(tmp_path / "result.json")]) == code
     assert json.loads((tmp_path / "result.json").read_text()).keys() == alone.keys()
-    assert capsys.readouterr().out, "without JSON on it, standard output has the text"
+    shown = capsys.readouterr()
+    assert shown.out, "without JSON on it, standard output has the text"
+    assert (f"\r{name}: " in shown.err) == (name in BARS), shown.err
 
 
 def test_a_folder_that_is_not_there_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
