@@ -58,6 +58,9 @@ class PcgLimits:
     # step i added less than q_eps / i of what the model b'x - x'A x / 2 has gained (Nash and Sofer 1990): further steps
     # would not lower the objective by what they cost. 0 for never.
     q_eps: float = 0.0
+    # |r| is sqrt(r'M^-1 r) in place of the Euclidean norm. Where M is near A that is the error of x in energy: a weak
+    # mode, of which next to nothing is in r, counts by what it is worth.
+    energy: bool = False
 
 
 def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limits: PcgLimits) -> Solution:
@@ -70,14 +73,14 @@ def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limit
     ``product`` is x -> A x, ``precondition`` r -> M^-1 r. The solution is never NaN.
     """
     x = np.zeros_like(rhs)
-    norm_b = float(np.linalg.norm(rhs))
-    if norm_b == 0.0 or not np.isfinite(norm_b):
-        return Solution(x if norm_b == 0.0 else None)
-    target = min(limits.t_eps, norm_b) * norm_b
     r = rhs.copy()
     z = precondition(r)
     d = z.copy()
     rz = float(r @ z)
+    norm_b = _size(r, rz, limits)
+    if norm_b == 0.0 or not np.isfinite(norm_b):
+        return Solution(x if norm_b == 0.0 else None)
+    target = min(limits.t_eps, norm_b) * norm_b
     gained = 0.0
     for j in range(limits.max_iterations):
         ad = product(d)
@@ -93,13 +96,20 @@ def pcg_steihaug(product: Product, rhs: FloatArray, precondition: Product, limit
         x = x_next
         r = r - alpha * ad
         before, gained = gained, 0.5 * float(x @ (rhs + r))
-        if float(np.linalg.norm(r)) <= target or (j + 1) * (gained - before) < limits.q_eps * gained:
+        if (j + 1) * (gained - before) < limits.q_eps * gained:
             return Solution(x, j + 1)
         z = precondition(r)
         rz_next = float(r @ z)
+        if _size(r, rz_next, limits) <= target:
+            return Solution(x, j + 1)
         d = z + (rz_next / rz) * d
         rz = rz_next
     return Solution(x, limits.max_iterations)
+
+
+def _size(r: FloatArray, rz: float, limits: PcgLimits) -> float:
+    """Return |r| as the limits want it, from r and r'M^-1 r."""
+    return float(np.sqrt(max(rz, 0.0))) if limits.energy else float(np.linalg.norm(r))
 
 
 def _to_boundary(x: FloatArray, d: FloatArray, radius: float) -> FloatArray:
