@@ -31,7 +31,7 @@ import numpy as np
 import scipy
 
 from ba_node.arrays import FloatArray, IntArray
-from ba_node.core import blocks, linear
+from ba_node.core import blocks, columns, linear
 from ba_node.core.communicator import Alone, Communicator, total
 from ba_node.core.problem import State
 
@@ -48,6 +48,7 @@ class TwoLevel:
 
     def __init__(self, free: IntArray, communicator: Communicator | None = None) -> None:
         """Take the indices of the free keyframes, (n_free,), and the ranks of which each has a part of S."""
+        columns.keep_memory()
         self.state: State  # at which the system was linearised
         self._free = free
         self._communicator = communicator or Alone()
@@ -118,10 +119,10 @@ class TwoLevel:
         n, count = len(label), int(label.max()) + 1
         size = np.bincount(label, minlength=count)
         middle = np.stack([np.bincount(label, column, count) / size for column in centre.T], axis=1)
-        columns = np.zeros((n, d, d + 1))
-        columns[:, :, :d] = np.eye(d)
-        columns[:, 3:6, d] = centre - middle[label]
-        return scipy.sparse.bsr_matrix((columns, label, np.arange(n + 1)), shape=(n * d, count * (d + 1)))
+        steps = np.zeros((n, d, d + 1))
+        steps[:, :, :d] = np.eye(d)
+        steps[:, 3:6, d] = centre - middle[label]
+        return scipy.sparse.bsr_matrix((steps, label, np.arange(n + 1)), shape=(n * d, count * (d + 1)))
 
 
 class _Inside:
