@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-from ba_node.cli import checkout
+from ba_node.cli import main as command_line
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import (
     CameraRig,
@@ -34,7 +34,7 @@ from ba_node.messages.report import LatencyReport, QueueReport, Report
 _ROOT = Path(__file__).resolve().parent.parent
 
 # Of a package that was installed elsewhere the experiments are those beside its tests.
-checkout.ROOT = _ROOT
+command_line.ROOT = _ROOT
 
 # The same examples in every run, and no verdict by the clock: a loaded machine is not a fault.
 settings.register_profile("ba_node", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])

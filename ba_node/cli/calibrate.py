@@ -23,7 +23,6 @@ from ba_node.cli.console import (
     topic_choice,
 )
 
-SUMMARY = "refine the cameras of a recording from its tracks"
 EXAMPLE = "ba calibrate bags/stereo_loop.mcap --out out/rig.yaml --refine intrinsics extrinsics"
 NOTHING_TOLD = 3
 _PARTS = ("intrinsics", "extrinsics", "time_offset")

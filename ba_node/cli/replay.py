@@ -48,7 +48,6 @@ from ba_node.offline.attention import HARMLESS
 if TYPE_CHECKING:
     from ba_node.config import Config
 
-SUMMARY = "run the back-end on a recording, without a middleware"
 # Results were written, and something in them has to be looked at.
 ATTENTION, NOTHING = 3, 2
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from ba_node.cli.console import require_folder
 
-SUMMARY = "make a page of the results of replays, one or several side by side"
 EXAMPLE = "ba report out/default out/tuned --out compare.html"
 
 

@@ -18,7 +18,6 @@ from ba_node.cli.console import TargetError, facts, require_folder
 if TYPE_CHECKING:
     from ba_node.measurements import CameraRig
 
-SUMMARY = "show, convert or publish the cameras of a rig"
 EXAMPLE = "ba rig camchain.yaml --to own --out rig.yaml\n  ba rig left.yaml right.yaml --publish"
 _FORMS = ("own", "kalibr", "camera_info")
 

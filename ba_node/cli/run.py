@@ -18,7 +18,6 @@ from pathlib import Path
 from ba_node.cli import check, replay, track
 from ba_node.cli.console import add_parameter_options, progress_bar
 
-SUMMARY = "from images to a map: track, check, replay, report"
 EXAMPLE = "ba run drive.mcap --out out/drive\n  ba run kitti/sequences/07 --out out/kitti07"
 
 

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ba_node.offline.solve_bal import Solution
     from ba_node.offline.solve_model import ModelSolution
 
-SUMMARY = "solve a BAL, Bundler, COLMAP or g2o problem as a whole"
 EXAMPLE = (
     "ba solve problem-49-7776-pre.txt.bz2 --iterations 50 --json trace.json\n"
     "  ba solve sparse/0 --out refined --refine focal distortion"

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ba_node.config.front_end import FrontEndOptions
     from ba_node.offline.track import TrackRequest
 
-SUMMARY = "track images: keyframes and feature tracks for ba replay"
 EXAMPLE = "ba track drive.mcap tracks.mcap\n  ba track kitti/sequences/07 tracks.mcap --track max_features=500"
 ATTENTION = 3
 # What is said and is no fault.

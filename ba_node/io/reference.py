@@ -17,8 +17,9 @@ import numpy as np
 
 from ba_node.core.geometry import quaternion_from_matrix
 from ba_node.estimate import Poses
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
 from ba_node.io.files import opened
-from ba_node.io.mcap import BagError, BagReader
 from ba_node.io.trajectory import MAX_BYTES, TrajectoryError, numbered, read_rows, read_tum
 from ba_node.messages.factory import stamp_ns_from_message
 

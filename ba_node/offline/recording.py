@@ -14,7 +14,10 @@ import numpy as np
 
 from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
+from ba_node.io.bag_writer import BagWriter
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.messages.conversion import InputMessages
 from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message

@@ -25,11 +25,14 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate, Extras, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import TopicChoice
+from ba_node.io.bag_writer import BagWriter
 from ba_node.io.files import locked_folder, whole_file, write_json
 from ba_node.io.map_file import load_map, map_name, write_map
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter, TopicChoice
 from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages

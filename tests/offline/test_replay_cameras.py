@@ -14,7 +14,8 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.config import Config
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagWriter
+from ba_node.io.bag_writer import BagWriter
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES

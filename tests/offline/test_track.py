@@ -14,7 +14,7 @@ from ba_node.cli.main import main
 from ba_node.core import geometry
 from ba_node.estimate import Transform
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.rig_file import rig_yaml
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
