@@ -7,8 +7,9 @@ PYTHON ?=
 ARGS ?=
 
 RUN := .venv/bin/python
-# Two at a time, grouped by tests/conftest.py.
-PYTEST := OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadgroup
+# Two at a time, grouped by tests/conftest.py. What is compiled once is kept, whatever the environment says: each process of
+# a test would compile all of it anew.
+PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(RUN) -m pytest -n 2 --dist loadgroup
 CHECKED := ba_node experiments tests tools setup.py $(wildcard launch/*.py)
 STYLED := $(CHECKED) examples docs/conf.py
 CPP = $(shell find ba_node examples experiments tests -name '*.[ch]pp')
