@@ -14,7 +14,7 @@ import numpy as np
 from ba_node.config import SceneConfig
 from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status, Transform
 from ba_node.scene import snapshot
-from ba_node.scene.map_content import MapContent, prefixed, require, require_all, within
+from ba_node.scene.map_content import MapContent, prefixed, require, require_all, require_rotations, within
 from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column
 from ba_node.window.correction import MapCorrection
@@ -103,7 +103,7 @@ def unpack(content: MapContent, config: SceneConfig) -> MapState:
 def _correction_from(content: MapContent) -> MapCorrection:
     facts = MapContent(facts=content.fact("correction", dict))
     columns = content.columns("correction", _CORRECTION)
-    snapshot.require_rotations(columns["rotation"], "correction/rotation")
+    require_rotations(columns["rotation"], "correction/rotation")
     translation = columns["translation"]
     require_all(within(translation, np.finfo(float).max), "correction/translation", translation, "finite numbers")
     require(len(translation) in (0, 2, 3), f"correction: {len(translation)} transforms, expected 0, 2 or 3")

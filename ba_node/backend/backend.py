@@ -47,6 +47,7 @@ from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import adjustment, full, guard, quality
 from ba_node.window.adjustment import Adjustment
+from ba_node.window.joining import Earlier
 
 FINISHED_KEPT = 8
 _REFUSED_KEPT = 1000
@@ -70,6 +71,7 @@ class Backend:
         self._adjusting: Adjustment | None = None
         self._clock = clock
         self._sessions = Sessions()
+        self._earlier = Earlier()
 
     @property
     def config(self) -> Config:
@@ -196,7 +198,11 @@ class Backend:
         """
         if self._adjusting is not None and self._adjusting.scene is self.scene:
             return None
-        what = adjustment.due(self.scene, self.config, final=final)
+        joined = self._earlier.join(self.scene, self.config, final=final)
+        if joined is not None:
+            self.finished = [one for one in self.finished if one[0] != joined[0]]
+            self.map.correct(int(self.scene.order[-1]))
+        what = joined[1] if joined else adjustment.due(self.scene, self.config, final=final)
         if what is None:
             return None
         begun = self._adjusting = Adjustment(self.scene, what, self.config, self.extras)
@@ -264,12 +270,12 @@ class Backend:
         """Return all that is known, with the report of the last solve."""
         return self.map.estimate()
 
-    def optimize(self) -> Estimate | None:
+    def optimize(self, by: full.Solve | None = None) -> Estimate | None:
         """Refine all keyframes and points that are kept; return what is known then, None if nothing came of it."""
         begun = self.begin_optimization()
         if isinstance(begun, str):
             return None
-        begun.solve(self.config.solver)
+        begun.solve(self.config.solver, by=by)
         merged = self.merge(begun)
         return merged[0] if merged else None
 
@@ -324,25 +330,19 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
-        self.finished = []
+        self.finished, self._earlier = [], Earlier()
         self._sessions.reset()
         self._renew(None, self.scene.next_cameras or self.scene.cameras)
         self.map.report = SolveReport(reason="reset: the map is empty")
 
     def snapshot(self) -> MapContent:
         """Return a copy of all that is known, for a file; see docs/map_format.md."""
-        return archive.pack(
-            archive.MapState(
-                self.scene,
-                self.finished,
-                self.map.report,
-                self.map.correction,
-                self.map.completion.row(self.scene),
-                self.map.completion.closed,
-                tuple(self.map.completion.delivered),
-                self.solve_count,
-            )
+        known, done = self.map, self.map.completion
+        of_newest = done.row(self.scene), done.closed, tuple(done.delivered)
+        state = archive.MapState(
+            self.scene, self.finished, known.report, known.correction, *of_newest, self.solve_count
         )
+        return archive.pack(state)
 
     def take_over(self, known: archive.MapState) -> None:
         """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
@@ -352,6 +352,7 @@ class Backend:
         known.scene.config = self.config.scene
         self.map = CurrentMap(self.config, known.scene, self.map.index + 1)
         self.map.report, self.map.correction = known.report, known.correction
+        self._earlier = Earlier()
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
         self.finished = known.finished[-FINISHED_KEPT:]
         newest = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
@@ -385,6 +386,7 @@ class Backend:
             self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.map.rejected.items())))
             self.finished.append((before.session_id, self.map.estimate()))
             del self.finished[:-FINISHED_KEPT]
+            self._earlier.keep(before, self.config)
         self._renew(session_id, before.next_cameras or before.cameras)
         self.scene.pending = waiting.pending
         if begin.replaces:

@@ -26,7 +26,7 @@ from ba_node.core.problem import State
 from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import full, old_keyframes, precision, quality, view
+from ba_node.window import culling, full, old_keyframes, precision, quality, view
 from ba_node.window.attempt import attempt
 from ba_node.window.correction import MapCorrection
 from ba_node.window.trust import Trust
@@ -196,6 +196,7 @@ class CurrentMap:
         ``wanted`` is worked out beside the estimate; the clock (s) is for the report alone; ``on_iteration`` ends the
         solve by returning False.
         """
+        culling.cull(self.scene, self.config)
         due = self.completion.due(self.scene)
         end = self._end(due)
         taking_part = window.rows_of(self.scene, self.config, end)

@@ -61,6 +61,17 @@ class SceneConfig:
         " back, and one alone is rejected; closer ones are sorted in. One this far ahead waits for the next. 0: never.",
         within=(0.0, 1e9),
     )
+    redundant_share: float = option(
+        0.0,
+        "A keyframe that has left the window is taken out of the map where three others at least see this share of its"
+        " points (0.9 in ORB-SLAM); 0: all are kept.",
+        within=(0.0, 1.0),
+    )
+    join_sessions: bool = option(
+        False,
+        "Sessions become one map where tracks connect them, by their ids or by merges; the ids of keyframes and tracks"
+        " have to be unique over all sessions then.",
+    )
     max_pending: int = option(
         200,
         "Track messages that wait for their keyframe or the rig; beyond it the oldest are rejected.",

@@ -71,6 +71,7 @@ class MapOptions:
     save: Path | None = None  # file for the map of the newest session
     # which topics of the recording are taken, where several are possible
     topics: TopicChoice = field(default_factory=TopicChoice)
+    by: Callable[..., Any] | None = None  # what solves everything at the end in place of solver.solve
 
 
 def replay(
@@ -105,7 +106,7 @@ def replay(
                 run.load(options.load)
             run.read(measurements, reader.message_count)
             run.backend.extras = Extras(covariance=options.covariance, points=options.covariance)
-            run.end(options.optimize)
+            run.end(options.optimize, options.by)
             if not run.sessions:
                 raise ReplayError(f"{reader.path}: {_nothing_to_use(run)}{_why(reader, run)}")
             if run.sessions[-1].summary.cameras == 0:
@@ -190,9 +191,9 @@ class _Run:
             yield measurement
             self._watch.progress(done, total)
 
-    def end(self, optimize: bool) -> None:
+    def end(self, optimize: bool, by: Callable[..., Any] | None = None) -> None:
         """End the newest session, after a solve of everything if that is wanted."""
-        estimate = self.backend.optimize() if optimize else None
+        estimate = self.backend.optimize(by) if optimize else None
         if estimate is not None:
             self._record(estimate)
         if not self.sessions and self.backend.map.keyframe_count:

@@ -17,7 +17,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core.bordered import Shared, Unknown, place_of, solve_shared
-from ba_node.core.objective import reprojection_errors
+from ba_node.core.objective import reprojection_errors, rms_px, squared_errors
 from ba_node.core.problem import Cameras, Problem, State
 from ba_node.core.result import Result
 from ba_node.core.solver import solve
@@ -91,7 +91,11 @@ class ModelSolution:
     def as_dict(self) -> dict[str, Any]:
         """Return statistics, options and trace for JSON."""
         ids = range(len(self.model.lens)) if self.colmap is None else self.colmap.camera_ids
-        return statistics(self.source, self._ends(), self.result, self.options) | {
+        problem = self.problem
+        sizes = problem.n_keyframes, problem.n_points, len(problem.observations)
+        with np.errstate(all="ignore"):  # infinite where the solve failed
+            before, after = (rms_px(squared_errors(*end)) for end in self._ends())
+        return statistics(self.source, sizes, (before, after), self.result, self.options) | {
             "origin": self.origin.tolist(),
             "attention": self.attention()[0],
             "camera_unknowns": len(self.unknowns),

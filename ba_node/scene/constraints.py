@@ -75,6 +75,7 @@ class Constraints:
         unchecked: relative poses that the map was not compared with yet; refused: those that it cannot meet.
         steps_precise: the front-end's steps turned out to be more precise than stated; the map is still to follow.
         adjusted_at: how many keyframes there were when the map was last bent.
+        seams: ids of keyframes with which the front-end began anew: no step leads there from the one before.
         map_from_world: rotation (3, 3) and translation (3,) m; None until enough is known.
         world_frame: name of the frame that all that is absolute is in; empty before the first.
         origin: (3,) latitude, longitude (deg), altitude (m) of the origin of east, north, up; None before a fix.
@@ -93,6 +94,7 @@ class Constraints:
         self.refused: set[tuple[int, int]] = set()
         self.steps_precise = False
         self.adjusted_at = 0
+        self.seams: set[int] = set()
         self.map_from_world: tuple[FloatArray, FloatArray] | None = None
         self.world_frame = ""
         self.origin: FloatArray | None = None
@@ -111,7 +113,7 @@ class Constraints:
             log.reject("bad_factor", f"{name}: expected two keyframes")
             return
         pose = _pose(name, measured.position, measured.orientation, log)
-        covariance = _covariance(name, measured.covariance, 6, log)
+        covariance = positive_covariance(name, measured.covariance, 6, log)
         if pose is None or covariance is None:
             return
         if key in self.relative or key[::-1] in self.relative:
@@ -122,15 +124,19 @@ class Constraints:
         turn[:3, :3] = pose.rotation.T
         covariance = turn @ covariance[np.ix_(_TANGENT, _TANGENT)] @ turn.T
         root = root_information(covariance)
-        self.relative[key] = RelativeMeasure(pose.rotation, pose.position, root, measured.is_loop)
+        self.put_relative(key, RelativeMeasure(pose.rotation, pose.position, root, measured.is_loop))
         self.unchecked.append(key)
+
+    def put_relative(self, key: tuple[int, int], measured: RelativeMeasure) -> None:
+        """Take in a relative pose that is sound, by the ids of both keyframes."""
+        self.relative[key] = measured
         for one in key:
             self.relative_of.setdefault(one, []).append(key)
 
     def add_step(self, keyframe_id: int, covariance: FloatArray, log: RejectionLog) -> None:
         """Take in the covariance of the step to a keyframe; one that cannot be is counted, and its step has none."""
         if len(covariance):
-            known = _covariance(f"step to keyframe {keyframe_id}", covariance, 6, log)
+            known = positive_covariance(f"step to keyframe {keyframe_id}", covariance, 6, log)
             if known is not None:
                 self.steps[keyframe_id] = known[np.ix_(_TANGENT, _TANGENT)]
 
@@ -187,7 +193,7 @@ class Constraints:
             priors.track_id.tolist(), priors.position, priors.covariance, strict=True
         ):
             name = f"prior of track {track}"
-            known = _covariance(name, covariance, 3, log)
+            known = positive_covariance(name, covariance, 3, log)
             if known is None:
                 continue
             if not _finite(position):
@@ -199,7 +205,7 @@ class Constraints:
         """Take in a pose of the body in the world."""
         name = f"pose prior at {prior.stamp_ns * 1e-9:.3f} s"
         pose = _pose(name, prior.position, prior.orientation, log)
-        covariance = _covariance(name, prior.covariance, 6, log)
+        covariance = positive_covariance(name, prior.covariance, 6, log)
         if pose is None or covariance is None or not self._same_world(name, prior.frame_id, log):
             return
         turn = np.eye(6)
@@ -217,7 +223,7 @@ class Constraints:
             log.reject("bad_factor", f"{name}: latitude, longitude, altitude {place}, expected within 90, 180 deg")
             return
         told = np.asarray(fix.covariance, float)
-        covariance = _covariance(name, told, 3, log) if told.any() else np.zeros((3, 3))
+        covariance = positive_covariance(name, told, 3, log) if told.any() else np.zeros((3, 3))
         if covariance is None or not self._same_world(name, ENU, log):
             return
         try:
@@ -233,12 +239,31 @@ class Constraints:
             return
         self._insert(Absolute(fix.stamp_ns, position, None, covariance, of_antenna=True))
 
+    def put_before(self, older: Constraints, seam: int, log: RejectionLog) -> None:
+        """Take in what was known of an older session, whose map this one's is now; ``seam`` is its first keyframe."""
+        if older.world_frame and self.world_frame not in ("", older.world_frame):
+            lost = len(self.absolute) + len(self.landmarks)
+            log.reject("other_world", f"priors in frame {self.world_frame!r}, expected {older.world_frame!r}", lost)
+            self.absolute, self.landmarks, self.map_from_world = [], {}, None
+        for name in ("relative", "relative_of", "gravity", "landmarks", "steps"):
+            setattr(self, name, {**getattr(self, name), **getattr(older, name)})
+        self.unchecked, self.merges = older.unchecked + self.unchecked, older.merges + self.merges
+        self.refused, self.seams = self.refused | older.refused, self.seams | older.seams | {seam}
+        self.steps.pop(seam, None)
+        self.absolute = sorted(older.absolute + self.absolute, key=lambda one: one.stamp_ns)[-_MOST:]
+        renamed, self.renamed = self.renamed, dict(older.renamed)
+        self.renamed |= {track: other for track, other in renamed.items() if self.name_of(other) != track}
+        self.world_frame = older.world_frame or self.world_frame
+        self.origin = self.origin if older.origin is None else older.origin
+        self.map_from_world = older.map_from_world or self.map_from_world
+
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
         """Drop what belongs to keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
         gone = set(keyframes.tolist())
         self._drop([key for key in self.relative if not gone.isdisjoint(key)])
         self.gravity = {key: value for key, value in self.gravity.items() if key not in gone}
         self.steps = {key: value for key, value in self.steps.items() if key not in gone}
+        self.seams -= gone
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
         self.adjusted_at = max(0, self.adjusted_at - len(gone))
 
@@ -278,6 +303,18 @@ class Constraints:
         return False
 
 
+def joined_step(one: FloatArray, other: FloatArray, turn: FloatArray, move: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of two steps in a row from those of each, about the axes of the body it begins at.
+
+    ``turn`` (3, 3) is that of the first step, ``move`` (3,) m the way of the second in the body where the first begins.
+    With the rotation phi and the translation t of the steps a and b: ``phi = phi_a + R_a phi_b``, ``t = t_a + R_a t_b -
+    [move]x phi_a``.
+    """
+    first, second = np.eye(6), np.kron(np.eye(2), turn)
+    first[3:, :3] = -geometry.hat(move[None])[0]
+    return np.asarray(first @ one @ first.T + second @ other @ second.T)
+
+
 def _pose(name: str, position: FloatArray, orientation: FloatArray, log: RejectionLog) -> ingest.Pose | None:
     position, quaternion = np.asarray(position, float), np.asarray(orientation, float)
     if not _finite(position) or quaternion.shape != (4,) or not ingest.is_rotation(quaternion):
@@ -286,7 +323,7 @@ def _pose(name: str, position: FloatArray, orientation: FloatArray, log: Rejecti
     return ingest.Pose(geometry.matrix_from_quaternion(quaternion), position)
 
 
-def _covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
+def positive_covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
     """Return a covariance (size, size), or None (counted) if it is not positive definite, or its inverse no number."""
     if np.size(values) != size * size:
         log.reject("bad_covariance", f"{name}: {np.size(values)} numbers, expected {size * size}")

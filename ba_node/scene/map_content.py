@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.arrays import BoolArray
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.scene.tables import Column
+
+_ROTATION_TOLERANCE = 1e-6
 
 
 class MapError(ValueError):
@@ -108,6 +110,14 @@ def require_unique(ids: NDArray[Any], name: str) -> None:
     """Raise MapError if a value occurs twice."""
     unique, count = np.unique(ids, return_counts=True)
     require(len(unique) == len(ids), f"{name} = {unique[np.argmax(count)] if len(ids) else 0} occurs more than once")
+
+
+def require_rotations(rotation: FloatArray, name: str) -> None:
+    """Raise MapError unless (n, 3, 3) are rotations."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).reshape(-1, 9).max(axis=1, initial=0.0)
+        good = (off <= _ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0)
+    require_all(good, name, rotation, "a rotation")
 
 
 def within(values: NDArray[Any], limit: float) -> BoolArray:

@@ -159,6 +159,33 @@ class MapTables:
         self._see(np.array([into]), int(table.last_seen[landmark]))
         return True
 
+    def put_before(self, older: MapTables) -> None:
+        """Put the rows of an older map in front; of a track that both know the older place counts, where it has one.
+
+        No keyframe is in both.
+        """
+        n_kf, n_obs = len(older.keyframes), len(older.observations)
+        number = older.find_landmarks(self.landmarks.track_id)
+        new = number < 0
+        number[new] = len(older.landmarks) + np.arange(np.count_nonzero(new))
+        shifted = {"keyframe": self.observations.keyframe + n_kf, "landmark": number[self.observations.landmark]}
+        keyframes, landmarks = older.keyframes.clone(), older.landmarks.clone()
+        observations = older.observations.clone()
+        keyframes.append(len(self.keyframes), **self.keyframes.columns())
+        landmarks.append(int(np.count_nonzero(new)), **self.landmarks.columns(new))
+        observations.append(len(self.observations), **(self.observations.columns() | shifted))
+        both = number[~new]
+        unplaced = ~landmarks.has_position[both]
+        for name in ("position", "has_position"):
+            getattr(landmarks, name)[both[unplaced]] = getattr(self.landmarks, name)[~new][unplaced]
+        landmarks.last_seen[both] = np.maximum(landmarks.last_seen[both], self.landmarks.last_seen[~new])
+        self.keyframes, self.landmarks, self.observations = keyframes, landmarks, observations
+        own = [[Block(b.camera, b.begin + n_obs, b.end + n_obs) for b in blocks] for blocks in self.blocks]
+        self.blocks = [*(list(blocks) for blocks in older.blocks), *own]
+        self.index()
+        # What was an outlier of the one may fit the other.
+        self.observations.outlier[self.views_of(both)] = False
+
     def moved(self, keyframes: IntArray | None = None) -> None:
         """Note that keyframes have other poses, or are refined or no longer; all by default."""
         if keyframes is None:
@@ -256,12 +283,16 @@ class MapTables:
         forgotten = table.keyframe_id[self.order[:n_drop]]
         keep = np.ones(len(table), bool)
         keep[self.order[:n_drop]] = False
+        self._drop_keyframes(keep)
+        return forgotten
+
+    def _drop_keyframes(self, keep: BoolArray) -> None:
+        """Forget all keyframes but those marked, with their observations."""
         self._drop_observations(keep[self.observations.keyframe])
-        renumbered = table.keep(keep)
+        renumbered = self.keyframes.keep(keep)
         self.observations.keyframe[:] = renumbered[self.observations.keyframe]
         self.blocks = [blocks for blocks, kept in zip(self.blocks, keep, strict=True) if kept]
         self._index_keyframes()
-        return forgotten
 
     def _limit_landmarks(self) -> None:
         """Forget the landmarks seen longest ago, ties by row, once there are too many; again a tenth at once."""

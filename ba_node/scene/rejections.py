@@ -51,6 +51,7 @@ NOTICES: dict[str, str] = {
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
     "empty_tracks": "A tracks message without rows.",
     "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
+    "apart": "A session before that no tracks connect with the last one, where scene.join_sessions asks for one map.",
 }
 
 # What somebody has to know or mend: kind -> what it is about. Said on the terminal, in report.json, on /diagnostics and
@@ -73,6 +74,7 @@ WARNINGS: dict[str, str] = {
     "no_geo": "Fixes of GNSS are left out, as pymap3d is missing.",
     "unaligned": "Priors or fixes that were not used, as the path is too short to tell where the map lies in them.",
     "not_adjusted": "A loop or priors that the map would have to be bent too far for, or that images contradict.",
+    "not_joined": "Sessions that tracks connect and that can be no one map: ids in both, stamps, cameras.",
     "setup": "A set-up that the tracks contradict: the likely mistake, and what to change. All solves are held.",
 }
 

@@ -33,7 +33,7 @@ from ba_node.measurements import (
     TrackMerge,
 )
 from ba_node.scene import ingest
-from ba_node.scene.constraints import Constraints
+from ba_node.scene.constraints import Constraints, joined_step
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
@@ -66,6 +66,7 @@ class Scene(MapTables):
         self.step_shares: tuple[float, float] = (1.0, 1.0)
         self.pending: list[FeatureTracks] = []
         self.constraints = Constraints()  # what is known beside pixels
+        self.culled_ns = np.iinfo(np.int64).min  # stamp of the last keyframe that was looked at, see window/culling.py
         self._reused: set[int] = set()
 
     def clone(self) -> Scene:
@@ -144,6 +145,30 @@ class Scene(MapTables):
         stamps = self.keyframes.stamp_ns
         span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
         self.constraints.end(self.keyframes.keyframe_id, span, self.log)
+
+    def take_out(self, keyframes: IntArray) -> None:
+        """Take keyframes (rows, oldest first; not the oldest nor the newest) out of the map; steps lead over them."""
+        table, steps, keep = self.keyframes, self.constraints.steps, np.ones(len(self.keyframes), bool)
+        for row in keyframes.tolist():
+            keep[row], place = False, int(self.places()[row])
+            before = next(one for one in self.order[:place][::-1].tolist() if keep[one])
+            after = int(self.order[place + 1])
+            first, second = steps.get(int(table.keyframe_id[row])), steps.pop(int(table.keyframe_id[after]), None)
+            if first is not None and second is not None:
+                back = table.input_rotation[before].T
+                move = back @ (table.input_position[after] - table.input_position[row])
+                steps[int(table.keyframe_id[after])] = joined_step(
+                    first, second, back @ table.input_rotation[row], move
+                )
+        gone = table.keyframe_id[~keep]
+        self._drop_keyframes(keep)
+        self.constraints.forget(gone, int(table.stamp_ns[self.order[0]]))
+
+    def sessions_of(self, keyframes: IntArray) -> IntArray:
+        """Return how many sessions of a map that was joined had begun before each of some keyframes (rows)."""
+        rows = [row for row in map(self.find_keyframe, self.constraints.seams) if row is not None]
+        begun = np.sort(self.places()[np.array(rows, np.intp)])
+        return np.asarray(np.searchsorted(begun, self.places()[keyframes], side="right"))
 
     def refine_cameras(self, cameras: Cameras) -> None:
         """Take refined cameras in the place of the rig that came, which stays known as the same one."""

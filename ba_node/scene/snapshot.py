@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.arrays import FloatArray
 from ba_node.config import SceneConfig
 from ba_node.core.cameras import N_PARAMS, Model
 from ba_node.core.problem import Cameras
 from ba_node.measurements import FeatureTracks
-from ba_node.scene import ingest
-from ba_node.scene.constraints import Constraints
+from ba_node.scene import ingest, saved_constraints
 from ba_node.scene.map_content import (
     MapContent,
     prefixed,
     require,
     require_all,
     require_index,
+    require_rotations,
     require_unique,
     within,
 )
@@ -52,7 +51,6 @@ _PENDING_ROWS = {
     "sigma_px": Column(np.float64),
     "depth_m": Column(np.float64),
 }
-_ROTATION_TOLERANCE = 1e-6
 _FINITE = np.finfo(float).max
 
 
@@ -74,9 +72,9 @@ def take(scene: Scene) -> MapContent:
         "notices": dict(sorted(scene.log.notices.items())),
         "rejection_notes": list(scene.log.notes),
         "warnings": dict(scene.log.warnings),
-        "world": _world(scene.constraints),
     }
-    return MapContent(arrays, facts)
+    beside = saved_constraints.take(scene.constraints)
+    return MapContent(arrays | beside.arrays, facts | beside.facts)
 
 
 def build(content: MapContent, config: SceneConfig) -> Scene:
@@ -100,7 +98,7 @@ def build(content: MapContent, config: SceneConfig) -> Scene:
     scene.blocks = _blocks(content, columns["sightings"], n)
     scene.pending = _pending(content, session_id)
     _restore_log(content, scene)
-    _restore_world(content, scene.constraints)
+    saved_constraints.restore(content, scene.constraints)
     scene.index()
     return scene
 
@@ -126,14 +124,6 @@ def _cameras(content: MapContent, group: str) -> Cameras | None:
     good = np.isfinite(found["params"]).all(axis=1) & (found["params"][:, :2] > 0).all(axis=1)
     require_all(good, f"{group}/params", found["params"], "finite numbers with fx, fy > 0")
     return Cameras(**{name: np.array(values) for name, values in found.items()})
-
-
-def require_rotations(rotation: FloatArray, name: str) -> None:
-    """Raise MapError unless (n, 3, 3) are rotations."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        off = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).reshape(-1, 9).max(axis=1, initial=0.0)
-        good = (off <= _ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0)
-    require_all(good, name, rotation, "a rotation")
 
 
 def _check_keyframes(found: Mapping[str, NDArray[Any]]) -> None:
@@ -209,44 +199,6 @@ def _pending(content: MapContent, session_id: int | None) -> list[FeatureTracks]
         waiting.append(tracks)
         begin += n
     return waiting
-
-
-def _world(known: Constraints) -> dict[str, Any]:
-    """Return what outlasts the keyframes of all that is known beside pixels, as JSON has it."""
-    place = known.map_from_world
-    return {
-        "frame_id": known.world_frame,
-        "origin": None if known.origin is None else known.origin.tolist(),
-        "map_from_world": None if place is None else [place[0].ravel().tolist(), place[1].tolist()],
-        "renamed": [list(pair) for pair in known.renamed.items()],
-    }
-
-
-def _restore_world(content: MapContent, known: Constraints) -> None:
-    """Take over what :func:`_world` gave; maps of 0.2.0 have none."""
-    if "world" not in content.facts:
-        return
-    facts = MapContent(facts=content.fact("world", dict))
-    known.world_frame = facts.fact("frame_id", str)
-    if facts.fact("origin", (list, type(None))) is not None:
-        known.origin = _numbers(facts.facts["origin"], 3, "world: origin")
-    place = facts.fact("map_from_world", (list, type(None)))
-    if place is not None:
-        require(len(place) == 2, f"world: map_from_world = {place}, expected a rotation and a translation")
-        rotation = _numbers(place[0], 9, "world: map_from_world").reshape(3, 3)
-        require_rotations(rotation[None], "world: map_from_world")
-        known.map_from_world = rotation, _numbers(place[1], 3, "world: map_from_world")
-    for pair in facts.fact("renamed", list):
-        good = isinstance(pair, list) and len(pair) == 2 and all(type(one) is int and 0 <= one < 2**64 for one in pair)
-        # A later name of a track is one that has none: no ring of names can form.
-        require(good and known.name_of(pair[1]) != pair[0], f"world: renamed has {pair!r}, expected two tracks")
-        known.renamed[pair[0]] = pair[1]
-
-
-def _numbers(values: Any, n: int, name: str) -> FloatArray:
-    good = isinstance(values, list) and len(values) == n and all(type(one) in (int, float) for one in values)
-    require(good and all(abs(one) < _FINITE for one in values), f"{name} = {values!r}, expected {n} finite numbers")
-    return np.array(values, float)
 
 
 def _restore_log(content: MapContent, scene: Scene) -> None:

@@ -120,8 +120,12 @@ class Table:
     def clone(self: _Table) -> _Table:
         """Return a table of its own with the same rows."""
         other = type(self)()
-        other.append(self._size, **{name: getattr(self, name) for name in self.COLUMNS})
+        other.append(self._size, **self.columns())
         return other
+
+    def columns(self, rows: BoolArray | slice = slice(None)) -> dict[str, NDArray[Any]]:
+        """Return all columns, of some rows, as :meth:`append` takes them."""
+        return {name: getattr(self, name)[rows] for name in self.COLUMNS}
 
     def copy(self) -> Rows:
         """Return a copy of the columns in ``COPIED``; it costs as much as has changed since the last."""

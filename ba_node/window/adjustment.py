@@ -34,9 +34,11 @@ from ba_node.window import arrival, constraints, full
 from ba_node.window.problems import problem_of
 
 # So many tracks place a keyframe; a view agrees within so many outlier gates, as the map has drifted apart.
-_LEAST, _WIDE = 6, 3.0
+LEAST, WIDE = 6, 3.0
 # What a step of the map is worth, by what one of the front-end's is; how far (rms, in sigmas) steps may be bent.
 _WORTH, _BENT = 1.0 / 3.0, 10.0
+# Between two sessions nothing was measured: they were aligned so well at least.
+_SEAM_RAD, _SEAM_M = 0.1, 1.0
 # How far the first keyframe may be turned where nothing else tells.
 _UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
@@ -221,6 +223,8 @@ def _steps(scene: Scene, config: OdometryConfig) -> RelativePoses:
     axes = np.arange(3)
     root[:, axes, axes] = 1.0 / np.maximum(_WORTH * sigma_rad, 1e-9)[:, None]
     root[:, axes + 3, axes + 3] = 1.0 / np.maximum(_WORTH * sigma_m, 1e-9)[:, None]
+    anew = np.diff(scene.sessions_of(order)) > 0
+    root[anew] = np.diag(np.repeat([1.0 / _SEAM_RAD, 1.0 / _SEAM_M], 3))
     at = np.arange(len(move))
     return RelativePoses(np.stack([at, at + 1], axis=1), turn, move, root)
 
@@ -289,9 +293,9 @@ def _merged(scene: Scene, config: Config, final: bool) -> Due | None:
     placed = points.has_position[rows[:, 1]]
     placed[placed] = seen
     seen = placed
-    if np.count_nonzero(seen) < _LEAST:
+    if np.count_nonzero(seen) < LEAST:
         if final and known.merges:
-            _give_up(scene, np.array(known.merges, np.uint64), f"no keyframe sees {_LEAST} that have a place")
+            _give_up(scene, np.array(known.merges, np.uint64), f"no keyframe sees {LEAST} that have a place")
         return None
     old = min((int(k) for k, _ in _images(scene, rows[seen][0, 1])), key=lambda k: int(scene.places()[k]))
     found = _resected(scene, config, new, rows[seen], old)
@@ -370,12 +374,12 @@ def _resected(
         begin = State(pose[0][None], pose[1][None], problem.start.points, problem.start.intrinsics)
         state = arrival.lowered(problem, begin)
         off = native_kernels.residual_norms(problem, state, config.solver.kernels)
-        cost = float(np.sum(np.minimum(off, _WIDE * config.tracks.outlier_px)))
+        cost = float(np.sum(np.minimum(off, WIDE * config.tracks.outlier_px)))
         if cost < least:
             best, least = state, cost
     norms = native_kernels.residual_norms(problem, best, config.solver.kernels)
-    right = np.bincount(problem.observations.point, norms <= _WIDE * config.tracks.outlier_px, len(rows)) > 0
-    if np.count_nonzero(right) < max(_LEAST, (len(rows) + 1) // 2):
+    right = np.bincount(problem.observations.point, norms <= WIDE * config.tracks.outlier_px, len(rows)) > 0
+    if np.count_nonzero(right) < max(LEAST, (len(rows) + 1) // 2):
         return None
     agrees = np.empty(len(rows), bool)
     agrees[order] = right

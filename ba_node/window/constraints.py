@@ -33,7 +33,7 @@ from ba_node.scene.scene import Scene
 _LOSS = "cauchy"
 # Standard deviation of the vertical of one frame in the other, rad; and of an orientation that was not measured.
 _LEVEL_RAD = 0.05
-_UNKNOWN = 1e6
+UNKNOWN = 1e6
 # Pairs that map and world are aligned by, spread over all.
 _ALIGNED = 2000
 # Minimal sets that are tried, pairs in each, pairs that score them, rounds of weighting.
@@ -83,6 +83,8 @@ def pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
     exact = stamps[np.minimum(after, len(stamps) - 1)] == time
     after = after + exact
     inside = (after > 0) & ((after < len(stamps)) | exact)
+    session = np.append(scene.sessions_of(order), -1)
+    inside &= exact | (session[after - 1] == session[after])
     which = np.flatnonzero(inside)
     a = after[which] - 1
     b = np.minimum(a + 1, len(stamps) - 1)
@@ -122,20 +124,27 @@ def every_pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
     seen = scene.observations.keyframe[points.last[rows[good]]].astype(np.intp)
     recent = scene.places()[seen] >= first
     good, seen = good[recent], seen[recent]
-    away = points.position[rows[good]] - scene.keyframes.position[seen]
     priors = list(known.values())
     covariance = np.array([_six(priors[i][1], config) for i in good]).reshape(-1, 6, 6)
+    position = np.array([priors[i][0] for i in good]).reshape(-1, 3)
+    more = as_seen(scene, rows[good], seen, position, covariance)
+    return Pairs(*(np.concatenate(both) for both in zip(vars(pairs).values(), vars(more).values(), strict=True)))
+
+
+def as_seen(scene: Scene, points: IntArray, seen: IntArray, position: FloatArray, covariance: FloatArray) -> Pairs:
+    """Return points (rows in the scene) whose places are known as points of the body at keyframes ``seen`` (rows)."""
+    away = scene.landmarks.position[points] - scene.keyframes.position[seen]
+    covariance = covariance.copy()
     covariance[:, 3:, 3:] += (0.05**2 * np.sum(away**2, axis=1))[:, None, None] * np.eye(3)
     back = np.swapaxes(scene.keyframes.rotation[seen], 1, 2)
-    position = np.array([priors[i][0] for i in good]).reshape(-1, 3)
-    more = Pairs(seen, (back @ away[:, :, None])[..., 0], position, np.tile(np.eye(3), (len(good), 1, 1)), covariance)
-    return Pairs(*(np.concatenate(both) for both in zip(vars(pairs).values(), vars(more).values(), strict=True)))
+    unit = np.tile(np.eye(3), (len(points), 1, 1))
+    return Pairs(seen, (back @ away[:, :, None])[..., 0], position, unit, covariance)
 
 
 def _six(covariance: FloatArray, config: FactorsConfig) -> FloatArray:
     if len(covariance) == 6:
         return covariance
-    out = _UNKNOWN**2 * np.eye(6)
+    out = UNKNOWN**2 * np.eye(6)
     out[3:, 3:] = covariance if covariance.any() else config.gnss_sigma_m**2 * np.eye(3)
     return out
 
@@ -146,13 +155,13 @@ def align(scene: Scene, config: Config) -> bool:
     if known.world_frame == config.frames.map_frame:
         known.map_from_world = np.eye(3), np.zeros(3)
         return True
-    found = _aligned(scene, every_pair(scene, config.factors), config.factors)
+    found = aligned(scene, every_pair(scene, config.factors), config.factors)
     if found is not None:
         known.map_from_world = found
     return known.map_from_world is not None
 
 
-def _aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArray, FloatArray] | None:
+def aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArray, FloatArray] | None:
     """Return map from world, None where too little is known."""
     if not len(pairs):
         return None
@@ -240,7 +249,7 @@ def absolute(scene: Scene, config: Config, pairs: Pairs, numbers: IntArray, orig
     assert scene.constraints.map_from_world is not None
     rotation, translation = scene.constraints.map_from_world
     root = root_information(pairs.covariance)
-    root[pairs.covariance[:, 0, 0] >= _UNKNOWN**2, :3] = 0.0
+    root[pairs.covariance[:, 0, 0] >= UNKNOWN**2, :3] = 0.0
     root[:, :, 3:] = root[:, :, 3:] @ rotation.T
     position = pairs.position @ rotation.T + translation - origin
     where = numbers[:, None], rotation @ pairs.rotation, position, pairs.lever_arm

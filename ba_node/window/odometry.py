@@ -76,7 +76,8 @@ class _Steps:
 
 def ties(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray:
     """Return which keyframes of a problem, oldest first, are tied to the next one, (n_kf - 1,)."""
-    return config.enabled & (np.diff(scene.places()[keyframes]) <= _MAX_GAP)
+    near = np.diff(scene.places()[keyframes]) <= _MAX_GAP
+    return np.asarray(config.enabled & near & (np.diff(scene.sessions_of(keyframes)) == 0))
 
 
 def factors(

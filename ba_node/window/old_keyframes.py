@@ -128,8 +128,9 @@ def memory(scene: Scene, config: Config, window: IntArray) -> Memory | None:
         return None
     rows = scene.find_keyframes(known.solved.keyframe_id)
     table = scene.keyframes
-    same = (rows >= 0).all() and all(
-        np.array_equal(now[rows], then)
+    free = ~known.solved.problem.fixed
+    same = (rows[free] >= 0).all() and all(
+        np.array_equal(now[rows[free]], then[free])
         for now, then in zip((table.rotation, table.position), known.solved.poses, strict=True)
     )
     if not same:
@@ -137,7 +138,7 @@ def memory(scene: Scene, config: Config, window: IntArray) -> Memory | None:
         return None
     inside = np.isin(rows, window)
     # All that have left since that window was solved: where solves were held, they are taken out once more, together.
-    gone = ~inside & ~known.solved.problem.fixed
+    gone = ~inside & free
     if (gone & ~np.isin(known.solved.keyframe_id, known.left)).any():
         known = _without(scene, known, gone, methods.from_config(config.solver))
         known = known.recent(scene, int(table.stamp_ns[window[0]]), config.window.max_keyframes)

@@ -37,6 +37,8 @@ _SPARE = 2
 _ABSURD = 25.0
 # Rotations alone are looked for in windows, not in whole maps.
 _MOST_TURNS = 200
+# Places in the order of time by which sessions are told apart.
+_APART = 10**9
 # As many residuals of known points tell how good the poses are.
 _BULK = 100
 
@@ -61,7 +63,7 @@ class Selection:
     tried: IntArray  # points whose tracks a solution is tried on, see ``trial.py``
     held_out: BoolArray  # (n_pt,) those of them that are not in the problem, but for their start
     keyframe_id: IdArray  # (n_kf,) uint64
-    place: IntArray  # (n_kf,) of each keyframe in the order of time
+    place: IntArray  # (n_kf,) of each keyframe in the order of time; those of other sessions are far apart
     measured: tuple[FloatArray, FloatArray]  # the front-end's poses, body from world: (n_kf, 3, 3), (n_kf, 3) m
     strays: tuple[arrival.Stray, ...]  # keyframes that began in the wrong place
     beside: tuple[KeyframeFactors, ...] = ()  # factors of the problem that are no steps of the front-end
@@ -161,7 +163,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         tried=tried,
         held_out=held_out,
         keyframe_id=table.keyframe_id[part.keyframes],
-        place=scene.places()[part.keyframes],
+        place=scene.places()[part.keyframes] + _APART * scene.sessions_of(part.keyframes),
         measured=_measured(scene, part),
         strays=strays,
         beside=tuple(beside),

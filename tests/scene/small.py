@@ -52,7 +52,7 @@ def guesses(ids: np.ndarray = IDS, session: int = 0, **changes: Any) -> Landmark
     return dataclasses.replace(LandmarkGuesses(session, ids, position), **changes)
 
 
-def scene_of(*measurements: Measurement, **config: int) -> Scene:
+def scene_of(*measurements: Measurement, **config: Any) -> Scene:
     scene = Scene(SceneConfig(**config))
     for measurement in measurements:
         scene.add(measurement)
