@@ -43,7 +43,7 @@ def commands_page() -> str:
             subparsers = build_parser(name)._subparsers
             assert subparsers is not None
             choices: Any = subparsers._group_actions[0].choices
-            parts.append(f"### ba {name}\n\n{COMMANDS[name].SUMMARY}.\n\n```text\n{choices[name].format_help()}```\n")
+            parts.append(f"### ba {name}\n\n{COMMANDS[name]}.\n\n```text\n{choices[name].format_help()}```\n")
     return "\n".join(parts)
 
 

@@ -10,7 +10,7 @@ import sys
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.measurements import Keyframe
 
 

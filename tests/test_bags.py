@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ba_node.cli.main import main
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 
 BAGS = Path(__file__).parents[1] / "bags"
 README = (BAGS / "README.md").read_text()

@@ -45,6 +45,8 @@ BEHIND_THE_FACE = ("scene", "window", "check")
 NUMERICS_FOR_ALL = ("geometry", "cameras", "problem")
 # `ba solve` and what belongs to it work on a file, without a back-end.
 WITHOUT_BACKEND = (
+    "offline/bal_share.py",
+    "offline/ranks.py",
     "offline/solve_bal.py",
     "offline/solve_model.py",
     "offline/solve_ranks.py",

@@ -2,23 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
 
-from ba_node.backend.archive import MapState
-from ba_node.backend.backend import FINISHED_KEPT, Backend
+from ba_node.backend.backend import Backend
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
 from ba_node.check.watch import Check
 from ba_node.core.calibration import Calibration
-from ba_node.scene.candidates import Admitted
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.window.adjustment import Adjustment
 from ba_node.window.full import Optimization
-from ba_node.window.quality import Residuals
 
 __all__ = [
-    "FINISHED_KEPT",
     "Adjustment",
-    "Admitted",
     "Backend",
     "Calibration",
     "Check",
@@ -27,10 +22,8 @@ __all__ = [
     "MapContent",
     "MapEnded",
     "MapError",
-    "MapState",
     "MapSummary",
     "Optimization",
-    "Residuals",
     "Row",
     "can_examine",
 ]

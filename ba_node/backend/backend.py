@@ -270,12 +270,12 @@ class Backend:
         """Return all that is known, with the report of the last solve."""
         return self.map.estimate()
 
-    def optimize(self) -> Estimate | None:
+    def optimize(self, by: full.Solve | None = None) -> Estimate | None:
         """Refine all keyframes and points that are kept; return what is known then, None if nothing came of it."""
         begun = self.begin_optimization()
         if isinstance(begun, str):
             return None
-        begun.solve(self.config.solver)
+        begun.solve(self.config.solver, by=by)
         merged = self.merge(begun)
         return merged[0] if merged else None
 

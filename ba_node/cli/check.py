@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from ba_node.backend import Diagnosis, Row
     from ba_node.config import Config
 
-SUMMARY = "test calibration and conventions of a recording against its tracks"
 EXAMPLE = "ba check bags/stereo_loop.mcap"
 TOO_LITTLE, MISTAKE = 2, 3
 
@@ -77,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_all(args: argparse.Namespace, config: Config) -> int:
     """Check many recordings."""
-    from ba_node.io.mcap import TopicChoice  # noqa: PLC0415
+    from ba_node.io.bag_topics import TopicChoice  # noqa: PLC0415
     from ba_node.offline import batch  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet, expand  # noqa: PLC0415
 

@@ -69,6 +69,10 @@ def progress_bar(name: str, unit: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
+class CheckoutError(ValueError):
+    """A command whose code stands beside the package in a checkout, and is not installed with it."""
+
+
 class TargetError(ValueError):
     """A file that is asked for in a format that is not written."""
 
@@ -79,11 +83,11 @@ def require_folder(path: Path | None) -> None:
         raise TargetError(f"{path}: there is no folder {path.parent}: make it first")
 
 
-def require_mcap(path: Path, otherwise: str = "") -> None:
-    """Raise TargetError unless a recording may have this name; ``otherwise`` says what else may be meant."""
+def require_mcap(path: Path) -> None:
+    """Raise TargetError unless a recording may have this name."""
     require_folder(path)
     if path.suffix != ".mcap":
-        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so{otherwise}")
+        raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so")
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -138,6 +142,28 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--namespace", default="", metavar="NS", help="take topics of this namespace only, e.g. /robot1"
     )
+
+
+def add_declared_options(parser: argparse.ArgumentParser, options: type) -> None:
+    """Declare an option of the command for each that a dataclass declares."""
+    from ba_node.config import declared  # noqa: PLC0415
+
+    for option in declared(options):
+        flag, unit = f"--{option.name.replace('_', '-')}", f", {option.unit}" if option.unit else ""
+        text = f"{option.doc} (default: {option.default}{unit})".replace("%", "%%")
+        if option.kind is bool:
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=text)
+        else:
+            metavar = None if option.choices else option.kind.__name__.upper()
+            parser.add_argument(flag, type=option.kind, choices=option.choices or None, metavar=metavar, help=text)
+
+
+def declared_options(args: argparse.Namespace, options: type) -> dict[str, Any]:
+    """Return those of the options of :func:`add_declared_options` that were given."""
+    from ba_node.config import declared  # noqa: PLC0415
+
+    values = {option.name: getattr(args, option.name) for option in declared(options)}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:

@@ -33,7 +33,6 @@ from ba_node.cli.console import (
     write_result,
 )
 
-SUMMARY = "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY"
 EXAMPLE = (
     "ba convert sparse/0 scene.mcap\n  ba convert bags/stereo_loop.mcap model/\n"
     "  ba convert problem-49-7776-pre.txt ladybug.mcap\n  ba convert out/trajectory.tum poses.txt --to kitti\n"

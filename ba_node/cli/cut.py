@@ -12,7 +12,6 @@ from pathlib import Path
 
 from ba_node.cli.console import progress_bar, require_mcap, write_result
 
-SUMMARY = "write a part of a recording"
 EXAMPLE = "ba cut bags/stereo_loop.mcap --out middle.mcap --start 5 --end 10"
 
 

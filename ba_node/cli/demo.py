@@ -18,7 +18,6 @@ from ba_node.cli.console import facts, table, write_result
 if TYPE_CHECKING:
     from ba_node.offline.demo import Outcome
 
-SUMMARY = "run the node on a recording and compare with ground truth"
 EXAMPLE = "ba demo --out out/demo"
 
 

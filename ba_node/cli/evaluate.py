@@ -14,7 +14,6 @@ from pathlib import Path
 
 from ba_node.cli.console import require_folder, table, write_result
 
-SUMMARY = "compare a trajectory with a reference"
 EXAMPLE = "ba evaluate out/trajectory.tum ground_truth.tum --align se3 --interval 1 --unit m"
 
 _HEAD = ("rmse", "mean", "median", "min", "max", "std", "sse", "count")

@@ -24,7 +24,6 @@ from ba_node.cli.console import (
 if TYPE_CHECKING:
     from ba_node.offline.recordings import RecordingFacts
 
-SUMMARY = "tell what is in a recording, and what a replay would use"
 EXAMPLE = "ba info bags/stereo_loop.mcap"
 ATTENTION = 3
 

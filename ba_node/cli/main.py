@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run ``ba``: read the command line, hand over to the file of the command, turn errors into one line.
 
-Only the command that is asked for says what options it has: that of ``synth`` comes from modules that are slow to
-import, and ``ba --help`` is not to wait for them.
+Only the command that is asked for is imported: ``ba --help`` is not to wait for the others.
 """
 
 from __future__ import annotations
@@ -14,66 +13,64 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
 from ba_node import __version__
 from ba_node.cli import interrupts
-from ba_node.cli.checkout import CheckoutCommand
-from ba_node.cli.console import add_json_option, conclude, json_alone, require_folder
+from ba_node.cli.console import CheckoutError, add_json_option, conclude, json_alone, require_folder
 
-# Every command, under its heading in ``ba --help``; each is a file of this folder, but for those of the last group.
-GROUPS: dict[str, tuple[str, ...]] = {
-    "from images": (
-        "run",
-        "track",
-    ),
-    "refine": (
-        "replay",
-        "tune",
-        "sweep",
-        "solve",
-        "calibrate",
-        "map",
-    ),
-    "look": (
-        "info",
-        "check",
-        "view",
-        "report",
-        "evaluate",
-        "regress",
-    ),
-    "recordings and files": (
-        "cut",
-        "merge",
-        "convert",
-        "rig",
-        "synth",
-    ),
-    "the running node": (
-        "record",
-        "play",
-        "demo",
-        "params",
-    ),
-    "in a checkout of the repository": (
-        "steps",
-        "robustness",
-        "thesis",
-    ),
+# What every command does, under its heading in ``ba --help``; each is a file of this folder, or below ``experiments``.
+GROUPS: dict[str, dict[str, str]] = {
+    "from images": {
+        "run": "from images to a map: track, check, replay, report",
+        "track": "track images: keyframes and feature tracks for ba replay",
+    },
+    "refine": {
+        "replay": "run the back-end on a recording, without a middleware",
+        "tune": "search for better parameters on recordings",
+        "sweep": "try every combination of some values of parameters on recordings",
+        "solve": "solve a BAL, Bundler, COLMAP or g2o problem as a whole",
+        "calibrate": "refine the cameras of a recording from its tracks",
+        "map": "look into a saved map, or export it",
+    },
+    "look": {
+        "info": "tell what is in a recording, and what a replay would use",
+        "check": "test calibration and conventions of a recording against its tracks",
+        "view": "show recordings and results in Foxglove or Rerun",
+        "report": "make a page of the results of replays, one or several side by side",
+        "evaluate": "compare a trajectory with a reference",
+        "regress": "replay recordings and compare with a baseline",
+    },
+    "recordings and files": {
+        "cut": "write a part of a recording",
+        "merge": "put several recordings together",
+        "convert": "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY",
+        "rig": "show, convert or publish the cameras of a rig",
+        "synth": "make a recording with ground truth",
+    },
+    "the running node": {
+        "record": "record the node's inputs from live topics",
+        "play": "publish a recording on live topics",
+        "demo": "run the node on a recording and compare with ground truth",
+        "params": "print all parameters with their defaults",
+    },
+    "in a checkout of the repository": {
+        "steps": "search the steps of the scaling inc on a BAL file",
+        "sphere": "make a BAL problem of points on a sphere, with its truth",
+        "robustness": "prove on recordings gone wrong that no harm is done",
+        "thesis": "repeat tables and figures of the thesis",
+    },
 }
-_IN_A_CHECKOUT = (
-    CheckoutCommand("steps", "thesis.steps", "search the steps of the scaling inc on a BAL file"),
-    CheckoutCommand("robustness", "robustness.command", "prove on recordings gone wrong that no harm is done"),
-    CheckoutCommand("thesis", "thesis.command", "repeat tables and figures of the thesis"),
-)
-_BY_NAME = {command.name: command for command in _IN_A_CHECKOUT}
-COMMANDS: dict[str, ModuleType | CheckoutCommand] = {
-    name: _BY_NAME.get(name) or importlib.import_module(f"ba_node.cli.{name}")
-    for names in GROUPS.values()
-    for name in names
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+_EXPERIMENTS = {
+    "steps": "thesis.steps",
+    "sphere": "thesis.sphere_file",
+    "robustness": "robustness.command",
+    "thesis": "thesis.command",
 }
+ROOT = Path(__file__).resolve().parents[2]
 _EXAMPLES = """\
 examples:
   ba check bags/stereo_loop.mcap                 is the set-up sound?
@@ -105,12 +102,27 @@ class Parser(argparse.ArgumentParser):
         self.exit(USAGE_ERROR, f"ba: error: {message}; see {self.prog} --help\n")
 
 
+def module_of(command: str) -> ModuleType:
+    """Import the module of a command: it has EXAMPLE, add_arguments and run.
+
+    Raises:
+        CheckoutError: it is one of the experiments, and the package is installed without its repository.
+    """
+    if command not in _EXPERIMENTS:
+        return importlib.import_module(f"ba_node.cli.{command}")
+    if not all((ROOT / name).is_file() for name in ("setup.py", "experiments/__init__.py")):
+        raise CheckoutError(f"{command} needs a checkout of the repository: experiments are not installed")
+    if str(ROOT) not in sys.path:
+        sys.path.append(str(ROOT))
+    return importlib.import_module(f"experiments.{_EXPERIMENTS[command]}")
+
+
 def overview() -> str:
     """Return the commands by group, each with its line, and examples."""
     width = max(map(len, COMMANDS))
     parts = [
-        "\n".join([f"{title}:", *(f"    {name.ljust(width)}  {COMMANDS[name].SUMMARY}" for name in names)])
-        for title, names in GROUPS.items()
+        "\n".join([f"{title}:", *(f"    {name.ljust(width)}  {summary}" for name, summary in group.items())])
+        for title, group in GROUPS.items()
     ]
     return "\n\n".join([*parts, _EXAMPLES])
 
@@ -141,11 +153,11 @@ def build_parser(command: str) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=Parser, help=argparse.SUPPRESS, prog="ba"
     )
-    for name, entry in COMMANDS.items():
+    for name in COMMANDS:
         if name != command:
             subparsers.add_parser(name)
             continue
-        module = entry.load() if isinstance(entry, CheckoutCommand) else entry
+        module = module_of(name)
         sub = subparsers.add_parser(
             name,
             description=module.__doc__,
@@ -154,8 +166,7 @@ def build_parser(command: str) -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         module.add_arguments(sub)
-        if module is entry:
-            add_json_option(sub)
+        add_json_option(sub)
     return parser
 
 
@@ -194,7 +205,7 @@ def _run(argv: Sequence[str] | None) -> int:
         asked = getattr(args, "json", None)
         require_folder(asked)
         with json_alone(asked):
-            code: int = COMMANDS[args.command].run(args)
+            code: int = module_of(args.command).run(args)
             if asked is not None:
                 conclude(args, code)
         sys.stdout.flush()

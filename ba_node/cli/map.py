@@ -12,7 +12,6 @@ from pathlib import Path
 
 from ba_node.cli.console import TargetError, facts, require_folder, write_result
 
-SUMMARY = "look into a saved map, or export it"
 EXAMPLE = "ba map export site.npz --tum poses.tum --ply points.ply"
 
 

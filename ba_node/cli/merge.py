@@ -14,7 +14,6 @@ from pathlib import Path
 
 from ba_node.cli.console import progress_bar, require_mcap, write_result
 
-SUMMARY = "put several recordings together"
 EXAMPLE = "ba merge bags/stereo_loop.mcap out/refined.mcap --out both.mcap"
 ATTENTION = 3
 

@@ -8,7 +8,6 @@ import argparse
 
 from ba_node.cli.console import write_result
 
-SUMMARY = "print all parameters with their defaults"
 EXAMPLE = "ba params > my.yaml"
 
 

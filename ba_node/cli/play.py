@@ -15,7 +15,6 @@ from pathlib import Path
 from ba_node.cli import interrupts
 from ba_node.cli.console import progress_bar, write_result
 
-SUMMARY = "publish a recording on live topics"
 EXAMPLE = (
     "ba play bags/stereo_loop.mcap --rate 2 --remap keyframes:=front/keyframes\n"
     "  ba play bags/mono_loop.mcap --clock --start 3 --loop"

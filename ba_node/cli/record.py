@@ -14,7 +14,6 @@ from pathlib import Path
 
 from ba_node.cli.console import require_mcap, write_result
 
-SUMMARY = "record the node's inputs from live topics"
 EXAMPLE = "ba record --out drive.mcap --namespace /robot1 --topics /robot1/ground_truth/pose"
 
 

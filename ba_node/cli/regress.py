@@ -18,7 +18,6 @@ from typing import Any
 
 from ba_node.cli.console import coloured, progress_bar, require_folder, table, write_result
 
-SUMMARY = "replay recordings and compare with a baseline"
 EXAMPLE = "ba regress bags/regress.yaml\n  ba regress mine.yaml --new drive_1.mcap drive_2.mcap"
 ATTENTION = 3
 _HEAD = ("recording", "figure", "baseline", "now", "change", "allowed", "")

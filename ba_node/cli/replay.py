@@ -41,13 +41,13 @@ from ba_node.cli.console import (
     topic_choice,
     write_result,
 )
+from ba_node.cli.ranks import start_ranks, together
 from ba_node.config import ConfigError
 from ba_node.offline.attention import HARMLESS
 
 if TYPE_CHECKING:
     from ba_node.config import Config
 
-SUMMARY = "run the back-end on a recording, without a middleware"
 # Results were written, and something in them has to be looked at.
 ATTENTION, NOTHING = 3, 2
 
@@ -78,6 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--final-optimize", action="store_true", help="refine all keyframes and points of the newest session at the end"
     )
+    parser.add_argument(
+        "--ranks", type=int, metavar="N", help="with --final-optimize: do that on N processes by MPI, see docs/scale.md"
+    )
     parser.add_argument("--no-report", action="store_true", help="leave out the page and the picture of the results")
     parser.add_argument(
         "--covariance", action="store_true", help="with --final-optimize: write how precise all is to covariance.npz"
@@ -91,22 +94,29 @@ def run(args: argparse.Namespace) -> int:
     """Replay."""
     from ba_node.offline.batch import recordings  # noqa: PLC0415
     from ba_node.offline.fleet import is_url  # noqa: PLC0415
-    from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
+    from ba_node.offline.ranks import started_as_ranks  # noqa: PLC0415
 
     require_folder(args.save_map)
+    if args.ranks is not None and not args.final_optimize:
+        raise ConfigError("--ranks share a solve of everything: add --final-optimize")
     if args.covariance and not args.final_optimize:
         raise ConfigError("--covariance is worked out by a solve of everything: add --final-optimize")
     config = parameters(args)
     if config.calibration.wanted and not args.final_optimize:
         raise ConfigError("calibration.* = refined is for a solve of everything: add --final-optimize")
+    if config.calibration.wanted and args.ranks is not None:
+        raise ConfigError("calibration.* = refined is worked out by one process: leave --ranks out")
     found = recordings(args.bag, each=args.each)
     if len(found) > 1 or args.scheduler or any(map(is_url, (args.bag[0], args.out))):
         return _replay_all(args, config, found)
     args.bag, args.out = list(map(Path, found[0])), Path(args.out)
-    with progress_bar("replay", "messages") as progress:
-        wanted = args.final_optimize, args.final_optimize and args.covariance
-        options = MapOptions(args.load_map, *wanted, args.save_map, topic_choice(args))
-        report = replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
+    if args.ranks is not None and not started_as_ranks():
+        return start_ranks(args, (0, ATTENTION, NOTHING))
+    on_ranks = args.final_optimize and started_as_ranks()
+    report = _on_ranks(args, config) if on_ranks else _replayed(args, config)
+    if report is None:
+        args.json = None  # rank 0 writes it
+        return 0
     print(facts(_rows(report)))
     _tell(report)
     if args.no_report:
@@ -114,9 +124,39 @@ def run(args: argparse.Namespace) -> int:
     else:
         from ba_node.offline.report import show  # noqa: PLC0415
 
-        print(f"written to {args.out}: {show(args.out)}")
+        with progress_bar("report", "figures") as progress:
+            written = show(args.out, progress)
+        print(f"written to {args.out}: {written}")
     write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
+
+
+def _replayed(args: argparse.Namespace, config: Config, **more: Any) -> dict[str, Any]:
+    """Replay one recording; return its report."""
+    from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
+
+    with progress_bar("replay", "messages") as progress:
+        wanted = args.final_optimize, args.final_optimize and args.covariance
+        options = MapOptions(args.load_map, *wanted, args.save_map, topic_choice(args), **more)
+        return replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
+
+
+def _on_ranks(args: argparse.Namespace, config: Config) -> dict[str, Any] | None:
+    """Replay on rank 0, and have all ranks solve everything at the end; return the report on rank 0."""
+    from ba_node.offline.ranks import world  # noqa: PLC0415
+    from ba_node.offline.solve_ranks import RankSolver  # noqa: PLC0415
+
+    communicator = world()
+    solver = RankSolver(communicator)
+
+    def part() -> dict[str, Any] | None:
+        if communicator.rank:
+            solver.serve()
+            return None
+        with solver:
+            return _replayed(args, config, by=solver)
+
+    return together(communicator, part)
 
 
 def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str, ...]]) -> int:
@@ -124,7 +164,7 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
     from ba_node.offline import batch  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet, delivered, is_url  # noqa: PLC0415
 
-    alone = [name for name in ("load_map", "save_map", "final_optimize") if getattr(args, name)]
+    alone = [name for name in ("load_map", "save_map", "final_optimize", "ranks") if getattr(args, name)]
     if alone:
         raise TargetError(f"--{alone[0].replace('_', '-')} is for one recording: give it alone, by its path")
     tasks = [

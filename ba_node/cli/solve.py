@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import argparse
 import resource
-import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ba_node.cli.console import require_folder, write_result
+from ba_node.cli.ranks import start_ranks, together
 
 if TYPE_CHECKING:
     from ba_node.config import SolverOptions
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ba_node.offline.solve_bal import Solution
     from ba_node.offline.solve_model import ModelSolution
 
-SUMMARY = "solve a BAL, Bundler, COLMAP or g2o problem as a whole"
 EXAMPLE = (
     "ba solve problem-49-7776-pre.txt.bz2 --iterations 50 --json trace.json\n"
     "  ba solve sparse/0 --out refined --refine focal distortion"
@@ -87,11 +86,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve."""
-    from ba_node.offline.solve_ranks import started_as_ranks  # noqa: PLC0415
+    from ba_node.offline.ranks import started_as_ranks  # noqa: PLC0415
 
     require_folder(args.out)
     if args.ranks is not None and not started_as_ranks():
-        return _start_ranks(args)
+        return start_ranks(args, (0, ATTENTION, NOTHING), lambda: _how_to_go_on(args.checkpoint))
     solution = _solved(args)
     if solution is None:
         args.json = None  # rank 0 writes it
@@ -124,41 +123,23 @@ def run(args: argparse.Namespace) -> int:
     return ATTENTION if grave else 0
 
 
-def _start_ranks(args: argparse.Namespace) -> int:
-    """Run this command once more, on several ranks."""
-    from ba_node.offline.solve_ranks import RanksError, launch_command  # noqa: PLC0415
-
-    if args.ranks < 1:
-        raise RanksError(f"--ranks {args.ranks}: expected 1 or more")
-    command, environ = launch_command(args.ranks, sys.argv[1:])
-    with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as ranks:
-        assert ranks.stderr is not None
-        framed = False
-        for line in ranks.stderr:
-            # Open MPI frames what it has to say itself; of a rank that died the line below tells in fewer words.
-            framed ^= line.startswith("-----")
-            if not framed and not line.startswith("-----"):
-                print(line, end="", file=sys.stderr)
-    code = ranks.returncode
-    args.json = args.json if args.json is not None and not args.json.is_file() else None  # rank 0 has written it
-    if code not in (0, NOTHING, ATTENTION):
-        hint = (
-            f": go on from {args.checkpoint} with --resume"
-            if args.checkpoint and args.checkpoint.is_file()
-            else "; --checkpoint FILE keeps what was done"
-        )
-        print(f"ba: error: a rank ended with code {code}, and all with it{hint}", file=sys.stderr)
-    return code if code >= 0 else NOTHING
+def _how_to_go_on(checkpoint: Path | None) -> str:
+    """Return what helps after a rank has died."""
+    if checkpoint is not None and checkpoint.is_file():
+        return f": go on from {checkpoint} with --resume"
+    return "; --checkpoint FILE keeps what was done"
 
 
 def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | None:
-    """Solve as one of several ranks; whatever ends one of them ends all."""
-    from ba_node.offline.solve_ranks import Checkpoint, solve_on_ranks, world  # noqa: PLC0415
+    """Solve as one of several ranks; return the solution on rank 0."""
+    from ba_node.offline.ranks import world  # noqa: PLC0415
+    from ba_node.offline.solve_ranks import Checkpoint, solve_on_ranks  # noqa: PLC0415
 
     communicator = world()
     checkpoint = Checkpoint(args.checkpoint, max(1, args.every), args.resume) if args.checkpoint else None
-    try:
-        solution = solve_on_ranks(
+    return together(
+        communicator,
+        lambda: solve_on_ranks(
             args.problem,
             options,
             communicator,
@@ -166,26 +147,15 @@ def _on_ranks(args: argparse.Namespace, options: SolverOptions) -> Solution | No
             clock=time.perf_counter,
             on_iteration=_show,
             warn=lambda text: print(f"ba: warning: {text}", file=sys.stderr),
-        )
-    except (ValueError, OSError):
-        # All ranks have come to it; the first says it.
-        communicator.finish()
-        if communicator.rank:
-            return None
-        raise
-    except BaseException as error:
-        print(f"ba: error: rank {communicator.rank}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        communicator.abort(1)
-        raise
-    communicator.finish()
-    return solution
+        ),
+    )
 
 
 def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:
     from ba_node.config import ConfigError  # noqa: PLC0415
+    from ba_node.offline.ranks import started_as_ranks  # noqa: PLC0415
     from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
     from ba_node.offline.solve_model import DEFAULT_GROUPS, solve_model  # noqa: PLC0415
-    from ba_node.offline.solve_ranks import started_as_ranks  # noqa: PLC0415
     from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
 
     assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]

@@ -20,7 +20,6 @@ from ba_node.cli.console import (
     write_result,
 )
 
-SUMMARY = "try every combination of some values of parameters on recordings"
 EXAMPLE = "ba sweep bags/*.mcap --out out/sweep --values window.max_keyframes=5,10,20 --values tracks.outlier_px=3,6"
 
 

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ba_node.offline.study import Plan, Trial
     from ba_node.offline.tuning import Tuned
 
-SUMMARY = "search for better parameters on recordings"
 EXAMPLE = "ba tune bags/*.mcap --out out/tune --preset accuracy --trials 50 --jobs 2"
 ATTENTION = 3
 

@@ -17,7 +17,6 @@ from pathlib import Path
 
 from ba_node.cli.console import write_result
 
-SUMMARY = "show recordings and results in Foxglove or Rerun"
 EXAMPLE = "ba view bags/stereo_loop.mcap out --rate 4\n  ba view out --rerun"
 
 

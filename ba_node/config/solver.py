@@ -54,7 +54,7 @@ class SolverConfig:
     method: str = option("auto", "Named method. See docs/methods.md.", choices=METHODS)
     linear_solver: str = option(
         "auto",
-        "How the reduced system S p = rhs is solved; an exact step that leaves the trust region is cut off by pcg.",
+        "How the reduced system S p = rhs is solved; an exact step that leaves the trust region is cut off there.",
         choices=(
             Choice(
                 "auto", "the method's own, that of local_irls being what costs least by the structure of the problem"

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from ba_node.arrays import FloatArray
@@ -24,6 +25,15 @@ class Communicator(Protocol):
 
     def broadcast(self, value: Any) -> Any:
         """Return the value of rank 0."""
+
+    def exchange(self, parts: Sequence[Any]) -> list[Any]:
+        """Send each rank its part; return what each has sent to this one."""
+
+    def send(self, value: Any, rank: int) -> None:
+        """Send another rank something that it receives."""
+
+    def receive(self) -> Any:
+        """Return what rank 0 sends, once it does, which may be long."""
 
     def abort(self, code: int) -> None:
         """End all ranks at once."""
@@ -48,6 +58,18 @@ class Alone:
     def broadcast(self, value: Any) -> Any:
         """Return the value."""
         return value
+
+    def exchange(self, parts: Sequence[Any]) -> list[Any]:
+        """Return the only part."""
+        return list(parts)
+
+    def send(self, value: Any, rank: int) -> None:
+        """Never called: there is no other rank."""
+        raise AssertionError(f"no rank {rank} for {type(value).__name__}")
+
+    def receive(self) -> Any:
+        """Never called: this is rank 0."""
+        raise AssertionError("rank 0 receives nothing")
 
     def abort(self, code: int) -> None:
         """End this process."""

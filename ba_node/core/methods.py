@@ -45,9 +45,9 @@ _HUBER = dataclasses.replace(_LOCAL, loss="huber")
 _TQ = dataclasses.replace(_LOCAL, loss="truncated_quadratic", annealing="gnc", preconditioner="schur_block")
 
 # Local DINM/IRLS as a window wants it: D of the damping is Marquardt's, which has no unit, so that nothing needs to be
-# known of the scene; no region, as it cuts off exact steps where points are far away; what costs less is solved
+# known of the scene, and so is D of the region, which binds where damping has fallen low; what costs less is solved
 # exactly, the limit t_eps -> 0; points follow each step.
-_LOCAL_IRLS = SolverOptions(q_eps=0.1)
+_LOCAL_IRLS = SolverOptions(trust_region="diag", q_eps=0.1)
 
 _CHOICES = {
     "lma_cd": _LMA_CD,

@@ -144,15 +144,11 @@ class Objective:
 
     def value(self, state: State) -> float:
         """Return the objective 1/2 sum Psi."""
-        return _total(self.costs(state)) + self.factors_value(state)
+        return _total(self._evaluate(state, self._all)[1]) + self.factors_value(state)
 
     def factors_value(self, state: State) -> float:
         """Return what the factors have of the objective."""
         return 0.0 if self.factors is None else self.factors.value(state)
-
-    def costs(self, state: State, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Return Psi of some observations, (n,)."""
-        return self._evaluate(state, self._all.part(rows))[1]
 
     def linearise(self, state: State, rows: PointRows | None = None) -> Linearisation:
         """Return residuals and Jacobians at a state; what is known of all rows there is not worked out again."""
@@ -311,9 +307,16 @@ def reprojection_errors(problem: Problem, state: State) -> FloatArray:
     return Objective(problem, SolverOptions()).errors(state)
 
 
-def rms_px(problem: Problem, *states: State) -> list[float]:
-    """Return for each state the rms over the observations whose point is in front of the camera, px; 0 without any."""
-    measure = Objective(problem, SolverOptions())
-    errors = (measure.errors(state) for state in states)
-    seen = [error[~np.isnan(error[:, 0])] for error in errors]
-    return [float(np.sqrt(np.mean(error * error))) if len(error) else 0.0 for error in seen]
+def squared_errors(problem: Problem, state: State) -> FloatArray:
+    """Return (2,) the sum of the squares of u and v over the observations whose point is in front, px^2, and how many.
+
+    Sums of parts of a problem are those of the whole.
+    """
+    error = reprojection_errors(problem, state)
+    error = error[~np.isnan(error[:, 0])]
+    return np.array([np.sum(error * error), error.size])
+
+
+def rms_px(squares: FloatArray) -> float:
+    """Return the rms of what :func:`squared_errors` has summed, px; 0 without any."""
+    return float(np.sqrt(squares[0] / squares[1])) if squares[1] else 0.0

@@ -34,14 +34,7 @@ def deal(problem: Problem, rank: int, size: int) -> tuple[Problem, slice]:
         ProblemError: there are more ranks than points.
     """
     obs = problem.observations
-    if size > problem.n_points:
-        raise ProblemError(f"{size} ranks for {problem.n_points} points: take at most one rank a point")
-    ends = np.searchsorted(obs.point, np.arange(problem.n_points), side="right")
-    # Cut where the observations before come nearest to equal shares, but leave everybody a point.
-    cuts = np.searchsorted(ends, len(obs) * np.arange(size + 1) / size)
-    cuts[0], cuts[-1] = 0, problem.n_points
-    for i in range(1, size):
-        cuts[i] = min(max(cuts[i], cuts[i - 1] + 1), problem.n_points - (size - i))
+    cuts = point_cuts(np.searchsorted(obs.point, np.arange(problem.n_points), side="right"), size)
     points = slice(int(cuts[rank]), int(cuts[rank + 1]))
     rows = slice(*np.searchsorted(obs.point, [points.start, points.stop]).tolist())
 
@@ -55,6 +48,27 @@ def deal(problem: Problem, rank: int, size: int) -> tuple[Problem, slice]:
     if rank:
         changes["factors"] = ()
     return dataclasses.replace(problem, **changes), points
+
+
+def point_cuts(ends: IntArray, size: int) -> IntArray:
+    """Return where the points of each rank begin, (size + 1,), as even by observations as can be.
+
+    Args:
+        ends: (n_points,) observations of each point and of all before it.
+        size: number of ranks; each gets a point.
+
+    Raises:
+        ProblemError: there are more ranks than points.
+    """
+    n = len(ends)
+    if size > n:
+        raise ProblemError(f"{size} ranks for {n} points: take at most one rank a point")
+    # Cut where the observations before come nearest to equal shares, but leave everybody a point.
+    cuts = np.searchsorted(ends, ends[-1] * np.arange(size + 1) / size)
+    cuts[0], cuts[-1] = 0, n
+    for i in range(1, size):
+        cuts[i] = min(max(cuts[i], cuts[i - 1] + 1), n - (size - i))
+    return np.asarray(cuts)
 
 
 class RankKernels:

@@ -7,8 +7,8 @@ inside the trust region (Algorithm 4). In the scaled space ``x~ = D x`` (3.94-3.
 ``D^-1 S D^-1 x~ = D^-1 rhs``; the region, the residual that ends PCG, and the preconditioner all live there. Without a
 region D is that of the damping (Algorithm 7).
 
-An exact solution is the limit of PCG for t_eps -> 0: it stands if it lies inside the region; if not, PCG goes to the
-boundary, as it would have for any t_eps that small.
+An exact solution is the limit of PCG for t_eps -> 0. If it leaves the region it is cut off at the boundary: PCG would
+get there on a curve, by hundreds of steps where S is badly conditioned, for the same progress.
 
 Where a step of PCG costs next to nothing beside an exact solution, PCG is tried first, as long as it gets there.
 """
@@ -63,25 +63,23 @@ class ReducedSolver:
             x = system.solve_dense() if self.kind == "dense" else system.solve_sparse()
             if x is None or not np.isfinite(x).all():
                 return linear.Solution(None)
-            if not self._outside(x, system, hessian, radius):
-                return linear.Solution(x)
-            t_eps = q_eps = 0.0
-        elif self._preconditioner == "two_level":
+            share = self._share_inside(x, system, hessian, radius)
+            return linear.Solution(x if share == 1.0 else share * x, on_boundary=share < 1.0)
+        if self._preconditioner == "two_level":
             t_eps, q_eps = min(t_eps, _NEARLY), min(q_eps, _NEARLY)
         limits = linear.PcgLimits(t_eps, options.max_linear_iterations, radius, q_eps)
         return self._pcg(system, hessian, limits, self._preconditioner, formed=len(system.rhs) <= DENSE_LIMIT)
 
-    def _outside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> bool:
-        """Return True if a step lies outside the region."""
+    def _share_inside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> float:
+        """Return the share of a step that lies inside the region, 1 if all of it does."""
         if not np.isfinite(radius):
-            return False
+            return 1.0
         d_c, d_p = hessian()
-        kind, by_points = self._options.scaled_space, system.side == "points"
-        # Nearly always so, and quickly seen: |D x| <= max(D) |x|.
-        if kind == "diag" and by_points and max(d_c.max(), 1.0) * (x @ x) <= radius * radius:
-            return False
-        scaled = system.gather(*scaling.scaled_space(kind, (d_c, d_p[:0] if by_points else d_p))) * x
-        return bool(scaled @ scaled > radius * radius)
+        # Points have no part in S where they were eliminated; most maps have many.
+        d_p = d_p[:0] if system.side == "points" else d_p
+        scaled = system.gather(*scaling.scaled_space(self._options.scaled_space, (d_c, d_p))) * x
+        length2 = float(np.einsum("i,i", scaled, scaled))
+        return 1.0 if length2 <= radius * radius else radius / float(np.sqrt(length2))
 
     def _worth_trying(self, system: System) -> int:
         """Return how many steps of PCG to try before an exact solver."""

@@ -135,7 +135,6 @@ def joined(parts: list[Rows]) -> Rows:
     stacked = {
         name: scipy.sparse.vstack(of, "csr") if scipy.sparse.issparse(of[0]) else np.concatenate(of)
         for name, of in columns.items()
-        for name, of in columns.items()
     }
     return Rows(**stacked)
 

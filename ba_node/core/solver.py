@@ -43,6 +43,8 @@ from ba_node.core.result import Iteration, Result, Status
 _SAVED_RHO = 0.3
 # A loop that has rejected this many steps in a row has nothing left to gain.
 _MAX_REJECTED = 25
+# Where policy fast stops to lower mu: below, mu diag(H) is lost in rounding, and Cholesky of S begins to break down.
+_LEAST_DAMPING = 1e-13
 
 
 def solve(
@@ -206,10 +208,12 @@ class _Run:
             shrink = max(1.0 / 3.0, 1.0 - (2.0 * rho - 1.0) ** 3)
             if self.options.damping_policy == "fast" and rho > 0.25:
                 shrink = 0.2 if rho > 0.5 else 0.5
-            self.mu, self.nu = self.mu * shrink, 2.0
+            self.mu, self.nu = max(self.mu * shrink, min(self.mu, _LEAST_DAMPING)), 2.0
         else:
             self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
-        if rho < 0.25:
+        if solution.x is None:  # says nothing of the region
+            pass
+        elif rho < 0.25:
             self.radius *= 0.25
         elif rho > 0.75 and solution.on_boundary:
             self.radius *= 2.0

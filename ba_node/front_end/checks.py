@@ -20,6 +20,8 @@ from ba_node.measurements import CameraRig
 # Spread of grey values below which there is nothing in an image.
 _DARK = 2.5
 _BACK_NS = 1_000_000_000
+# A gap of so many times the two before is a pause, where images come more seldom than max_gap_s says.
+_USUAL = 3
 # An optical axis farther from the middle than this share of the image is that of another image.
 _OFF_CENTRE = 0.25
 # A pair of which so few features have a partner is looked at with left and right exchanged.
@@ -37,6 +39,8 @@ class ImageWatch:
         self._rig, self._options = rig, options
         self._told: set[str] = set()
         self.counts: Counter[str] = Counter()  # images by cause
+        self._came_ns: int | None = None  # the last stamp, believed or not
+        self._gaps_ns = (0, 0)  # the last two between stamps that were believed
 
     def say(self, cause: str, text: str, notes: list[str]) -> None:
         """Add a note, once until the cause is cleared."""
@@ -87,6 +91,22 @@ class ImageWatch:
             return None
         self.clear("dark")
         return self._pair(images, notes)
+
+    def believes(self, stamp_ns: int, last_ns: int | None, notes: list[str]) -> bool:
+        """Return False for a stamp far ahead of the last believed one until another confirms it: it may be a pause.
+
+        A clock that was set wrong for one image would end the session, and turn away all that comes after it.
+        """
+        before, self._came_ns = self._came_ns, stamp_ns
+        gap_ns = 0 if last_ns is None else stamp_ns - last_ns
+        limit_ns = max(self._options.max_gap_s * 1e9, _USUAL * min(self._gaps_ns))
+        if last_ns is not None and before is not None and before - stamp_ns > self._options.max_gap_s * 1e9:
+            ahead_s = (before - stamp_ns) / 1e9
+            self.say("ahead", f"stamp {before} ns is {ahead_s:.1f} s ahead of the one after it: no keyframe", notes)
+        if gap_ns > limit_ns and not (before is not None and last_ns is not None and last_ns < before < stamp_ns):
+            return False
+        self._gaps_ns = self._gaps_ns[1], gap_ns
+        return True
 
     def _pair(self, images: Images, notes: list[str]) -> Images:
         """Return the images without a partner of another time or of another size."""

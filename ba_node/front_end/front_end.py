@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Take images, say what came of them: the face of the front-end, with sessions, keyframes and what is published."""
+"""Take images, say what came of them: the face of the front-end, which looks at images and begins and ends sessions."""
 
 from __future__ import annotations
 
@@ -10,23 +10,21 @@ import numpy as np
 
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.config.front_end import FrontEndOptions
-from ba_node.core import geometry
 from ba_node.estimate import Cloud, Poses, Transform
-from ba_node.front_end import covariance, opencv
+from ba_node.front_end import opencv
 from ba_node.front_end.checks import ImageWatch
 from ba_node.front_end.frame import Frame
 from ba_node.front_end.records import FrontEndError, Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig, ideal_rig
-from ba_node.front_end.tracking import Content, Found, Tracker
-from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.front_end.session import Session
+from ba_node.measurements import CameraRig
 
-_IDENTITY = Transform(np.eye(3), np.zeros(3))
-# Features have moved by less than this since the last keyframe (median): nothing moves, px.
-_STANDS_PX = 0.5
 # Depth cameras tell nothing beyond this, m.
 _FARTHEST_M = 1e4
-# One camera alone begins once features have moved this far by its motion (median), px.
-_START_PX = 20.0
+# How the second camera is turned is known once its yaw is, to so many px, or after so many images that move.
+_SETTLED_PX, _MOST_KEPT = 0.1, 60
+# A turn that is known too late by more, px, spoils the keyframes from before.
+_FAR_OFF_PX = 0.5
 _ALONE = "one camera without odometry: the scale is free, lengths are in units of the first step"
 
 
@@ -90,8 +88,7 @@ class FrontEnd:
             self._know_size((int(rig.image_size[0, 0]), int(rig.image_size[0, 1])))
         self._stamp_ns: int | None = None
         self._turn = np.array([self.options.stereo_yaw_px, self.options.stereo_roll_px])
-        self._tracker: Tracker | None = None
-        self._forget()
+        self._session: Session | None = None
 
     def _know_size(self, size: tuple[int, int]) -> None:
         self._ideal = ideal_rig(self.rig, size)
@@ -109,28 +106,13 @@ class FrontEnd:
                 raise FrontEndError(f"mask of {found} px: expected {size[0]} x {size[1]} px, the image's")
             self._allowed = self._allowed & (self._ideal.image(0, self._mask.astype(np.uint8), linear=False) > 0)
 
-    def _forget(self) -> None:
-        """Forget the session."""
-        if self._tracker is not None:
-            self._turn = self._tracker.alignment.turn
-        self._tracker = None
-        self._motion = _IDENTITY  # camera now from camera at the image before
-        self._lost = 0  # images in a row without a pose
-        self._unseen = 0  # images without a pose since the last keyframe
-        self._keyframe_pose: Transform | None = None  # fixed frame from body at it
-        self._alone = False  # one camera without odometry
-        self._waiting: Content | None = None  # first keyframe of one camera alone, until it has moved
-        self._waiting_ns = 0
-        self._fixed_from_map = _IDENTITY  # changes when the map is refined, so that published poses do not
-        self._odometry: Transform | None = None  # at the last image that had a pose
-        self._count = 0  # keyframes of the session
-        self._known_id = 0  # points up to this id were told as guesses
-
     @property
     def alignment(self) -> tuple[FloatArray, FloatArray] | None:
         """Return yaw and roll of the second camera as learned (``alignment.py``) and their sigmas, (2,) px each."""
-        tracker = self._tracker
-        return None if tracker is None else (tracker.alignment.turn, tracker.alignment.sigma)
+        if self._session is None:
+            return None
+        alignment = self._session.tracker.alignment
+        return alignment.turn, alignment.sigma
 
     @property
     def counts(self) -> dict[str, int]:
@@ -151,37 +133,100 @@ class FrontEnd:
             The pose and perhaps a keyframe. Nothing is raised, whatever the images hold.
         """
         self._notes = []
-        if self._stamp_ns is not None and images.stamp_ns <= self._stamp_ns - 1_000_000_000:
-            self._end(f"stamps went back by {(self._stamp_ns - images.stamp_ns) / 1e9:.1f} s")
-            self._stamp_ns = None
-        usable = self._watch.look(images, self._stamp_ns, self._notes)
+        told = self._process(images, odometry)
+        return dataclasses.replace(told, notes=tuple(self._notes))
+
+    def refine(self, poses: Poses, cloud: Cloud | None = None) -> None:
+        """Take from the back-end refined poses of keyframes of this session (by id) and of points (by track id).
+
+        What is not known here (any more) is passed over. Points that are not in the cloud move with the keyframe that
+        they were first seen from.
+        """
+        if self._session is not None:
+            self._session.refine(poses, cloud)
+
+    def _process(self, images: Images, odometry: Transform | None) -> Tracked:
+        last_ns = self._stamp_ns
+        if last_ns is not None and images.stamp_ns <= last_ns - 1_000_000_000:
+            self._end(f"stamps went back by {(last_ns - images.stamp_ns) / 1e9:.1f} s")
+            last_ns = self._stamp_ns = None
+        usable = self._watch.look(images, last_ns, self._notes)
         if usable is not None and self._ideal is None:
             try:
                 self._know_size((usable.grey[0].shape[1], usable.grey[0].shape[0]))
             except FrontEndError as error:
                 self._watch.say("rig", str(error), self._notes)
                 usable = None
+        session = self._session
         if usable is None:
-            if self._stamp_ns is not None and images.stamp_ns > self._stamp_ns:
-                self._lost, self._unseen = self._lost + 1, self._unseen + 1
-            return self._told(State.LOST if self._tracker else State.STARTING, images)
-        gap_s = 0.0 if self._stamp_ns is None else (images.stamp_ns - self._stamp_ns) / 1e9
-        self._stamp_ns = images.stamp_ns
-        frame = self._frame(usable)
-        if self._alone and odometry is not None:
+            if session is None:
+                return self._nothing(images)
+            if last_ns is not None and images.stamp_ns > last_ns:
+                session.lost, session.unseen = session.lost + 1, session.unseen + 1
+            return session.told(State.LOST, images)
+        sure = self._watch.believes(images.stamp_ns, last_ns, self._notes)
+        gap_s = 0.0 if last_ns is None or not sure else (images.stamp_ns - last_ns) / 1e9
+        self._stamp_ns = images.stamp_ns if sure else last_ns
+        if session is not None and session.alone and odometry is not None:
             self._end("an odometry is there now, whose scale it has")
-        if self._tracker is None:
+        told = self._track(usable, odometry, gap_s, sure)
+        return self._settled(told, (usable, odometry, gap_s, sure))
+
+    def _settled(self, told: Tracked, image: tuple[Images, Transform | None, float, bool]) -> Tracked:
+        """Track the first images again where the second camera turns out to be far from where the rig has it.
+
+        Their keyframes were measured before that was known. What moves tells it within some keyframes.
+        """
+        session = self._session
+        if session is None or session.first_images is None or told.state is State.STANDING:
+            return told
+        session.first_images.append(image)
+        alignment, first_images = session.tracker.alignment, session.first_images
+        if alignment.sigma[0] > _SETTLED_PX and len(first_images) < _MOST_KEPT:
+            return told
+        session.first_images = None
+        yaw, roll = alignment.turn.tolist()
+        if max(abs(yaw - session.options.stereo_yaw_px), abs(roll - session.options.stereo_roll_px)) < _FAR_OFF_PX:
+            return told
+        notes, self._notes = self._notes, []
+        self._forget()
+        self.session_id += 1
+        again = [self._track(*one) for one in first_images]
+        if self._session is None or any(one.state is State.LOST for one in again):
+            self._session, self.session_id, self._notes = session, session.number, notes
+            return told
+        self._session.first_images = None
+        words = f"{yaw:.2f} px of yaw and {roll:.2f} of roll against the rig: session {self.session_id} begins"
+        words += f" with the same {len(again)} images, tracked again; the one before is void"
+        self._notes = [*notes, f"the second camera is turned by {words}"]
+        earlier = tuple(measurement for one in again[:-1] for measurement in one.measurements())
+        return dataclasses.replace(again[-1], earlier=earlier + again[-1].earlier, again=True)
+
+    def _track(self, images: Images, odometry: Transform | None, gap_s: float, sure: bool = True) -> Tracked:
+        """Go on with the session, or begin one where there is none, or where it is lost for good."""
+        frame, session = self._frame(images), self._session
+        if session is None:
             return self._first(images, frame, odometry)
-        if self._waiting is not None:
-            return self._wait(images, frame)
-        if self._tracker.given and odometry is None:
-            return self._lose(images, frame, None, gap_s, "no odometry, which the session has its scale from")
-        found = self._locate(frame, odometry, gap_s > self.options.max_gap_s)
-        if found is None:
-            return self._lose(images, frame, odometry, gap_s, "too little of what was seen before is found again")
-        self._lost = 0
-        self._watch.clear("lost")
-        return self._tracking(images, found, odometry)
+        if not session.has_begun:
+            told = session.wait(images, frame)
+            if told is None:
+                self._forget()
+                return self._first(images, frame, odometry)
+            return told
+        why = "no odometry, which the session has its scale from"
+        if odometry is not None or not session.tracker.given:
+            told = session.take(images, frame, odometry, gap=gap_s > self.options.max_gap_s, sure=sure)
+            if told is not None:
+                self._watch.clear("lost")
+                return told
+            why = "too little of what was seen before is found again"
+        session.lost, session.unseen = session.lost + 1, session.unseen + 1
+        self._watch.say("lost", f"lost at {images.stamp_ns} ns: {why}", self._notes)
+        gap = gap_s > self.options.max_gap_s
+        if session.lost <= self.options.max_lost and not gap:
+            return session.told(State.LOST, images)
+        self._end(f"{gap_s:.1f} s without images" if gap else f"{session.lost} images without a pose")
+        return self._first(images, frame, odometry)
 
     def _frame(self, images: Images) -> Frame:
         """Return images as the ideal cameras see them."""
@@ -201,200 +246,36 @@ class FrontEnd:
         """Begin a session with an image."""
         assert self._ideal is not None
         yaw, roll = self._turn.tolist()
-        tracker = Tracker(self._ideal, dataclasses.replace(self.options, stereo_yaw_px=yaw, stereo_roll_px=roll))
-        tracker.begin(frame, (odometry or _IDENTITY).after(self._ideal.body_from_camera).inverse())
-        content, _ = tracker.keyframe(self._count + 1)
+        options = dataclasses.replace(self.options, stereo_yaw_px=yaw, stereo_roll_px=roll)
+        session = Session(self._ideal, options, self.session_id, self._fixed_frame, odometry)
+        content = session.begin(frame)
         if frame.right is not None:
             self._watch.partners(frame, self._ideal, self._notes)
         if len(content.track_id) < self.options.min_points:
             text = f"only {len(content.track_id)} features at {images.stamp_ns} ns: too little to begin with"
             self._watch.say("empty", text, self._notes)
-            return self._told(State.STARTING, images)
+            return self._nothing(images)
         self._watch.clear("empty")
-        self._tracker, self._odometry = tracker, odometry
-        if not content.depths.measures and odometry is None:
+        self._session = session
+        told = session.first(images, content)
+        if session.alone:
             self._watch.say("alone", _ALONE, self._notes)
-            self._alone = True
-            self._waiting, self._waiting_ns = content, images.stamp_ns
-            return self._told(State.STARTING, images)
-        return self._keyframe(images, content)
+        return told
 
-    def _wait(self, images: Images, frame: Frame) -> Tracked:
-        """Begin with one camera alone, once it has moved."""
-        tracker, first = self._tracker, self._waiting
-        assert tracker is not None and first is not None
-        tracker.follow(frame, None)
-        if len(tracker.rows) < max(self.options.min_points, len(first.track_id) // 3):
-            self._forget()
-            return self._first(images, frame, None)
-        if not tracker.begin_alone(_START_PX):
-            return self._told(State.STARTING, images)
-        earlier = self._measurements(self._waiting_ns, first, self._body(tracker.keyframe_pose))
-        self._waiting = None
-        content, _ = tracker.keyframe(self._count + 1)
-        return self._keyframe(images, content, earlier)
+    def _nothing(self, images: Images) -> Tracked:
+        """Return what is known of an image without a session."""
+        return Tracked(State.STARTING, self.session_id, images.stamp_ns, None, np.full((6, 6), np.nan))
 
-    def _expected(self, odometry: Transform | None) -> Transform:
-        """Return camera from map as foretold, by odometry or by going on as before."""
-        tracker = self._tracker
-        assert tracker is not None and self._ideal is not None
-        if odometry is None or self._odometry is None:
-            return self._motion.after(tracker.pose)
-        step = odometry.inverse().after(self._odometry)  # body now from body before
-        body = self._ideal.body_from_camera
-        return body.inverse().after(step).after(body).after(tracker.pose)
-
-    def _locate(self, frame: Frame, odometry: Transform | None, gap: bool) -> Found | None:
-        """Find the pose of an image; leave everything as it was if that fails."""
-        tracker = self._tracker
-        assert tracker is not None
-        before, expected = tracker.state(), self._expected(odometry)
-        blind = (gap or self._lost > 0) and odometry is None
-        for first in (None,) if blind else (expected, None):
-            tracker.follow(frame, first)
-            if odometry is not None and frame.right is None and frame.depth is None:
-                found = tracker.locate_by(expected)
-            else:
-                found = tracker.locate()
-            if found is not None:
-                self._motion = _IDENTITY if self._lost else tracker.pose.after(before["pose"].inverse())
-                self._odometry = odometry
-                return found
-            tracker.restore(before)
-        return None
-
-    def _lose(self, images: Images, frame: Frame, odometry: Transform | None, gap_s: float, why: str) -> Tracked:
-        """Say that an image has no pose; begin anew when that has gone on for too long."""
-        self._lost, self._unseen = self._lost + 1, self._unseen + 1
-        self._watch.say("lost", f"lost at {images.stamp_ns} ns: {why}", self._notes)
-        if self._lost <= self.options.max_lost and gap_s <= self.options.max_gap_s:
-            return self._told(State.LOST, images)
-        gap = gap_s > self.options.max_gap_s
-        self._end(f"{gap_s:.1f} s without images" if gap else f"{self._lost} images without a pose")
-        return self._first(images, frame, odometry)
+    def _forget(self) -> None:
+        """Forget the session, but for how the second camera is turned."""
+        if self._session is not None:
+            self._turn = self._session.tracker.alignment.turn
+        self._session = None
 
     def _end(self, why: str) -> None:
         """End the session, if there is one."""
-        if self._tracker is None:
+        if self._session is None:
             return
         self._forget()
         self.session_id += 1
         self._notes.append(f"session {self.session_id} begins: {why}; the map of the one before stays as it is")
-
-    def _tracking(self, images: Images, found: Found, odometry: Transform | None) -> Tracked:
-        """Make the image a keyframe if it is worth it."""
-        tracker = self._tracker
-        assert tracker is not None
-        moved, shift = tracker.moved()
-        share = len(tracker.rows) / max(tracker.shared, 1)
-        o = self.options
-        if moved < o.keyframe_parallax_px and share >= o.keyframe_min_shared and not self._unseen:
-            state = State.STANDING if shift < _STANDS_PX else State.TRACKING
-            return self._told(state, images, found, odometry)
-        content, refined = tracker.keyframe(self._count + 1)
-        return self._keyframe(images, content, (), refined or found, odometry)
-
-    def _body(self, camera_from_map: Transform) -> Transform:
-        """Return fixed frame from body of a camera in the map."""
-        assert self._ideal is not None
-        camera = self._fixed_from_map.after(camera_from_map.inverse())
-        return camera.after(self._ideal.body_from_camera.inverse())
-
-    def _keyframe(
-        self,
-        images: Images,
-        content: Content,
-        earlier: tuple[Measurement, ...] = (),
-        found: Found | None = None,
-        odometry: Transform | None = None,
-    ) -> Tracked:
-        """Tell of an image that was made a keyframe."""
-        told = self._told(State.TRACKING, images, found, odometry)
-        assert told.pose is not None
-        measured = self._measurements(images.stamp_ns, content, told.pose)
-        keyframe = next(one for one in measured if isinstance(one, Keyframe))
-        tracks = tuple(one for one in measured if isinstance(one, FeatureTracks))
-        return dataclasses.replace(
-            told, keyframe=keyframe, tracks=tracks, guesses=self._guesses(content), earlier=earlier
-        )
-
-    def _told(
-        self, state: State, images: Images, found: Found | None = None, odometry: Transform | None = None
-    ) -> Tracked:
-        """Return what is known of an image that is no keyframe."""
-        tracker = self._tracker
-        pose, uncertain = None, np.full((6, 6), np.nan)
-        if tracker is not None and self._waiting is None:
-            pose = self._body(tracker.pose)
-            uncertain = covariance.of_lost(self._lost)
-            if found is not None:
-                fixed_from_camera = self._fixed_from_map.rotation @ tracker.pose.rotation.T
-                uncertain = covariance.of_tracked(found.covariance, fixed_from_camera)
-        if odometry is not None and (self._ideal is None or not self._ideal.baseline) and images.depth_m is None:
-            pose = odometry
-        return Tracked(state, self.session_id, images.stamp_ns, pose, uncertain, notes=tuple(self._notes))
-
-    def _measurements(self, stamp_ns: int, content: Content, pose: Transform) -> tuple[Measurement, ...]:
-        """Return keyframe and tracks, in pixels of the raw images."""
-        assert self._ideal is not None
-        self._count += 1
-        ideal, session, number = self._ideal, self.session_id, self._count
-        orientation = geometry.quaternion_from_matrix(pose.rotation)
-        told = self._step_covariance(pose)
-        keyframe = Keyframe(session, number, stamp_ns, self._fixed_frame, pose.translation, orientation, told)
-        depths = content.depths
-        depth_m = np.empty(0)
-        stereo = np.isfinite(depths.disparity)
-        if depths.measures and not stereo.any():
-            depth_m = 1.0 / depths.inverse_depth
-        raw = ideal.raw(0, content.uv)
-        left = FeatureTracks(session, number, 0, content.track_id, raw, content.sigma, depth_m)
-        if not stereo.any():
-            return keyframe, left
-        there = content.uv[stereo] - np.column_stack([depths.disparity[stereo], np.zeros(int(stereo.sum()))])
-        # A disparity is between both images, and both are off by sigma: the second bears what is more than the first's.
-        sigma = np.hypot(depths.disparity_sigma[stereo], self.options.sigma_px)
-        right = FeatureTracks(session, number, 1, content.track_id[stereo], ideal.raw(1, there), sigma)
-        return keyframe, left, right
-
-    def _step_covariance(self, pose: Transform) -> FloatArray:
-        """Return the covariance of the step to a keyframe, (36,); (0,) where it is what images that see well give."""
-        tracker, before, unseen = self._tracker, self._keyframe_pose, self._unseen
-        self._keyframe_pose, self._unseen = pose, 0
-        if before is None or tracker is None:
-            return np.empty(0)
-        if tracker.given:
-            return covariance.of_step(before.inverse().after(pose)).reshape(-1)
-        return covariance.of_lost(unseen).reshape(-1) if unseen else np.empty(0)
-
-    def _guesses(self, content: Content) -> LandmarkGuesses | None:
-        """Return where points are that were not told before, in the fixed frame."""
-        tracker = self._tracker
-        assert tracker is not None
-        rows = np.flatnonzero(tracker.map.known & (tracker.map.track_id > self._known_id))
-        if not content.depths.measures or not len(rows):
-            return None
-        self._known_id = int(tracker.map.track_id[rows].max())
-        points, _ = tracker.map.points(rows)
-        moved = points @ self._fixed_from_map.rotation.T + self._fixed_from_map.translation
-        return LandmarkGuesses(self.session_id, tracker.map.track_id[rows], moved)
-
-    def refine(self, poses: Poses, cloud: Cloud | None = None) -> None:
-        """Take from the back-end refined poses of keyframes of this session (by id) and of points (by track id).
-
-        What is not known here (any more) is passed over. Points that are not in the cloud move with the keyframe that
-        they were first seen from.
-        """
-        tracker = self._tracker
-        if tracker is None or self._waiting is not None or self._ideal is None:
-            return
-        rotation = geometry.matrix_from_quaternion(poses.orientation)
-        body = self._ideal.body_from_camera
-        there = {
-            int(key): Transform(rotation[i], poses.position[i]).after(body) for i, key in enumerate(poses.keyframe_id)
-        }
-        moved = tracker.refine(there)
-        if moved is not None:
-            self._fixed_from_map = self._fixed_from_map.after(moved.inverse())
-        if cloud is not None and len(cloud):
-            tracker.map.refine(cloud.track_id, cloud.position)

@@ -128,6 +128,11 @@ def _pixels(message: Any, bits: int, channels: int) -> NDArray[Any]:
             f"image of {width} x {height} px in {message.encoding}, {step} bytes a row: expected"
             f" {row} bytes a row and {row * height} in all, found {len(data)}"
         )
+    if step % row == 0 and step > row and width > 1:
+        raise FrontEndError(
+            f"image of {width} x {height} px with {step} bytes a row: {step // row} times what {message.encoding} has;"
+            " check its encoding"
+        )
     rows = np.lib.stride_tricks.as_strided(data.view(np.uint8), (height, row), (step, 1))
     kind = np.dtype({8: "u1", 16: "u2", 32: "f4"}[bits])
     as_sent = kind.newbyteorder(">" if message.is_bigendian else "<")

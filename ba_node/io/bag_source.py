@@ -17,9 +17,9 @@ from rosbags.interfaces import MessageDefinitionFormat, QosDurability
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from ba_node.io import ros_types
-from ba_node.io.bag_index import BagIndex, Message, read_index, read_messages
 from ba_node.io.bag_topics import BagError, EmptyBagError
 from ba_node.io.files import FileKindError, open_regular
+from ba_node.io.mcap_index import BagIndex, Message, read_index, read_messages
 
 # Any recording; devices and pipes are refused.
 MAX_BYTES = 2**62

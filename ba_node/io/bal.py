@@ -63,7 +63,7 @@ def read_bal(path: Path | str) -> BalProblem:
     """
     path = Path(path)
     text = _unpack(path)
-    values = _numbers(path, text)
+    values = numbers_of(path, text)
     n_cameras, n_points, n_obs = _header(path, text, values)
     ends = 3 + np.cumsum([4 * n_obs, 9 * n_cameras, 3 * n_points])
     _check_count(path, text, values, (n_cameras, n_points, n_obs), int(ends[-1]))
@@ -167,7 +167,7 @@ def _unpack(path: Path) -> bytes:
         raise BalError(f"{path}: cannot be unpacked, it is truncated or damaged: {error}") from error
 
 
-def _numbers(path: Path, text: bytes) -> FloatArray:
+def numbers_of(path: Path, text: bytes) -> FloatArray:
     """Return all numbers of the text, finite; numpy reads them 20 times as fast as a split would."""
     if not text.strip():
         raise BalError(f"{path}: the file is empty: expected a line with the numbers of cameras, points, observations")

@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from ba_node.io.bag_topics import absolute
-from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError, absolute
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.adapters import SOURCES, Adapter, AdapterOptions, Input, Source
 from ba_node.messages.adapters.rtabmap import BODY

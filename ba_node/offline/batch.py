@@ -14,7 +14,7 @@ import numpy as np
 
 from ba_node.config import Config
 from ba_node.io.bag_files import same_recording
-from ba_node.io.mcap import TopicChoice
+from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.parameters import parameters_yaml
 from ba_node.offline.check import check_recording
 from ba_node.offline.figures import BEFORE, COLOURS

@@ -13,8 +13,9 @@ from typing import Any
 from ba_node.backend import Backend, Calibration
 from ba_node.config import Config
 from ba_node.core import geometry
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.files import whole_file
-from ba_node.io.mcap import BagReader, TopicChoice
 from ba_node.io.rig_file import rig_yaml
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.offline.recording import placed

@@ -12,7 +12,7 @@ import numpy as np
 
 from ba_node.backend import Backend, CurrentMap, Diagnosis, can_examine
 from ba_node.config import Config
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.offline.attention import turned_away
 
 

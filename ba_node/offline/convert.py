@@ -18,10 +18,11 @@ from ba_node.core.geometry import inverse, quaternion_from_matrix
 from ba_node.core.problem import Cameras
 from ba_node.estimate import Cloud, Poses
 from ba_node.io import bundler, colmap
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.bal import read_bal, write_bal
 from ba_node.io.g2o import is_pinhole, read_g2o, write_g2o
 from ba_node.io.map_file import is_map, read_map
-from ba_node.io.mcap import BagReader, TopicChoice
 from ba_node.io.model import ModelError, Reconstruction, from_bal, lens_of, stamps, to_bal
 from ba_node.io.ply import read_ply, write_ply
 from ba_node.io.reference import first_line, read_poses

@@ -18,7 +18,7 @@ import numpy as np
 
 from ba_node.estimate import Cloud, Poses
 from ba_node.evaluation.metrics import TrajectoryError, absolute_error
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import Keyframe

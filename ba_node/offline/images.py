@@ -33,8 +33,8 @@ from ba_node.front_end.streams import (
     images_of,
     transform_of,
 )
-from ba_node.io.bag_topics import absolute
-from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError, absolute
 from ba_node.io.rig_file import read_rig
 from ba_node.measurements import CameraRig
 from ba_node.messages.factory import stamp_ns_from_message

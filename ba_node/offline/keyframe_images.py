@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ba_node.front_end.images import grey_of
 from ba_node.front_end.records import FrontEndError
-from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # Images are looked for in no more than this of a recording.

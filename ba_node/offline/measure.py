@@ -26,7 +26,8 @@ from ba_node.config import Config, FramesConfig
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.io.mcap import BagReader, TopicChoice
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import TopicChoice
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.offline.fleet import fetched
 from ba_node.offline.recording import placed, read_truth

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_source import BagChannel
-from ba_node.io.bag_topics import TopicChoice
-from ba_node.io.mcap import BagError, BagReader, BagWriter
+from ba_node.io.bag_topics import BagError, TopicChoice
+from ba_node.io.bag_writer import BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.messages.topics import CAMERA_TYPES, INPUT_TYPES, TF_STATIC
 

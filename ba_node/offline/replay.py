@@ -25,11 +25,14 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate, Extras, Poses
 from ba_node.evaluation.alignment import EvaluationError
 from ba_node.evaluation.metrics import absolute_error
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import TopicChoice
+from ba_node.io.bag_writer import BagWriter
 from ba_node.io.files import locked_folder, whole_file, write_json
 from ba_node.io.map_file import load_map, map_name, write_map
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter, TopicChoice
 from ba_node.io.parameters import NODE_NAME, parameters_yaml
 from ba_node.io.ply import write_ply
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.io.trajectory import write_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
@@ -68,6 +71,7 @@ class MapOptions:
     save: Path | None = None  # file for the map of the newest session
     # which topics of the recording are taken, where several are possible
     topics: TopicChoice = field(default_factory=TopicChoice)
+    by: Callable[..., Any] | None = None  # what solves everything at the end in place of solver.solve
 
 
 def replay(
@@ -102,7 +106,7 @@ def replay(
                 run.load(options.load)
             run.read(measurements, reader.message_count)
             run.backend.extras = Extras(covariance=options.covariance, points=options.covariance)
-            run.end(options.optimize)
+            run.end(options.optimize, options.by)
             if not run.sessions:
                 raise ReplayError(f"{reader.path}: {_nothing_to_use(run)}{_why(reader, run)}")
             if run.sessions[-1].summary.cameras == 0:
@@ -187,9 +191,9 @@ class _Run:
             yield measurement
             self._watch.progress(done, total)
 
-    def end(self, optimize: bool) -> None:
+    def end(self, optimize: bool, by: Callable[..., Any] | None = None) -> None:
         """End the newest session, after a solve of everything if that is wanted."""
-        estimate = self.backend.optimize() if optimize else None
+        estimate = self.backend.optimize(by) if optimize else None
         if estimate is not None:
             self._record(estimate)
         if not self.sessions and self.backend.map.keyframe_count:

@@ -7,7 +7,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
 from ba_node.io.rig_file import read_rig
 from ba_node.measurements import CameraRig
 from ba_node.messages.conversion import measurement_from_message

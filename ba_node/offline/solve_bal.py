@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
-from ba_node.core.objective import rms_px
+from ba_node.core.objective import rms_px, squared_errors
 from ba_node.core.problem import Problem, State
 from ba_node.core.result import Result, Status
 from ba_node.core.solver import solve
@@ -27,6 +28,25 @@ from ba_node.io.bundler import BundlerScene, from_bal, is_bundler, read_bundler,
 _FAR = 10.0
 # Observations behind their cameras from which on somebody has to look at the file; a few points may well end there.
 _MANY_BEHIND = 0.01
+
+
+@dataclass(frozen=True)
+class Totals:
+    """What is summed over all observations of a problem, each at its start and at its end."""
+
+    rms_px: tuple[float, float]
+    behind: tuple[int, int]  # observations of points behind their cameras
+
+
+def totals(
+    bal: BalProblem, problem: Problem, end: State, total: Callable[[FloatArray], FloatArray] = np.asarray
+) -> Totals:
+    """Return the totals of a problem, of which this may be a part: ``total`` adds up what all parts have."""
+    with np.errstate(all="ignore"):  # infinite where the solve failed
+        squares = [squared_errors(problem, state) for state in (problem.start, end)]
+    behinds = [np.count_nonzero(behind(one)) for one in (bal, from_state(bal, end))]
+    sums = total(np.array([*np.concatenate(squares), *behinds], dtype=float))
+    return Totals((rms_px(sums[:2]), rms_px(sums[2:4])), (int(sums[4]), int(sums[5])))
 
 
 @dataclass(frozen=True)
@@ -43,6 +63,14 @@ class Solution:
     setup_s: float  # time to read and prepare it, s
     solve_s: float  # time in the solver, s
     bundler: BundlerScene | None = None  # what else a file of Bundler holds
+
+    # for ``totals`` where several ranks have found them, each for its part
+    summed: Totals | None = None
+
+    @cached_property
+    def totals(self) -> Totals:
+        """Return what is summed over all observations."""
+        return self.summed or totals(self.bal, self.problem, self.result.state)
 
     def write(self, path: Path) -> None:
         """Write the problem with the solution as start: a scene of Bundler where the name ends in .out, else BAL."""
@@ -63,8 +91,7 @@ class Solution:
         """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
         lines, grave = [], False
         count, focal = len(self.bal.observations), self.bal.cameras[:, 6]
-        ends = (self.bal, from_state(self.bal, self.result.state))
-        before, after = (int(np.count_nonzero(behind(end))) for end in ends)
+        before, after = self.totals.behind
         bad = np.flatnonzero(focal <= 0.0)
         if len(bad):
             grave = True
@@ -91,8 +118,8 @@ class Solution:
     def as_dict(self) -> dict[str, Any]:
         """Return statistics, options and trace for JSON; an infinite radius becomes null there."""
         lines = self.attention()[0]
-        ends = [(self.problem, self.problem.start), (self.problem, self.result.state)]
-        return statistics(self.source, ends, self.result, self.options) | {
+        sizes = (len(self.bal.cameras), len(self.bal.points), len(self.bal.observations))
+        return statistics(self.source, sizes, self.totals.rms_px, self.result, self.options) | {
             "origin": self.origin.tolist(),
             "attention": lines,
             "setup_s": self.setup_s,
@@ -101,18 +128,14 @@ class Solution:
 
 
 def statistics(
-    source: str, ends: Sequence[tuple[Problem, State]], result: Result, options: SolverOptions
+    source: str, sizes: tuple[int, int, int], rms: tuple[float, float], result: Result, options: SolverOptions
 ) -> dict[str, Any]:
-    """Return what every solve of a file tells; ``ends`` are problem and state at the start and at the end."""
-    problem = ends[0][0]
-    with np.errstate(all="ignore"):  # infinite where the solve failed
-        before, after = (rms_px(of, state)[0] for of, state in ends)
+    """Return what every solve of a file tells; sizes: cameras, points, observations; rms: at the start and the end."""
+    before, after = rms
     return {
         "problem": {
             "file": Path(source).name,
-            "cameras": problem.n_keyframes,
-            "points": problem.n_points,
-            "observations": len(problem.observations),
+            **dict(zip(("cameras", "points", "observations"), sizes, strict=True)),
         },
         "method": result.method,
         "linear_solver": result.linear_solver,

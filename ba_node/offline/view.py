@@ -13,8 +13,8 @@ from heapq import merge
 from pathlib import Path
 from typing import Any
 
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_source import BagChannel
-from ba_node.io.mcap import BagReader
 
 _NS = 1e9
 # What `ba replay` leaves in its folder.

@@ -43,6 +43,8 @@ from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import problem_of
 from ba_node.window.selection import Selection, select
 
+# What solves a problem in place of solver.solve, as where many processes work on it.
+Solve = Callable[..., Result]
 MAX_ITERATIONS = 50
 NOTHING = Extras()
 # A window is solved again and again, everything once: it is worth more digits.
@@ -107,12 +109,15 @@ class Optimization:
         *,
         clock: Callable[[], float] = lambda: 0.0,
         on_iteration: Callable[[Iteration], bool] | None = None,
+        by: Solve | None = None,
     ) -> None:
         """Solve, on any thread; the map is not touched. Arguments as of :func:`options` and ``solver.solve``."""
         chosen = options(config, method, max_iterations)
         if self.refine.wanted:
             self._calibrate(chosen)
-        result = solver.solve(self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True)
+        result = (by or solver.solve)(
+            self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True
+        )
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
             # After it the front-end's steps set the scale, be they factors or not.

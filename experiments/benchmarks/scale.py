@@ -13,6 +13,7 @@ import dataclasses
 import json
 import resource
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from ba_node.core import methods
 from ba_node.core.communicator import Communicator
 from ba_node.core.ranks import RankKernels
 from ba_node.core.solver import solve
-from ba_node.offline.solve_ranks import world
+from ba_node.offline.ranks import world
 from experiments.benchmarks.streams import named
 
 
@@ -33,7 +34,7 @@ class Counted:
     def __init__(self, ranks: Communicator) -> None:
         self._ranks, self.rank, self.size = ranks, ranks.rank, ranks.size
         self.bytes, self.calls, self.busy_s, self.wall_s = 0, 0, 0.0, 0.0
-        self.abort, self.finish = ranks.abort, ranks.finish
+        self.send, self.receive, self.abort, self.finish = ranks.send, ranks.receive, ranks.abort, ranks.finish
 
     def sum(self, values: FloatArray) -> FloatArray:
         """Return the sum over ranks."""
@@ -48,6 +49,12 @@ class Counted:
         """Return the value of rank 0."""
         return self._counted(self._ranks.broadcast, value, _size(value))
 
+    def exchange(self, parts: Sequence[Any]) -> list[Any]:
+        """Send each rank its part; return what each has sent to this one."""
+        sent = sum(_size(part) for rank, part in enumerate(parts) if rank != self.rank)
+        found: list[Any] = self._counted(self._ranks.exchange, parts, sent)
+        return found
+
     def _counted(self, call: Any, value: Any, size: int) -> Any:
         began, busy = time.perf_counter(), time.process_time()
         found = call(value)
@@ -61,8 +68,10 @@ def _size(value: Any) -> int:
     """Return about how many bytes a value has."""
     if isinstance(value, (list, tuple)):
         return sum(map(_size, value))
+    if isinstance(value, np.ndarray):
+        return value.nbytes
     arrays = (getattr(value, name, None) for name in ("data", "indices", "indptr"))
-    return sum(array.nbytes for array in arrays if isinstance(array, (np.ndarray, memoryview)))
+    return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
 
 def measure(name: str, iterations: int, settings: dict[str, Any]) -> dict[str, Any] | None:

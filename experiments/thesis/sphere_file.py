@@ -1,18 +1,46 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn a synthetic sphere into BAL problems: one that begins where a solver does, and one that holds the truth."""
+"""Make a BAL problem of points on a sphere: the synthetic problem of section 5.1 of the thesis.
+
+--preset has the sizes measured there. The truth is written beside it in the same format, as OUT.truth.txt. The same
+options give the same bytes.
+"""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from pathlib import Path
-from typing import Any
 
+from ba_node.cli.console import TargetError, add_declared_options, declared_options, require_folder
 from ba_node.io.bal import BalProblem, write_bal
 from experiments.thesis.sphere import SphereData, generate_sphere
 from experiments.thesis.sphere_options import PRESETS, SphereOptions, preset
 
-__all__ = ["PRESETS", "SphereOptions", "make", "start_of", "truth_of", "truth_path", "write_sphere"]
+EXAMPLE = "ba sphere ball.txt --preset 10-253"
+_BAL = (".txt", ".bz2", ".gz")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("target", type=Path, metavar="OUT")
+    parser.add_argument("--preset", choices=tuple(PRESETS), help="images-points of the thesis; options change it")
+    add_declared_options(parser, SphereOptions)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make it."""
+    require_folder(args.target)
+    if args.target.suffix not in _BAL:
+        raise TargetError(f"{args.target}: BAL problems are written as {', '.join(_BAL)}: give a name that ends so")
+    base = preset(args.preset) if args.preset else SphereOptions()
+    data = generate_sphere(dataclasses.replace(base, **declared_options(args, SphereOptions)))
+    truth = write_sphere(args.target, data)
+    print(
+        f"{args.target}: {len(data.cameras)} images, {len(data.points)} points, {len(data.uv)} observations,"
+        f" {int(data.outlier.sum())} of them outliers\n{truth}: the truth"
+    )
+    return 0
 
 
 def start_of(data: SphereData) -> BalProblem:
@@ -37,20 +65,3 @@ def write_sphere(path: Path, data: SphereData) -> Path:
     write_bal(truth, truth_of(data))
     write_bal(path, start_of(data))
     return truth
-
-
-def make(path: Path, size: str | None, given: dict[str, Any]) -> str:
-    """Write a problem for ``ba synth --kind sphere``; return what it says.
-
-    Args:
-        path: of the problem.
-        size: name of a preset, or None for the defaults.
-        given: options by name, in place of those of the preset.
-    """
-    base = preset(size) if size else SphereOptions()
-    data = generate_sphere(dataclasses.replace(base, **given))
-    truth = write_sphere(path, data)
-    return (
-        f"{path}: {len(data.cameras)} images, {len(data.points)} points, {len(data.uv)} observations,"
-        f" {int(data.outlier.sum())} of them outliers\n{truth}: the truth"
-    )

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ba_node.backend import FINISHED_KEPT, Backend
+from ba_node.backend import Backend
+from ba_node.backend.backend import FINISHED_KEPT
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Status
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement

@@ -13,8 +13,8 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.core import geometry, objective
 from ba_node.estimate import Estimate
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import BalProblem, read_bal, to_problem
-from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.window import quality
 

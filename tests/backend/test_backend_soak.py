@@ -10,7 +10,8 @@ import itertools
 import numpy as np
 import pytest
 
-from ba_node.backend import FINISHED_KEPT, Backend
+from ba_node.backend import Backend
+from ba_node.backend.backend import FINISHED_KEPT
 from ba_node.config import Config
 from ba_node.measurements import FeatureTracks, Keyframe
 from ba_node.scene.tables import Table

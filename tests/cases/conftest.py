@@ -53,7 +53,7 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Replay:
     def replay(bag: Path, *arguments: str) -> Outcome:
         out = tmp_path / "out"
         capsys.readouterr()
-        code = main(["replay", str(bag), "--out", str(out), *arguments])
+        code = main(["replay", str(bag), "--out", str(out), "--no-report", *arguments])
         stderr = capsys.readouterr().err
         path = out / "report.json"
         report: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}

@@ -36,7 +36,7 @@ def test_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert max(map(len, out.splitlines())) <= 100, "columns of a usual terminal"
     assert {row["hypothesis"] for row in session["hypotheses"]} >= {"as given", "free", "cameras 0 and 1 swapped"}
 
-    assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 3
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out"), "--no-report"]) == 3
     assert "baseline of camera 1 reversed" in capsys.readouterr().err
     written = [line.split()[1:4] for line in (tmp_path / "out" / "trajectory.tum").read_text().splitlines()]
     given = [line.split()[1:4] for line in (tmp_path / "out" / "trajectory_input.tum").read_text().splitlines()]

@@ -84,11 +84,11 @@ def check(moments: Sequence[float], number: signal.Signals, words: Sequence[str]
 
 
 def test_a_signal_at_a_few_moments(bag: Path, tmp_path: Path) -> None:
-    words = ["replay", str(bag), "--out", str(tmp_path / "out")]
+    words = ["replay", str(bag), "--out", str(tmp_path / "out"), "--no-report"]
     whole = length_s(words)
-    moments = [whole * share for share in (0.0, 0.05, 0.2, 0.4, 0.6, 0.8)]
-    assert check(moments, signal.SIGINT, words, tmp_path / "out") >= 4
-    assert check(moments[::3], signal.SIGTERM, words, tmp_path / "out") >= 1
+    moments = [whole * share for share in (0.0, 0.3, 0.7)]
+    assert check(moments, signal.SIGINT, words, tmp_path / "out") >= 2
+    assert check(moments[1:2], signal.SIGTERM, words, tmp_path / "out") == 1
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from ba_node.cli import checkout
+from ba_node.cli import main as command_line
+from ba_node.cli import params
 from ba_node.cli.main import COMMANDS, GROUPS, main
 
 
@@ -21,24 +22,22 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
     text = capsys.readouterr().out
     assert stop.value.code == 0
     assert f"example:\n  ba {command}" in text
+    assert "--json FILE" in text
 
 
-@pytest.mark.parametrize("command", ["steps", "robustness", "thesis"])
+@pytest.mark.parametrize("command", ["steps", "sphere", "robustness", "thesis"])
 def test_commands_of_a_checkout_say_so_elsewhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(checkout, "ROOT", tmp_path)
+    monkeypatch.setattr(command_line, "ROOT", tmp_path)
     for arguments in ([command], [command, "--help"]):
         assert refused(capsys, *arguments) == (
-            f"ba: error: {command} needs a checkout of the repository: experiments are not installed with ba_node\n"
+            f"ba: error: {command} needs a checkout of the repository: experiments are not installed\n"
         )
 
 
-def test_an_installed_package_makes_recordings_and_no_spheres(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(checkout, "ROOT", tmp_path)
-    assert "--kind sphere needs a checkout" in refused(capsys, "synth", str(tmp_path / "ball.txt"), "--kind", "sphere")
+def test_an_installed_package_makes_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command_line, "ROOT", tmp_path)
     assert main(["synth", str(tmp_path / "short.mcap"), "--keyframes", "3"]) == 0
     assert (tmp_path / "short.mcap").stat().st_size > 1000
 
@@ -118,7 +117,7 @@ def test_bad_recordings_are_named(tmp_path: Path, bag: Path, capsys: pytest.Capt
 def test_recording_without_keyframes_names_what_is_missing(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 0
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out"), "--no-report"]) == 0
     capsys.readouterr()
     outputs = tmp_path / "out" / "refined.mcap"
     error = refused(capsys, "replay", str(outputs), "--out", str(tmp_path / "again"))
@@ -152,7 +151,7 @@ def test_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     def interrupted(_: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(COMMANDS["params"], "run", interrupted)
+    monkeypatch.setattr(params, "run", interrupted)
     assert main(["params"]) == 130
     assert capsys.readouterr().err == "ba: interrupted\n"
 
@@ -171,7 +170,7 @@ def test_faults_of_our_own_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> No
     def faulty(_: object) -> int:
         raise ValueError("a fault")
 
-    monkeypatch.setattr(COMMANDS["params"], "run", faulty)
+    monkeypatch.setattr(params, "run", faulty)
     with pytest.raises(ValueError, match="a fault"):
         main(["params"])
 

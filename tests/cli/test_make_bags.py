@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,8 @@ from numpy.testing import assert_allclose
 from ba_node.cli.main import main
 from ba_node.core.cameras import parameters, project
 from ba_node.core.geometry import inverse, matrix_from_quaternion
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import read_bal
-from ba_node.io.mcap import BagReader
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.offline.recording import read_truth
 
@@ -50,8 +49,6 @@ def test_synth_records_the_truth(tmp_path: Path) -> None:
 
 
 def test_synth_refuses_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["synth", str(tmp_path / "s.txt")]) == 2
-    assert "give a name that ends so, or --kind sphere for a BAL problem" in capsys.readouterr().err
     assert main(["synth", str(tmp_path / "s.bag")]) == 2
     assert capsys.readouterr().err.endswith("give a name that ends so\n")
     assert main(["synth", str(tmp_path / "s.mcap"), "--keyframes", "1"]) == 2
@@ -103,34 +100,3 @@ def test_convert_refuses_what_it_cannot_do(bal_file: Path, tmp_path: Path, capsy
     assert main(["convert", str(bad), str(tmp_path / "b.mcap")]) == 2
     assert "camera 0: f = -500 px: expected > 0" in capsys.readouterr().err
     assert not (tmp_path / "b.mcap").exists()
-
-
-def test_synth_makes_a_sphere_with_its_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "ball.txt"
-    options = ["--kind", "sphere", "--preset", "10-253"]
-    assert main(["synth", str(path), *options]) == 0
-    assert "10 images, 253 points, 1334 observations, 0 of them outliers" in capsys.readouterr().out
-    truth = (tmp_path / "ball.truth.txt").read_text().split()
-    assert truth[:3] == ["10", "253", "1334"]
-    first = path.read_bytes()
-    assert main(["synth", str(path), *options]) == 0
-    assert path.read_bytes() == first
-    assert main(["synth", str(path), *options, "--outlier-share", "0.1", "--seed", "4"]) == 0
-    found = re.findall(r"(\d+) observations, (\d+) of them outliers", capsys.readouterr().out)
-    assert len(found) == 2 and int(found[1][1]) == round(0.1 * int(found[1][0])) > 100
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["s.mcap", "--preset", "10-253"], "--preset is an option of --kind sphere alone"),
-        (["s.mcap", "--kind", "sphere"], "give a name that ends so, or leave out --kind sphere"),
-        (["s.txt", "--kind", "sphere", "--keyframes", "5"], "--keyframes is an option of --kind recording alone"),
-        (["s.txt", "--kind", "sphere", "--observations", "9"], "need 506"),
-    ],
-)
-def test_synth_refuses_options_of_the_other_kind(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["synth", str(tmp_path / arguments[0]), *arguments[1:]]) == 2
-    assert words in capsys.readouterr().err

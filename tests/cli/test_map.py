@@ -20,7 +20,7 @@ from tests.ply import read_ply
 
 
 def replay(bag: Path, out: Path, *options: str) -> int:
-    return main(["replay", str(bag), "--out", str(out), *options])
+    return main(["replay", str(bag), "--out", str(out), "--no-report", *options])
 
 
 @pytest.fixture(scope="module")

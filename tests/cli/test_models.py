@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -16,14 +17,15 @@ import pytest
 from ba_node.cli import solve as solve_command
 from ba_node.cli.main import main
 from ba_node.estimate import Poses
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import read_bal
 from ba_node.io.bundler import read_bundler
 from ba_node.io.g2o import read_g2o
-from ba_node.io.mcap import BagReader
 from ba_node.io.model import Reconstruction
 from ba_node.io.ply import read_ply
 from ba_node.io.reference import read_poses
 from ba_node.offline import solve_model
+from ba_node.offline.solver_settings import solver_options
 from tests.models import LENSES, adjusted, make_model, objective, written
 
 
@@ -84,6 +86,23 @@ def test_points_behind_a_camera_and_seen_twice_are_told(tmp_path: Path, capsys: 
     assert "without 1 observations of points that an image saw already" in capsys.readouterr().out
 
 
+def test_what_ends_behind_its_camera_is_not_written(tmp_path: Path) -> None:
+    world = make_model("PINHOLE")
+    model = written(world, tmp_path / "model")
+    options = solver_options("auto", ["cheirality=drop", "trust_region=none", "max_iterations=2"])
+    found = solve_model.solve_model(model, options, ("focal",), clock=lambda: 0.0)
+    state = found.result.state
+    camera = np.linalg.inv(np.vstack([np.column_stack([state.rotation[0], state.translation[0]]), [0, 0, 0, 1]]))
+    points = state.points.copy()
+    points[found.model.point[np.flatnonzero(found.model.frame == 0)[0]]] = (camera @ [0.0, 0.0, -2.0, 1.0])[:3]
+    result = dataclasses.replace(found.result, state=dataclasses.replace(state, points=points))
+    dataclasses.replace(found, result=result).write(tmp_path / "end")
+    count = pycolmap.Reconstruction(tmp_path / "end").compute_num_observations()
+    assert count < world.compute_num_observations()
+    again = solve_model.solve_model(tmp_path / "end", options, (), clock=lambda: 0.0)
+    assert again.attention() == ([], False)
+
+
 def test_one_scene_in_every_format_has_one_objective(bal_file: Path, tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a.out", "a.txt", "model", "text", "b.out", "b.bz2")]
     forms = ("bundler", "bal", "colmap", "colmap-text", "bundler", "bal")
@@ -110,7 +129,7 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
     assert {(camera.width, camera.height) for camera in world.cameras.values()} == {(640, 480)}
     assert objective(world) / (2.0 * world.compute_num_observations()) < 1.0, "half a px^2 each coordinate, or so"
     assert main(["convert", str(tmp_path / "model"), str(tmp_path / "again.mcap")]) == 0
-    assert main(["replay", str(tmp_path / "again.mcap"), "--out", str(tmp_path / "out")]) == 0
+    assert main(["replay", str(tmp_path / "again.mcap"), "--out", str(tmp_path / "out"), "--no-report"]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["keyframes_refined"] == 8
     assert report["rms_px"]["refined"] < 1.02 * report["rms_px"]["input"]

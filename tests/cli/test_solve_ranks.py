@@ -19,8 +19,9 @@ import pytest
 
 from ba_node.core.communicator import Alone
 from ba_node.io.bal import BalProblem, write_bal
+from ba_node.offline.ranks import RanksError, started_as_ranks, world
 from ba_node.offline.solve_bal import solve_file
-from ba_node.offline.solve_ranks import Checkpoint, RanksError, solve_on_ranks, started_as_ranks, world
+from ba_node.offline.solve_ranks import Checkpoint, solve_on_ranks
 from ba_node.offline.solver_settings import solver_options
 
 _ASK = [sys.executable, "-c", "from mpi4py import MPI"]
@@ -191,18 +192,6 @@ def test_ranks_of_different_versions_are_told_apart(file: Path) -> None:
 
     with pytest.raises(RanksError, match="ranks 0 and 1 have different versions of ba_node: give all ranks the same"):
         solve_on_ranks(file, solver_options("auto", []), Two(), clock=time.perf_counter)
-
-
-def test_more_ranks_than_points_are_refused(file: Path) -> None:
-    """So no rank is without points either."""
-
-    class Many(Alone):
-        """One of a thousand ranks that all come to the same."""
-
-        size = 1000
-
-    with pytest.raises(ValueError, match="1000 ranks for 300 points: take at most one rank a point"):
-        solve_on_ranks(file, solver_options("auto", []), Many(), clock=time.perf_counter)
 
 
 def test_ranks_without_an_mpi_library_are_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

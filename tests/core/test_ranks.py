@@ -6,19 +6,16 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import threading
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import methods, native_kernels
-from ba_node.core.communicator import Alone
+from ba_node.core.communicator import Alone, Communicator
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.ranks import RankKernels, deal
 from ba_node.core.result import Result
@@ -26,6 +23,7 @@ from ba_node.core.solver import solve
 from experiments.benchmarks.generators import loop
 from experiments.benchmarks.problem_file import case_problem
 from tests.core.conftest import Spec, make
+from tests.ranks import on_threads
 
 
 def random_problem(seed: int) -> Problem:
@@ -33,55 +31,14 @@ def random_problem(seed: int) -> Problem:
     return make(Spec(seed=seed, keyframes=6, points=40, noise_px=0.5))[0]
 
 
-class Threads(Alone):
-    """Ranks that are threads of this process."""
-
-    def __init__(self, rank: int, size: int, board: list[Any], barrier: threading.Barrier) -> None:
-        self.rank, self.size = rank, size
-        self._board, self._barrier = board, barrier
-
-    def gather(self, value: Any) -> list[Any] | None:
-        self._board[self.rank] = value
-        self._barrier.wait()
-        found = list(self._board)
-        self._barrier.wait()
-        return found if self.rank == 0 else None
-
-    def broadcast(self, value: Any) -> Any:
-        if self.rank == 0:
-            self._board[0] = value
-        self._barrier.wait()
-        found = self._board[0]
-        self._barrier.wait()
-        return found
-
-    def sum(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        parts = self.gather(np.array(values))
-        total: NDArray[np.float64] = self.broadcast(None if parts is None else np.sum(parts, axis=0))
-        return total.copy()
-
-    def abort(self, code: int) -> None:  # noqa: ARG002
-        self._barrier.abort()
-
-    def finish(self) -> None:
-        self._barrier.wait()
-
-
 def on_ranks(problem: Problem, options: SolverOptions, size: int) -> tuple[Sequence[Result], State]:
     """Solve on threads; return the result of each rank, and the whole state."""
-    board, barrier = [None] * size, threading.Barrier(size, timeout=60.0)
 
-    def run(rank: int) -> Result:
-        try:
-            part, _ = deal(problem, rank, size)
-            kernels = RankKernels(part, options, Threads(rank, size, board, barrier))
-            return solve(part, options, kernels=kernels)
-        except BaseException:
-            barrier.abort()
-            raise
+    def work(ranks: Communicator) -> Result:
+        part, _ = deal(problem, ranks.rank, ranks.size)
+        return solve(part, options, kernels=RankKernels(part, options, ranks))
 
-    with ThreadPoolExecutor(size) as pool:
-        results = list(pool.map(run, range(size)))
+    results = on_threads(size, work)
     points = np.concatenate([result.state.points for result in results])
     return results, dataclasses.replace(results[0].state, points=points)
 
@@ -147,7 +104,7 @@ def test_more_ranks_than_points_are_refused() -> None:
 def test_what_ranks_cannot_do_is_refused() -> None:
     for changes in ({"schur": "cameras"}, {"preconditioner": "b_block"}):
         with pytest.raises(ConfigError, match="several ranks"):
-            RankKernels(random_problem(seed=1), options("numpy", **changes), Threads(0, 2, [], threading.Barrier(2)))
+            RankKernels(random_problem(seed=1), options("numpy", **changes), Alone())
 
 
 @pytest.mark.parametrize("kernels", ["numpy", "native"])

@@ -224,6 +224,18 @@ class TestLadybug:
         check(result)
         assert result.objective_after <= 13344.246 * 1.001
 
+    @pytest.mark.parametrize("loss", ["squared", "huber"])
+    def test_the_region_saves_steps_that_cholesky_cannot_solve(self, loss: str, problem: Problem) -> None:
+        """Near the end damping alone falls until S breaks down; the region holds steps back in its place."""
+        chosen = dataclasses.replace(methods.options("auto"), loss=loss, function_tolerance=1e-9, max_iterations=100)
+        found = solve(problem, chosen)
+        alone = solve(problem, dataclasses.replace(chosen, trust_region="none"))
+        for result in (found, alone):
+            assert result.status is Status.CONVERGED and min(row.damping for row in result.trace) >= 1e-13
+        assert found.objective_after == pytest.approx(alone.objective_after, rel=1e-7)
+        rejected = [sum(not row.accepted for row in result.trace) for result in (found, alone)]
+        assert rejected[0] < rejected[1] and len(found.trace) <= len(alone.trace), rejected
+
 
 @pytest.mark.parametrize("name", ["dubrovnik-1-1-pre.txt", "dubrovnik-3-7-18-pre.txt", "dubrovnik-3-7-pre.txt"])
 @pytest.mark.parametrize("method", list(methods.METHODS))

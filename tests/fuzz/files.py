@@ -25,12 +25,12 @@ from rosbags.rosbag2 import Writer as Rosbag2
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.io import model, ros_types
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import BalProblem, read_bal, write_bal
 from ba_node.io.bundler import from_bal, read_bundler, write_bundler
 from ba_node.io.colmap import read_colmap, to_colmap, write_colmap
 from ba_node.io.g2o import read_g2o, write_g2o
 from ba_node.io.map_file import load_map, write_map
-from ba_node.io.mcap import BagReader
 from ba_node.io.parameters import configure, parameters_yaml
 from ba_node.io.ply import read_ply, write_ply
 from ba_node.io.reference import read_poses

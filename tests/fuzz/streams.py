@@ -15,7 +15,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.io import ros_types
-from ba_node.io.mcap import ROSBAGS_FACTORY
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import (
     FeatureTracks,
     GlobalFix,

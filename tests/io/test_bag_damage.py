@@ -14,8 +14,10 @@ from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
 from ba_node.io import ros_types
-from ba_node.io.bag_index import MAGIC
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
+from ba_node.io.mcap_index import MAGIC
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES

@@ -22,7 +22,9 @@ from mcap_ros2.decoder import DecoderFactory
 
 from ba_node.config import OutputConfig
 from ba_node.io import ros_types
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_writer import BagWriter
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import input_message, measurement_from_message
 from ba_node.messages.outputs import output_messages

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ba_node.io.mcap import BagError, BagReader
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
 from tests.fuzz.targets import seeds
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ba_node.io.mcap import BagError
+from ba_node.io.bag_topics import BagError
 from ba_node.io.rig_file import rig_yaml
 from ba_node.offline.images import ImageRequest, open_images
 from tests.io.test_rig_file import a_rig

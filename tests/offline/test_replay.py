@@ -16,8 +16,8 @@ import yaml
 
 from ba_node.config import Config
 from ba_node.evaluation.metrics import absolute_error
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.bal import read_bal
-from ba_node.io.mcap import BagReader
 from ba_node.io.model import from_bal
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.estimate import Cloud, Poses
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_writer import BagWriter
 from ba_node.io.ply import write_ply
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.io.trajectory import write_tum
 from ba_node.messages.factory import header_message
 from ba_node.offline.figures import figures

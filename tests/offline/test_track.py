@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from ba_node.cli.main import main
 from ba_node.core import geometry
 from ba_node.estimate import Transform
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.rig_file import rig_yaml
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
@@ -46,7 +47,10 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_pictures_become_a_map(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["run", str(pictures), "--out", str(out), "--no-report", "--track", "max_features=300"]) == 0
+    found = tmp_path / "found.json"
+    options = ["--no-report", "--track", "max_features=300", "--json", str(found)]
+    assert main(["run", str(pictures), "--out", str(out), *options]) == 0
+    assert json.loads(found.read_text())["exit_codes"] == {"track": 0, "check": 0, "replay": 0}
     text, errors = capsys.readouterr()
     assert "12, stereo" in text
     assert "error to ground truth" in text

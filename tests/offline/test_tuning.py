@@ -12,7 +12,8 @@ import pytest
 
 from ba_node.cli.main import main
 from ba_node.config import Config, declarations
-from ba_node.io.mcap import BagReader, TopicChoice
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.parameters import read_parameters
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.offline.measure import Measured, Question, is_held_out, measure

@@ -15,7 +15,7 @@ import pytest
 from tornado.websocket import websocket_connect
 
 from ba_node.cli.main import main
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.parameters import NODE_NAME
 from ba_node.offline.recording import record
 from ba_node.offline.view import ViewError, ViewOptions, serve, view

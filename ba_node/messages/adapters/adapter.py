@@ -151,6 +151,8 @@ class Adapter:
             return
         if isinstance(piece, Extrinsic):
             self._extrinsic = piece
+            if self.rig is None and self._frames:
+                self._invent_lens(self._frames[-1][1])
         elif piece.malformed:
             self.leave("bad_camera", piece.malformed)
             return

@@ -12,13 +12,11 @@ from __future__ import annotations
 import argparse
 import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
@@ -30,9 +28,10 @@ from ba_node.messages.topics import INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Severity, log
+from ba_node.ros.main import USAGE_ERROR, run
+from ba_node.ros.rclpy_compat.lifecycle import answering
 
 NODE_NAME = "ba_adapter"
-USAGE_ERROR = 2
 PUBLISHED = ("camera_rig", "keyframes", "landmark_guesses", "feature_tracks")
 _DEPTH = 1000
 _LOOK_S = 0.5
@@ -41,19 +40,15 @@ _HINT = "; its package comes with the front-end (for rtabmap: ros-jazzy-rtabmap-
 
 
 class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
-    """The converter node.
-
-    Raises:
-        LookupError: the messages of the front-end are not installed.
-    """
+    """The converter node. The messages of its source must be installed."""
 
     def __init__(self, source: str, adapter: Adapter, **node_options: Any) -> None:
         super().__init__(NODE_NAME, **node_options)
         self.adapter = adapter
         self._source = source
         self._inputs = [one for one in SOURCES[source].inputs if one.type_name]
-        for one in self._inputs:
-            message_class(one.type_name)
+        for service in self.services:
+            service.callback = answering(self, service.srv_name, service.srv_type.Response, service.callback)
         self._subscribed: dict[str, Input] = {}
         self._messages = InputMessages(RclpyFactory())
         self._said = self._ambiguous = ""
@@ -66,6 +61,17 @@ class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_S, self._look, clock=clock)
         self.create_timer(_LOG_S, self._report, clock=clock)
+
+    def start(self) -> None:
+        """Begin: it does as soon as it is there."""
+
+    def stop(self) -> None:
+        """Count what still waits."""
+        self.adapter.finish()
+
+    def summary(self) -> str:
+        """Return in words what was sent on, and what was left out."""
+        return "; ".join([self.adapter.summary(), *self.adapter.told()])
 
     def _look(self) -> None:
         """Subscribe to what is there now: an input under its own name, else under the same one in any namespace."""
@@ -110,7 +116,7 @@ class AdapterNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def _report(self) -> None:
         """Log what has become of the images, when that has changed; and what is missing."""
         missing = [one for one in self._inputs if one.role and one.role not in self._roles()]
-        words = "; ".join([self.adapter.summary(), *self.adapter.told()])
+        words = self.summary()
         if missing:
             listed = ", ".join(f"{self.resolve_topic_name(one.name)} ({one.type_name})" for one in missing)
             words += f"; nobody publishes {listed}: is {self._source} running?"
@@ -138,27 +144,26 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("--parallax", type=float, default=1.0, metavar="DEG", help="between keyframes (%(default)s)")
     parser.add_argument("--cameras", type=int, default=0, metavar="N", help="NUM_OF_CAM of vins_mono (rig's, or 1)")
     said = parser.parse_args(remove_ros_args(given)[1:])
-    rclpy.init(args=given)
+    kind = SOURCES[said.source]
     try:
         rig = read_rig(*said.rig) if said.rig else None
-        options = AdapterOptions(said.tolerance, said.parallax, rig=rig)
-        node = AdapterNode(
-            said.source, Adapter(SOURCES[said.source](said.cameras or (len(rig) if rig else 1)), options)
-        )
+        for name in {one.type_name for one in kind.inputs} - {""}:
+            message_class(name)
     except (RigError, LookupError) as error:
         print(f"{NODE_NAME}: {error}{_HINT if isinstance(error, LookupError) else ''}", file=sys.stderr)
-        rclpy.try_shutdown()
         return USAGE_ERROR
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.adapter.finish()
-        print("; ".join([f"stopped: {node.adapter.summary()}", *node.adapter.told()]), flush=True)
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    options = AdapterOptions(said.tolerance, said.parallax, rig=rig)
+    adapter = Adapter(kind(said.cameras or (len(rig) if rig else 1)), options)
+    return run(NODE_NAME, lambda: AdapterNode(said.source, adapter), [given[0], *_ros_words(given)])
+
+
+def _ros_words(given: Sequence[str]) -> Iterator[str]:
+    """Yield the arguments that are for ROS."""
+    inside = False
+    for word in given:
+        inside = word == "--ros-args" or (inside and word != "--")
+        if inside:
+            yield word
 
 
 if __name__ == "__main__":

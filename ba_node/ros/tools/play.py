@@ -26,7 +26,7 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.time import Time
 
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.measurements import CameraRig
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS

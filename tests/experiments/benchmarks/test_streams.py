@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ba_node.core.objective import rms_px
+from ba_node.core.objective import rms_px, squared_errors
 from experiments.benchmarks.scale import measure
 from experiments.benchmarks.streams import PUBLISHED, Stream, named
 
@@ -29,7 +29,7 @@ def test_parts_are_those_of_the_whole(kind: str) -> None:
 def test_points_lie_before_cameras_that_see_them(kind: str) -> None:
     """A noise of 0.2 m of points and 0.05 m of cameras at 8 m and more is some 20 px; nobody looks backwards."""
     problem = Stream(kind, 600, 9000, 5.0).part(0, 1)
-    (rms,) = rms_px(problem, problem.start)
+    rms = rms_px(squared_errors(problem, problem.start))
     assert 5.0 < rms < 60.0, rms
     assert 4.0 < len(problem.observations) / problem.n_points < 5.2
 

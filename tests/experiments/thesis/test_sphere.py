@@ -5,11 +5,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ba_node.cli.main import main
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core.geometry import so3_exp
 from ba_node.core.objective import Objective, reprojection_errors
@@ -156,3 +158,20 @@ def test_impossible_wishes_are_refused(changes: dict[str, float], words: str) ->
 def test_an_unknown_preset_is_answered_with_those_there_are() -> None:
     with pytest.raises(ConfigError, match="choose one of 10-253, 10-289, 50-1000, 100-4000, 500-5000"):
         preset("7-7")
+
+
+def test_the_command_makes_a_sphere_with_its_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, size = tmp_path / "ball.txt", ["--preset", "10-253"]
+    assert main(["sphere", str(path), *size]) == 0
+    assert "10 images, 253 points, 1334 observations, 0 of them outliers" in capsys.readouterr().out
+    truth = (tmp_path / "ball.truth.txt").read_text().split()
+    assert truth[:3] == ["10", "253", "1334"]
+    first = path.read_bytes()
+    assert main(["sphere", str(path), *size]) == 0
+    assert path.read_bytes() == first
+    assert main(["sphere", str(path), *size, "--outlier-share", "0.1", "--seed", "4"]) == 0
+    found = re.findall(r"(\d+) observations, (\d+) of them outliers", capsys.readouterr().out)
+    assert len(found) == 2 and int(found[1][1]) == round(0.1 * int(found[1][0])) > 100
+    for wrong, words in ((["s.mcap"], "give a name that ends so"), (["s.txt", "--observations", "9"], "need 506")):
+        assert main(["sphere", str(tmp_path / wrong[0]), *wrong[1:]]) == 2
+        assert words in capsys.readouterr().err

@@ -46,15 +46,21 @@ def needs_rtabmap_msgs() -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "expected"),
-    [("openvins", 12), ("rtabmap", 12), pytest.param("vins_fusion", 9, marks=pytest.mark.slow)],
+    ("source", "expected", "images"),
+    [
+        ("openvins", 12, 12),
+        ("rtabmap", 12, 12),
+        ("rtabmap_map", 12, 23),  # each node but the last comes again
+        pytest.param("vins_fusion", 9, 9, marks=pytest.mark.slow),
+    ],
 )
 def test_what_a_front_end_publishes_comes_back_refined(
-    source: str, expected: int, start_node: StartNode, make_peer: MakePeer
+    source: str, expected: int, images: int, start_node: StartNode, make_peer: MakePeer
 ) -> None:
-    if source == "rtabmap":
+    rectified = source.startswith("rtabmap")
+    if rectified:
         needs_rtabmap_msgs()
-    data = layouts.scene()
+    data = layouts.scene(12, "none" if rectified else "plumb_bob")
     node, adapter, peer = start_node(), start_node("--from", source, program=PROGRAM), make_peer()
     peer.listen("refined_keyframes")
     peer.until(lambda: peer.node.count_subscribers("keyframes"), "the node")
@@ -66,11 +72,13 @@ def test_what_a_front_end_publishes_comes_back_refined(
     else:  # which of the two stamps a keyframe has, is that of its pose
         peer.until(lambda: len(peer.refined_ids()) == expected, "all keyframes")
     # Counts and reasons stand in the log while it runs.
-    peer.until(lambda: f"{expected} keyframes of {expected} images" in adapter.err, "the log")
+    peer.until(lambda: f"{expected} keyframes of {images} images" in adapter.err, "the log")
     if source == "openvins":
         assert "not_seen_by_camera_0 = 36" in adapter.err
+    if source == "rtabmap_map":
+        assert "ambiguous_word = 24" in adapter.err and "repeated_keyframe = 11" in adapter.err
     assert adapter.stop() == 0, adapter.err
-    assert adapter.out.startswith(f"stopped: {expected} keyframes of {expected} images"), adapter.out
+    assert adapter.out.startswith(f"stopped: {expected} keyframes of {images} images"), adapter.out
     assert node.stop() == 0
 
 

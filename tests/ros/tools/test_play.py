@@ -18,9 +18,11 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from ba_node.config import Config
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_writer import BagWriter
 from ba_node.io.bal import read_bal
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagReader, BagWriter
 from ba_node.io.model import from_bal
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.messages import conversion
 from ba_node.messages.topics import CAMERAS, INPUT_TYPES
 from ba_node.offline.convert import timeline

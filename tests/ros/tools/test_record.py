@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.offline.recording import record
 from ba_node.synthetic import SyntheticOptions, generate
 

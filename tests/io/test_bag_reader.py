@@ -16,8 +16,11 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 
 from ba_node.config import OutputConfig
 from ba_node.io import ros_types
-from ba_node.io.bag_index import read_index
-from ba_node.io.mcap import ROSBAGS_FACTORY, BagError, BagReader, BagWriter
+from ba_node.io.bag_reader import BagReader
+from ba_node.io.bag_topics import BagError
+from ba_node.io.bag_writer import BagWriter
+from ba_node.io.mcap_index import read_index
+from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import input_message
 from ba_node.messages.outputs import output_messages

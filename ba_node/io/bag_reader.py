@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read recordings of ROS 2 without ROS, MCAP or SQLite, of one file or several; write them with :class:`BagWriter`."""
+"""Read recordings of ROS 2 without ROS, MCAP or SQLite, of one file or several."""
 
 from __future__ import annotations
 
@@ -15,17 +15,14 @@ from typing import Any
 
 from ba_node.io import ros_types
 from ba_node.io.bag_files import PACKED, find_files, unpack_file
-from ba_node.io.bag_index import MAX_CHUNK_BYTES, Message, merge_by_time
 from ba_node.io.bag_source import BagChannel, Source, open_source
 from ba_node.io.bag_topics import NO_CHOICE, BagError, Chooser, Chosen, EmptyBagError, TopicChoice
-from ba_node.io.bag_writer import BagWriter
-from ba_node.io.ros_types import ROSBAGS_FACTORY, TypeMismatchError
+from ba_node.io.mcap_index import MAX_CHUNK_BYTES, Message, merge_by_time
+from ba_node.io.ros_types import TypeMismatchError
 from ba_node.io.unpack import ZSTD_MAGIC, unpack
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.messages.conversion import measurement_from_message
 from ba_node.messages.topics import CAMERA_TYPES, CAMERAS, INPUT_TYPES
-
-__all__ = ["ROSBAGS_FACTORY", "BagError", "BagReader", "BagWriter", "TopicChoice"]
 
 _NOTES = 100
 # Messages that are looked at for the frames that a topic names.
