@@ -102,7 +102,7 @@ class _Part:
 
 def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
     """Return the keyframes of the newest window among the first ``end`` keyframes (all by default), oldest first."""
-    return scene.order[:end][-config.window.max_keyframes :]
+    return scene.order[:end][-old_keyframes.window_size(scene, config) :]
 
 
 def select(scene: Scene, config: Config, end: int | None = None, without: tuple[int, ...] = ()) -> Selection | str:
