@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ba_node.cli.console import TargetError, facts, progress_bar, require_mcap
+from ba_node.cli.console import TargetError, facts, progress_bar, require_mcap, write_result
 
 if TYPE_CHECKING:
     from ba_node.config.front_end import FrontEndOptions
@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         report = track(args.source, args.out, request(args), time.process_time, progress)
     tell(report)
     print(f"written to {args.out}")
+    write_result(args.json, report)
     return ATTENTION if attention(report) else 0
 
 
