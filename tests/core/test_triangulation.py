@@ -176,7 +176,7 @@ def test_kernels_agree(offset: float) -> None:
     np.testing.assert_allclose(ours.points[wide], oracle.points[wide], rtol=1e-9, atol=1e-7)
 
 
-def test_many_observations_are_worked_on_by_pieces_and_give_the_same_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pieces_of_many_observations_give_the_same_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem(seed=9, noise_px=0.5)
     whole = rays_of(problem)
     error = errors(whole, problem.start.points)
