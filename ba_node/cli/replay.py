@@ -124,7 +124,9 @@ def run(args: argparse.Namespace) -> int:
     else:
         from ba_node.offline.report import show  # noqa: PLC0415
 
-        print(f"written to {args.out}: {show(args.out)}")
+        with progress_bar("report", "figures") as progress:
+            written = show(args.out, progress)
+        print(f"written to {args.out}: {written}")
     write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
 

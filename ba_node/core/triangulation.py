@@ -49,7 +49,10 @@ class Rays:
 
     def part(self, which: BoolArray) -> Rays:
         """Return some of them."""
-        return Rays(**{item.name: getattr(self, item.name)[which] for item in dataclasses.fields(self)})
+        if which.all():
+            return self
+        rows = np.flatnonzero(which)
+        return Rays(*(getattr(self, item.name).take(rows, axis=0) for item in dataclasses.fields(self)))
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,8 @@ class Session:
         self.lost = 0  # images in a row without a pose
         self.unseen = 0  # images without a pose since the last keyframe
         self.alone = False  # one camera without odometry
+        # What was taken until it is known how the second camera is turned: arguments of ``FrontEnd._track``.
+        self.first_images: list[tuple[Images, Transform | None, float, bool]] | None = [] if ideal.baseline else None
         self._ideal, self._fixed_frame = ideal, fixed_frame
         self._motion = _IDENTITY  # camera now from camera at the image before
         self._keyframe_pose: Transform | None = None  # fixed frame from body at the last keyframe

@@ -107,11 +107,11 @@ class Kernel:
     def rhs(self, out: Doubles) -> None: ...
     def dense(self, out: Doubles) -> None: ...
     def solve(self, out: Doubles) -> bool: ...
-    def sparse(self) -> tuple[Doubles, NDArray[np.int32], Ints]:
-        """Return blocks (n_blocks, d, d), columns and row starts of the upper triangle of S."""
+    def schur_pattern(self) -> tuple[NDArray[np.int32], Ints]:
+        """Return columns and row starts of the upper triangle of S, by blocks."""
 
-    def schur_blocks(self) -> int:
-        """Return how many blocks S has on and above its diagonal."""
+    def sparse(self, place: Ints, mirrored: Ints, out: Doubles) -> None:
+        """Write block k of that to out[place[k]] (d, d), transposed to out[mirrored[k]] unless that is negative."""
 
     def analyse(self, max_blocks: int, max_products: float) -> tuple[bool, int, float]:
         """Return whether the sparse factor meets the limits, its blocks, and products of blocks to find it."""

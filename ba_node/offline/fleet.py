@@ -106,10 +106,13 @@ class Fleet:
     def each(
         self, function: Callable[[Task], Result], tasks: Sequence[Task], failed: Callable[[Task, str], Result]
     ) -> Iterator[tuple[int, Result]]:
-        """Call a function with each task; yield number and result as they come.
+        """Call a function with each task; yield number and result as they come, those of this process one by one.
 
         ``failed`` makes a result of a task that several workers died of.
         """
+        if isinstance(self._executor, _Here):
+            yield from enumerate(map(function, tasks))
+            return
         futures = {self.submit(function, task): n for n, task in enumerate(tasks)}
         for future in as_completed(futures):
             number = futures.pop(future)

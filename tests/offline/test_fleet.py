@@ -80,6 +80,14 @@ def test_what_kills_every_worker_is_given_up_and_named(cluster: Any) -> None:
     assert found == {0: (1, "3 workers died of it, perhaps for want of memory (KilledWorker)")}
 
 
+def test_one_process_tells_of_each_recording_as_it_is_done() -> None:
+    begun: list[int] = []
+    with Fleet() as fleet:
+        for number, _ in fleet.each(begun.append, [0, 1, 2], lambda *_: None):
+            assert begun == list(range(number + 1)), "the next one has begun before this one was told of"
+    assert len(begun) == 3
+
+
 def test_results_are_one_table_and_page(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["replay", str(MONO), str(broken), str(STEREO), "--out", str(out), "--no-report"]) == 3

@@ -111,11 +111,15 @@ py::array_t<T> copy(const std::vector<T>& values) {
   return py::array_t<T>(static_cast<py::ssize_t>(values.size()), values.data());
 }
 
-py::tuple sparse(Kernel& k) {
-  const Rows32& pattern = *without_gil([&] { return &k.assemble(); });
-  Doubles blocks = empty({static_cast<py::ssize_t>(pattern.index.size()), k.size(), k.size()});
-  k.write_blocks(blocks.mutable_data());
-  return py::make_tuple(blocks, copy(pattern.index), copy(pattern.start));
+py::tuple schur_pattern(Kernel& k) {
+  const Rows32& pattern = *without_gil([&] { return &k.schur_pattern(); });
+  return py::make_tuple(copy(pattern.index), copy(pattern.start));
+}
+
+void sparse(Kernel& k, const Ints& place, const Ints& mirrored, OutDoubles out) {
+  const std::int64_t *to = place.data(), *turned = mirrored.data();
+  double* blocks = out.mutable_data();
+  without_gil([&] { k.sparse(to, turned, blocks); });
 }
 
 py::tuple inner_iterations(Kernel& k, const py::object& state, int steps) {
@@ -214,7 +218,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              return without_gil([&] { return k.solve(x); });
            })
       .def("sparse", &sparse)
-      .def("schur_blocks", [](Kernel& k) { return without_gil([&] { return k.schur_blocks(); }); })
+      .def("schur_pattern", &schur_pattern)
       .def("analyse",
            [](Kernel& k, std::int64_t max_blocks, double max_products) {
              const Fill& fill = *without_gil([&] { return &k.analyse({max_blocks, max_products}); });

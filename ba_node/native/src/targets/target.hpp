@@ -54,15 +54,14 @@ class Kernel {
   virtual void rhs(double* out) const = 0;
   // S, symmetric, (n x n), n = n_free d.
   virtual void dense(double* out) = 0;
-  // The upper triangle of S by blocks: its pattern, and the blocks of the last one assembled, (n_blocks x d x d).
-  virtual const Rows32& assemble() = 0;
-  virtual void write_blocks(double* out) = 0;
+  // The pattern of the upper triangle of S; its blocks (d x d), block k to place[k] of out, and transposed to
+  // mirrored[k] unless that is negative.
+  virtual const Rows32& schur_pattern() = 0;
+  virtual void sparse(const std::int64_t* place, const std::int64_t* mirrored, double* out) = 0;
   // S x without forming S, and the diagonal blocks of S, (n_free x d x d).
   virtual void product(const double* x, double* out) = 0;
   virtual void diagonal_blocks(double* out) = 0;
 
-  // Blocks of S on and above its diagonal.
-  virtual std::int64_t schur_blocks() = 0;
   // Solve S x = rhs by dense Cholesky, or by sparse Cholesky after analyse; false if S is not positive definite.
   virtual bool solve(double* x) = 0;
   virtual const Fill& analyse(const FillLimits& limits) = 0;
