@@ -21,8 +21,10 @@ from ba_node.measurements import CameraRig
 
 # Depth cameras tell nothing beyond this, m.
 _FARTHEST_M = 1e4
-# How the second camera is turned is known once its yaw is, to so many px, or after so many images that move.
-_SETTLED_PX, _MOST_KEPT = 0.1, 60
+# How the second camera is turned is known once its yaw is, to so many px; that it is far off, by so many keyframes.
+_SETTLED_PX, _ENOUGH_KEYFRAMES = 0.1, 6
+# Images that are kept until then.
+_MOST_KEPT = 40
 # A turn that is known too late by more, px, spoils the keyframes from before.
 _FAR_OFF_PX = 0.5
 _ALONE = "one camera without odometry: the scale is free, lengths are in units of the first step"
@@ -178,15 +180,19 @@ class FrontEnd:
         Their keyframes were measured before that was known. What moves tells it within some keyframes.
         """
         session = self._session
-        if session is None or session.first_images is None or told.state is State.STANDING:
+        if session is None or session.first_images is None or told.state in (State.STANDING, State.LOST):
             return told
-        session.first_images.append(image)
         alignment, first_images = session.tracker.alignment, session.first_images
-        if alignment.sigma[0] > _SETTLED_PX and len(first_images) < _MOST_KEPT:
+        if len(first_images) >= _MOST_KEPT:
+            del first_images[1::2]  # so many between few keyframes are near enough to each other
+        first_images.append(image)
+        yaw, roll = alignment.turn.tolist()
+        o = session.options
+        far_off = max(abs(yaw - o.stereo_yaw_px), abs(roll - o.stereo_roll_px)) > _FAR_OFF_PX
+        if alignment.sigma[0] > _SETTLED_PX and not (far_off and session.keyframes >= _ENOUGH_KEYFRAMES):
             return told
         session.first_images = None
-        yaw, roll = alignment.turn.tolist()
-        if max(abs(yaw - session.options.stereo_yaw_px), abs(roll - session.options.stereo_roll_px)) < _FAR_OFF_PX:
+        if not far_off:
             return told
         notes, self._notes = self._notes, []
         self._forget()
