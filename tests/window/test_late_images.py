@@ -55,7 +55,8 @@ def clock_of(data: SyntheticData) -> Parameter:
     return clock
 
 
-@pytest.mark.parametrize("late_s", [LATE_S, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("late_s", [LATE_S, 0.0])
 def test_on_a_gentle_way_the_offset_is_recovered_to_a_fifth(late_s: float) -> None:
     clock = clock_of(recording(late_s, gentle=True))
     assert clock.told
