@@ -124,6 +124,15 @@ class Kernel:
     def diagonal_blocks(self) -> Doubles: ...
     def back_substitute(self, step_c: Doubles) -> tuple[Doubles, float]: ...
 
+class SparseFactor:
+    """The sparse Cholesky factor of a symmetric matrix by d x d blocks, d = 6 or 9, given by its upper triangle."""
+
+    def __init__(self, d: int, columns: Ints, starts: Ints) -> None:
+        """Find its structure from the columns of each row, the diagonal first, and where rows start."""
+
+    def solve(self, blocks: Doubles, x: Doubles) -> bool:
+        """Turn the right-hand side x (n d,) into the solution; False if the matrix is not positive definite."""
+
 class RelativePoses:
     """Factors on relative poses, as core.factors.RelativePoses; the arrays are copied."""
 

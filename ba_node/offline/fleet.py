@@ -245,6 +245,8 @@ def _fetching(place: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise FleetError(f"{place}: {error}: URLs need fsspec: pip install ba_node[fleet]") from None
+        # fsspec itself says what else to install, for s3:// and others.
+        hint = ": URLs need fsspec: pip install ba_node[fleet]" if (error.name or "").startswith("fsspec") else ""
+        raise FleetError(f"{place}: {error}{hint}") from None
     except Exception as error:  # each store has errors of its own
         raise FleetError(f"{place}: {type(error).__name__}: {error}") from None

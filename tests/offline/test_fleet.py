@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -127,6 +128,14 @@ def test_recordings_and_results_may_be_urls(tmp_path: Path) -> None:
     ).read_bytes()
     with pytest.raises(FleetError, match="nothing is there that matches"):
         expand([f"{url}/*.db3"])
+
+
+def test_what_a_store_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for missing, words in (("s3fs", "^s3://a/[*]: Install s3fs to access S3$"), ("fsspec", "pip install ba_node")):
+        monkeypatch.setitem(sys.modules, missing, None)
+        monkeypatch.setitem(sys.modules, f"{missing}.core", None)
+        with pytest.raises(FleetError, match=words):
+            expand(["s3://a/*"])
 
 
 def test_all_bad_is_two(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

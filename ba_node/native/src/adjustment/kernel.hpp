@@ -188,4 +188,27 @@ class KernelOf final : public Kernel {
   std::vector<Buffer<V8>> staged_;      // the same: rows of a batch
 };
 
+template <int D>
+class SparseFactorOf final : public SparseFactor {
+ public:
+  explicit SparseFactorOf(const Rows32& upper)
+      : factor_(upper, {std::numeric_limits<std::int64_t>::max(), std::numeric_limits<double>::infinity()}),
+        blocks_(upper.index.size()) {}
+
+  bool solve(const double* blocks, double* x) override {
+    for (Block<D>& block : blocks_) {
+      clear(&block, 1);
+      for (int r = 0; r < D; ++r)
+        for (int c = 0; c < D; ++c) set_entry(block, r, c, *blocks++);
+    }
+    if (!factor_.factor(blocks_.data())) return false;
+    factor_.solve(x);
+    return true;
+  }
+
+ private:
+  SparseCholesky<D> factor_;
+  Buffer<Block<D>> blocks_;
+};
+
 }  // namespace ba::BA_TARGET

@@ -244,6 +244,15 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
       .def("back_substitute", &back_substitute);
 }
 
+// columns, starts: of the rows of the upper triangle of a matrix by d x d blocks.
+SparseFactor* make_factor(int d, const Ints& columns, const Ints& starts) {
+  Rows32 upper;
+  upper.index.assign(columns.data(), columns.data() + columns.size());
+  upper.start.assign(starts.data(), starts.data() + starts.size());
+  const auto make = d == 9 ? target->make_factor9 : target->make_factor6;
+  return without_gil([&] { return make(upper); });
+}
+
 RelativePoseFactors* make_relative_poses(const py::object& factors, const Ints& column, const Ints& pair) {
   const Ints keyframes = array_of<std::int64_t>(factors, "keyframes");
   const Doubles rotation = array_of<double>(factors, "rotation"),
@@ -276,6 +285,16 @@ void bind_relative_poses(py::module_& m) {
       });
 }
 
+void bind_sparse_factor(py::module_& m) {
+  py::class_<SparseFactor>(m, "SparseFactor")
+      .def(py::init(&make_factor))
+      .def("solve", [](SparseFactor& f, const Doubles& blocks, OutDoubles x) {
+        const double* from = blocks.data();
+        double* out = x.mutable_data();
+        return without_gil([&] { return f.solve(from, out); });
+      });
+}
+
 }  // namespace
 
 }  // namespace ba
@@ -288,6 +307,7 @@ PYBIND11_MODULE(_kernels, m) {
   kernel.def(pybind11::init(&ba::make_kernel));
   ba::bind_assembly(kernel);
   ba::bind_reduced_system(kernel);
+  ba::bind_sparse_factor(m);
   ba::bind_relative_poses(m);
   m.def("targets", &ba::target_names);
   m.def("target", [] { return ba::target->name; });

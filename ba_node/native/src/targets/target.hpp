@@ -88,11 +88,24 @@ class RelativePoseFactors {
   virtual double linearise(const StateView& s, const FactorSums& out) const = 0;
 };
 
+// The sparse Cholesky factor of a symmetric matrix by d x d blocks, for sums of S; linalg/sparse_cholesky.hpp.
+class SparseFactor {
+ public:
+  virtual ~SparseFactor();
+
+  // blocks: of the upper triangle in the order of the pattern, (n_blocks x d x d). x: right-hand side in, solution out.
+  // False if the matrix is not positive definite.
+  virtual bool solve(const double* blocks, double* x) = 0;
+};
+
 // What is compiled for one kind of processor.
 struct Target {
   const char* name;
   Kernel* (*make_kernel6)(KernelArguments&&);
   Kernel* (*make_kernel9)(KernelArguments&&);
+  // upper: rows of the upper triangle with the diagonal first.
+  SparseFactor* (*make_factor6)(const Rows32& upper);
+  SparseFactor* (*make_factor9)(const Rows32& upper);
   RelativePoseFactors* (*make_relative_poses)(const RelativePosesView&);
   void (*residual_norms)(const ProblemView&, const StateView&, double* out);
   void (*triangulate)(const RaysView&, std::int64_t n_points, double* points, double* parallax, bool* measured);
@@ -104,6 +117,8 @@ struct Target {
   extern const Target kTarget;                       \
   Kernel* make_kernel6(KernelArguments&& arguments); \
   Kernel* make_kernel9(KernelArguments&& arguments); \
+  SparseFactor* make_factor6(const Rows32& upper);   \
+  SparseFactor* make_factor9(const Rows32& upper);   \
   }
 BA_DECLARE_TARGET(baseline)
 BA_DECLARE_TARGET(avx2)
