@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,17 @@ settings.register_profile("ba_node", deadline=None, derandomize=True, suppress_h
 settings.load_profile("ba_node")
 
 
+# Folders whose tests take longest, which are begun first: so that all processes end at about the same time.
+_LONG = ("cases", "check", "window", "offline", "backend", "cli", "front_end")
+# By how much processes give way to the one that talks over DDS, which waits most of its time.
+_GIVING_WAY = 5
+_begun = pytest.StashKey[bool]()
+
+
+def _talks(item: pytest.Item) -> bool:
+    return item.get_closest_marker("dds") is not None or _ROOT / "tests" / "ros" in item.path.parents
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Group tests for pytest-xdist: a process runs all that talk over DDS, and each other file as a whole.
 
@@ -48,9 +60,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     if not config.pluginmanager.hasplugin("xdist"):
         return
+
+    def rank(item: pytest.Item) -> int:
+        folder = item.path.relative_to(_ROOT / "tests").parts[0]
+        return -1 if _talks(item) else _LONG.index(folder) if folder in _LONG else len(_LONG)
+
+    items.sort(key=rank)
     for item in items:
-        talks = item.get_closest_marker("dds") is not None or _ROOT / "tests" / "ros" in item.path.parents
-        item.add_marker(pytest.mark.xdist_group("dds" if talks else str(item.path)))
+        item.add_marker(pytest.mark.xdist_group("dds" if _talks(item) else str(item.path)))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let a process that does not begin with DDS give way to the one that does."""
+    if hasattr(item.config, "workerinput") and not item.config.stash.setdefault(_begun, False):
+        item.config.stash[_begun] = True
+        os.nice(0 if _talks(item) else _GIVING_WAY)
 
 
 @pytest.fixture(scope="session")

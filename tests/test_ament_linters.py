@@ -30,6 +30,7 @@ def test_copyright(capfd: pytest.CaptureFixture[str]) -> None:
     assert code == 0, capfd.readouterr().err
 
 
+@pytest.mark.slow  # ruff has looked at the same by then
 def test_flake8() -> None:
     pytest.importorskip("ament_flake8.main", reason="ament_flake8 is not installed")
     # Its workers are forked, which a process must not do that other tests have given threads.

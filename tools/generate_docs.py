@@ -3,6 +3,7 @@
 """Write config/*.yaml, docs/parameters.md, docs/topics.md and tables of docs/methods.md and front_end.md from the code.
 
 docs/thesis.md and docs/open_problems.md are written from docs/thesis_results.json, which `ba thesis --all` makes,
+and docs/thesis_second_run.json, verdicts.json of such a run with the kernels and the BLAS of another processor;
 docs/robustness.md from docs/robustness_results.json, which is results.json of `ba robustness`.
 
 Run it without arguments to write them, with --check to learn whether they are up to date (exit code 1 if not).
@@ -167,6 +168,7 @@ def front_end_yaml() -> str:
 def pages() -> dict[str, str]:
     """Return the content of every generated file by its path from the root."""
     results = json.loads((ROOT / "docs" / "thesis_results.json").read_text(encoding="utf-8"))
+    second = json.loads((ROOT / "docs" / "thesis_second_run.json").read_text(encoding="utf-8"))
     robustness = json.loads((ROOT / "docs" / "robustness_results.json").read_text(encoding="utf-8"))
     note = f"<!-- Written by `{MADE_BY}`: do not edit. -->\n\n"
     front_end_table = parameters_markdown(of_the_front_end(FrontEndNodeOptions, FrontEndOptions))
@@ -176,7 +178,7 @@ def pages() -> dict[str, str]:
         "docs/methods.md": renewed("methods.md", methods_tables()),
         "docs/front_end.md": renewed("front_end.md", front_end_table),
         "config/ba_front_end.yaml": front_end_yaml(),
-        "docs/thesis.md": note + claims_page(results),
+        "docs/thesis.md": note + claims_page(results, second),
         "docs/open_problems.md": note + open_page(results),
         "docs/robustness.md": note + robustness_page(robustness),
         "docs/topics.md": note + topics_markdown(),

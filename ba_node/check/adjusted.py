@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 
 from ba_node.arrays import FloatArray
-from ba_node.check.relations import Relation, spread
+from ba_node.check.relations import GIVE_WAY, Relation, spread
 from ba_node.check.tracks import Tracks
 from ba_node.config import SolverOptions
 from ba_node.core import bordered, cameras, geometry, methods, native_kernels, solver, triangulation
@@ -38,6 +38,9 @@ _PATIENT = dataclasses.replace(_NARROW, max_iterations=60, function_tolerance=1e
 _ALONG = dataclasses.replace(_PATIENT, trust_region="none", schur="points", annealing="none", kernels="numpy")
 # Of each unknown, relative, so that what the tracks do not tell at all has a large standard deviation.
 _DAMPING = 1e-9
+# Where a step of focal length and principal point and its standard deviations come to less, in focal lengths, the
+# given ones stand, and no more steps are taken. A third of what is named, see intrinsics.py.
+_AT_ONCE = 0.007
 # Distance of a point that has none, in diameters of the path.
 _FAR = 20.0
 # Residuals beyond this many of the usual ones with the given model are mismatches.
@@ -167,22 +170,32 @@ class Freed:
         basis = (focal[:, None, None] * np.eye(3)).reshape(3 * n, 3)
         shared = bordered.Shared(tuple(unknowns), basis)
         problem = _placed(dataclasses.replace(start.problem, start=start.state))
+        self.params, self.state, self.norms = rig.params, start.state, start.norms
         with np.errstate(all="ignore"):
-            _, end = bordered.solve_shared(problem, shared, _ALONG)
-            at = dataclasses.replace(problem, start=end, cameras=end.cameras)
-            kernels = bordered.SharedKernels(at, _ALONG, shared)
-            kernels.linearise(kernels.start)
-            system = kernels.damp("diag", _DAMPING)
-            assert isinstance(system, bordered.BorderedSystem)
-            values, vectors = np.linalg.eigh(system.of_border())
-        self.params = end.cameras.params
-        self.state = State(end.rotation, end.translation, end.points, end.intrinsics)
-        self.norms = native_kernels.residual_norms(dataclasses.replace(problem, cameras=end.cameras), self.state)
-        self.sigma = np.median(self.norms) * np.sqrt((vectors**2) @ (1.0 / np.maximum(values, 1e-12)))
+            step, self.sigma = self._told(problem, shared)
+            if not (np.abs(step) + self.sigma).max() < _AT_ONCE:
+                _, end = bordered.solve_shared(problem, shared, _ALONG)
+                at = dataclasses.replace(problem, start=end, cameras=end.cameras)
+                self.params = end.cameras.params
+                self.state = State(end.rotation, end.translation, end.points, end.intrinsics)
+                self.norms = native_kernels.residual_norms(at, self.state)
+                _, self.sigma = self._told(at, shared)
+
+    def _told(self, problem: Problem, shared: bordered.Shared) -> tuple[FloatArray, FloatArray]:
+        """Return a Gauss-Newton step of what is free, and its standard deviations, (3,) focal lengths each."""
+        kernels = bordered.SharedKernels(problem, _ALONG, shared)
+        kernels.linearise(kernels.start)
+        system = kernels.damp("diag", _DAMPING)
+        assert isinstance(system, bordered.BorderedSystem)
+        values, vectors = np.linalg.eigh(system.of_border())
+        sigma = np.median(self.norms) * np.sqrt((vectors**2) @ (1.0 / np.maximum(values, 1e-12)))
+        step = system.solve_dense()
+        return np.full(3, np.inf) if step is None else step[-3:], sigma
 
 
 def _placed(problem: Problem) -> Problem:
     """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
+    GIVE_WAY.get()()
     rays, n = triangulation.rays_of(problem), problem.n_points
     if not len(rays.point):
         return problem

@@ -146,12 +146,14 @@ def _explained(cost: float) -> float:
 
 def _freed(problem: Problem, given: Adjusted, measure: Measure, tracks: Tracks) -> Freed:
     """Return the adjustment whose cameras are free; where those given are far off, from several others on too."""
-    starts = [given]
+    found = [Freed(given)]
     if measure.noise > LARGE:
-        params = tracks.cameras.params
-        scaled = [_scaled(params, factor) for factor in _FACTORS]
-        starts += [Adjusted(problem, one) for one in (*scaled, *(size.params for size in other_sizes(tracks)))]
-    return min((Freed(one) for one in starts), key=measure)
+        scaled = [_scaled(tracks.cameras.params, factor) for factor in _FACTORS]
+        for params in (*scaled, *(size.params for size in other_sizes(tracks))):
+            if np.median(found[-1].norms) < LARGE:
+                break  # these explain the tracks: no others do so much better
+            found.append(Freed(Adjusted(problem, params)))
+    return min(found, key=measure)
 
 
 def _named(tracks: Tracks, free: Freed) -> Model | None:

@@ -15,7 +15,7 @@ from ba_node.check.diagnosis import Diagnosis, Finding, Row
 from ba_node.check.mistakes import FLIPS, IN_MOTION, LAGS, Flip, Mistake, finding
 from ba_node.check.relations import Relation, agreed
 from ba_node.check.tracks import Tracks
-from ba_node.check.two_view import Pose
+from ba_node.check.two_view import Pair, Pose
 from ba_node.core import geometry
 
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
@@ -63,6 +63,8 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
 
 def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis | None:
     """Tell of mistakes that show where the camera turns; None if turns do not say so."""
+    if np.count_nonzero(now.rotation > _DIFFERENT_DEG) < _TURNS:
+        return None  # nothing can be so much nearer
     tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in LAGS}
     for flip in FLIPS:
         tried[flip] = compare(tracks, flipped(usable, flip))
@@ -101,9 +103,11 @@ def _turned(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row])
     """Tell of a camera that is turned against the body, or its principal point off; None if steps do not say so."""
     turn = _turn(tracks, usable)
     degrees = float(np.degrees(np.linalg.norm(geometry.so3_log(turn))))
-    turned = compare(tracks, usable, turn)
     least = _BESIDE_DEG if agreed(usable) else _DOUBTFUL_DEG
-    if len(usable) < 2 * _PAIRS_NEEDED or degrees < least or not now.loses_to(turned):
+    if len(usable) < 2 * _PAIRS_NEEDED or degrees < least:
+        return None
+    turned = compare(tracks, usable, turn)
+    if not now.loses_to(turned):
         return None
     rows.append(turned.row(rows[0].test, f"cameras turned by {degrees:.0f} degrees"))
     cause = f"camera 0 does not fit its place on the body by about {degrees:.0f} degrees"
@@ -114,12 +118,12 @@ def _turned(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row])
 
 @dataclass(frozen=True)
 class Steps:
-    """How far a set-up is off the tracks, a row a pair of images: degrees; length of its steps; share explained."""
+    """How far a set-up is off the tracks, a row a pair of images."""
 
-    rotation: FloatArray
-    direction: FloatArray
-    length: FloatArray
-    share: FloatArray
+    steps: list[tuple[Pair, Pose]]  # rays, and the step of the set-up
+    rotation: FloatArray  # (n,) degrees
+    direction: FloatArray  # (n,) the same
+    length: FloatArray  # (n,) of the step, m
 
     @property
     def off(self) -> FloatArray:
@@ -141,21 +145,20 @@ class Steps:
 
     def row(self, test: str, name: str) -> Row:
         """Return it for the table."""
-        return Row(
-            test, name, float(np.mean(self.share)), float(np.median(self.rotation)), float(np.median(self.direction))
-        )
+        share = float(np.mean([two_view.share(*step) for step in self.steps]))
+        return Row(test, name, share, float(np.median(self.rotation)), float(np.median(self.direction)))
 
 
 def compare(given: Tracks, relations: list[Relation], turn: FloatArray | None = None) -> Steps:
     """Return how far a set-up is off the tracks, with its cameras turned by a rotation (3, 3) if there is one."""
-    rows = []
+    rows, steps = [], []
     for one in relations:
         step = given.between_images(one.a, one.b)
         if turn is not None:
             step = Pose(turn @ step.rotation @ turn.T, turn @ step.translation)
-        off = step.direction_from(one.pose)
-        rows.append((step.turned_from(one.pose), off, np.linalg.norm(step.translation), two_view.share(one.pair, step)))
-    return Steps(*np.array(rows).reshape(-1, 4).T)
+        rows.append((step.turned_from(one.pose), step.direction_from(one.pose), np.linalg.norm(step.translation)))
+        steps.append((one.pair, step))
+    return Steps(steps, *np.array(rows).reshape(-1, 3).T)
 
 
 def flipped(relations: list[Relation], flip: Flip) -> list[Relation]:

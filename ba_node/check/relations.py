@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +24,8 @@ _GAPS = (8, 5, 3, 2, 1)
 # Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
 # is estimated, and nothing but the usual mistakes of placement is told.
 AGREED = 0.7
+# Called between steps of a few milliseconds: a check that runs beside solves waits here until there is time.
+GIVE_WAY: ContextVar[Callable[[], object]] = ContextVar("GIVE_WAY", default=lambda: None)
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Relation:
 
 def relate(tracks: Tracks, a: Image, b: Image, rows: tuple[IntArray, IntArray]) -> Relation | None:
     """Return the relation of two images (of two cameras: of all keyframes that the rows are of)."""
+    GIVE_WAY.get()()
     pair = rays(tracks, rows)
     pose = two_view.estimate(pair)
     if pose is None:

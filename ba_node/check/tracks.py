@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +43,26 @@ class Tracks:
     uv: FloatArray  # (n_obs, 2) px
     sigma_px: FloatArray  # (n_obs,)
     depth_m: FloatArray  # (n_obs,) NaN for none
-    ray: FloatArray  # (n_obs, 2) X/Z and Y/Z; NaN where there is none
-    images: dict[Image, IntArray]  # rows of each image (keyframe, camera), by track
 
     def __len__(self) -> int:
         return len(self.position)
+
+    @cached_property
+    def ray(self) -> FloatArray:
+        """Return X/Z and Y/Z, (n_obs, 2); NaN where there is none."""
+        ray = camera_models.normalise(self.uv, self.cameras.model[self.camera], self.cameras.params[self.camera])
+        with np.errstate(invalid="ignore"):
+            usable = np.asarray((ray * ray).sum(axis=1) <= _MAX_RAY**2)
+        return np.where(usable[:, None], ray, np.nan)
+
+    @cached_property
+    def images(self) -> dict[Image, IntArray]:
+        """Return the rows of each image (keyframe, camera) that have a ray, by track."""
+        rows = np.flatnonzero(np.isfinite(self.ray[:, 0]))
+        rows = rows[np.lexsort((self.track[rows], self.camera[rows], self.keyframe[rows]))]
+        ends = np.flatnonzero((np.diff(self.keyframe[rows]) != 0) | (np.diff(self.camera[rows]) != 0)) + 1
+        parts = np.split(rows, ends)
+        return {(int(self.keyframe[part[0]]), int(self.camera[part[0]])): part for part in parts if len(part)}
 
     def match(self, a: Image, b: Image) -> tuple[IntArray, IntArray]:
         """Return the rows of the tracks that two images share, in the same order: two (n,)."""
@@ -76,10 +92,7 @@ class Tracks:
     def seen(self, uv: FloatArray | None = None, params: FloatArray | None = None) -> Tracks:
         """Return the same with other pixels (n_obs, 2), or seen through cameras with other intrinsics (n_cam, 12)."""
         cameras = self.cameras if params is None else dataclasses.replace(self.cameras, params=params)
-        uv = self.uv if uv is None else uv
-        ray = _rays(cameras, self.camera, uv)
-        images = _images(self.keyframe, self.camera, self.track, ray)
-        return dataclasses.replace(self, cameras=cameras, uv=uv, ray=ray, images=images)
+        return dataclasses.replace(self, cameras=cameras, uv=self.uv if uv is None else uv)
 
     def between_cameras(self, a: int, b: int) -> Pose:
         """Return camera b from camera a, as given."""
@@ -110,38 +123,18 @@ def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:
     rows = np.flatnonzero(place[table.keyframe] >= 0)
     if cameras is None or not len(rows):
         return None
-    keyframe, camera = place[table.keyframe[rows]], table.camera[rows].astype(np.intp)
-    track, uv = table.landmark[rows].astype(np.intp), table.uv[rows].astype(float)
-    ray = _rays(cameras, camera, uv)
     return Tracks(
         scene.keyframes.stamp_ns[order],
         scene.keyframes.input_rotation[order],
         scene.keyframes.input_position[order],
         cameras,
-        keyframe,
-        camera,
-        track,
-        uv,
+        place[table.keyframe[rows]],
+        table.camera[rows].astype(np.intp),
+        table.landmark[rows].astype(np.intp),
+        table.uv[rows].astype(float),
         table.sigma_px[rows].astype(float),
         table.depth_m[rows].astype(float),
-        ray,
-        _images(keyframe, camera, track, ray),
     )
-
-
-def _images(keyframe: IntArray, camera: IntArray, track: IntArray, ray: FloatArray) -> dict[Image, IntArray]:
-    """Return the rows of each image that have a ray, by track."""
-    rows = np.flatnonzero(np.isfinite(ray[:, 0]))
-    rows = rows[np.lexsort((track[rows], camera[rows], keyframe[rows]))]
-    ends = np.flatnonzero((np.diff(keyframe[rows]) != 0) | (np.diff(camera[rows]) != 0)) + 1
-    return {(int(keyframe[part[0]]), int(camera[part[0]])): part for part in np.split(rows, ends) if len(part)}
-
-
-def _rays(cameras: Cameras, camera: IntArray, uv: FloatArray) -> FloatArray:
-    ray = camera_models.normalise(uv, cameras.model[camera], cameras.params[camera])
-    with np.errstate(invalid="ignore"):
-        usable = np.asarray((ray * ray).sum(axis=1) <= _MAX_RAY**2)
-    return np.where(usable[:, None], ray, np.nan)
 
 
 def _focal(cameras: Cameras) -> FloatArray:

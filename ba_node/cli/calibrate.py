@@ -21,6 +21,7 @@ from ba_node.cli.console import (
     parameters,
     progress_bar,
     topic_choice,
+    write_result,
 )
 
 EXAMPLE = "ba calibrate bags/stereo_loop.mcap --out out/rig.yaml --refine intrinsics extrinsics"
@@ -56,4 +57,6 @@ def run(args: argparse.Namespace) -> int:
     rows = [("keyframes", str(refined.keyframes)), ("rms without outliers", f"{refined.rms_px[-1]:.3f} px")]
     print(facts([*rows, *((f"camera {i}", text) for i, text in enumerate(refined.found.lines()))]))
     print(f"written to {args.out}")
+    found = {"keyframes": refined.keyframes, "rms_px": refined.rms_px, "parameters": refined.found.as_dicts()}
+    write_result(args.json, found)
     return 0 if any(one.told for one in refined.found.parameters) else NOTHING_TOLD

@@ -166,8 +166,7 @@ def build_parser(command: str) -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         module.add_arguments(sub)
-        if name not in _EXPERIMENTS:
-            add_json_option(sub)
+        add_json_option(sub)
     return parser
 
 

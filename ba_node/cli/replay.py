@@ -124,7 +124,9 @@ def run(args: argparse.Namespace) -> int:
     else:
         from ba_node.offline.report import show  # noqa: PLC0415
 
-        print(f"written to {args.out}: {show(args.out)}")
+        with progress_bar("report", "figures") as progress:
+            written = show(args.out, progress)
+        print(f"written to {args.out}: {written}")
     write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
 
@@ -200,42 +202,32 @@ def _named(row: Mapping[str, Any]) -> str:
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    statuses = report["solves_by_status"]
+    """Return what came out, then how."""
+    statuses = ", ".join(f"{n} {name.lower()}" for name, n in report["solves_by_status"].items())
+    older = ", ".join(f"{old['keyframes']} keyframes in {old['folder']}" for old in report["older_sessions"])
+    rejected = ", ".join(f"{n} {reason}" for reason, n in _rejected(report).items())
+    error = report.get("trajectory_error_m")
     rows = [
-        ("topics", ", ".join(report["topics_taken"].values())),
-        *(("left aside", f"{topic}: {reason}") for topic, reason in report["topics_left"].items()),
-        *(("adjusted", note) for note in report["cameras_adjusted"]),
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
-        *(
-            ("not refined", report["unrefined"])
-            for _ in range(bool(report["unrefined"] and report["keyframes_refined"]))
-        ),
+        ("not refined", report["unrefined"] if report["keyframes_refined"] else ""),
+        ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)" if error else ""),
         ("landmarks", f"{report['landmarks']} from {report['observations']} observations"),
         *((label, _change(report[key])) for label, key in _ERRORS),
         *_behind(report["observations_behind"]),
         ("rms without outliers", _short(report["rms_px_without_outliers"]["refined"])),
-        (
-            "solves",
-            f"{report['solves']} ({', '.join(f'{n} {name.lower()}' for name, n in statuses.items()) or 'none'})",
-        ),
-        ("time in the solver", f"{report['solver_time_s']:.2f} s, slowest {1e3 * report['slowest_solve_s']:.0f} ms"),
+        *((f"camera {i}", text) for i, text in enumerate(report.get("cameras_refined", []))),
         ("outliers left out", str(report["outliers"])),
-        ("rejected", ", ".join(f"{n} {reason}" for reason, n in _rejected(report).items()) or "nothing"),
+        ("rejected", rejected or "nothing"),
+        ("topics", ", ".join(report["topics_taken"].values())),
+        *(("left aside", f"{topic}: {reason}") for topic, reason in report["topics_left"].items()),
+        *(("adjusted", note) for note in report["cameras_adjusted"]),
+        ("solves", f"{report['solves']} ({statuses or 'none'})"),
+        ("time in the solver", f"{report['solver_time_s']:.2f} s, slowest {1e3 * report['slowest_solve_s']:.0f} ms"),
+        ("older sessions", older),
     ]
-    error = report.get("trajectory_error_m")
-    if error:
-        rows.insert(-4, ("error to ground truth", f"{error['input']:.3f} -> {error['refined']:.3f} m (rmse, se3)"))
-    rows += [(f"camera {i}", text) for i, text in enumerate(report.get("cameras_refined", []))]
-    if report["older_sessions"]:
-        rows.append(
-            (
-                "older sessions",
-                ", ".join(f"{old['keyframes']} keyframes in {old['folder']}" for old in report["older_sessions"]),
-            )
-        )
     if report["known_already"]:
         rows.append(("in the loaded map", f"{report['known_already']} keyframes of the recording already"))
-    return rows
+    return [row for row in rows if row[1]]
 
 
 def _change(of: Mapping[str, float | None]) -> str:

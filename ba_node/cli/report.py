@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import require_folder
+from ba_node.cli.console import progress_bar, require_folder, write_result
 
 EXAMPLE = "ba report out/default out/tuned --out compare.html"
 
@@ -29,5 +29,9 @@ def run(args: argparse.Namespace) -> int:
 
     require_folder(args.out)
     path = args.out or (args.folders[0] / REPORT if len(args.folders) == 1 else Path(REPORT))
-    print(f"written to {path.parent}: {write_report(args.folders, path)}")
+    with progress_bar("report", "figures") as progress:
+        written = write_report(args.folders, path, progress)
+    print(f"written to {path.parent}: {written}")
+    page = str(path) if path.is_file() else None
+    write_result(args.json, {"page": page, "pictures": str(path.with_suffix(""))})
     return 0

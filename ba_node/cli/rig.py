@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ba_node.cli import interrupts
-from ba_node.cli.console import TargetError, facts, require_folder
+from ba_node.cli.console import TargetError, facts, require_folder, write_result
 
 if TYPE_CHECKING:
     from ba_node.measurements import CameraRig
@@ -39,6 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show, convert or publish."""
+    import yaml  # noqa: PLC0415
+
     from ba_node.io.files import whole_file  # noqa: PLC0415
     from ba_node.io.rig_file import rig_yaml  # noqa: PLC0415
     from ba_node.offline.rig import load_rig  # noqa: PLC0415
@@ -57,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
         print("---\n".join(texts), end="")
     if not args.to and not args.out:
         print(_shown(rig))
+    write_result(args.json, yaml.safe_load(rig_yaml(rig, "own")[0]))
     if args.publish:
         from ba_node.ros.tools.play import publish_rig, take_leave  # noqa: PLC0415
 

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from ba_node.cli import check, replay, track
-from ba_node.cli.console import add_parameter_options, progress_bar
+from ba_node.cli.console import add_parameter_options, progress_bar, write_result
 
 EXAMPLE = "ba run drive.mcap --out out/drive\n  ba run kitti/sequences/07 --out out/kitti07"
 
@@ -52,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
     codes.append(_call(replay, [str(tracks), "--out", str(args.out), "--final-optimize", *page, *parameters]))
     # Too little to check is no fault of what was tracked.
     codes[1] = 0 if codes[1] == check.TOO_LITTLE else codes[1]
+    by_name = dict(zip(("track", "check", "replay"), codes, strict=True))
+    write_result(args.json, {"track": report, "exit_codes": by_name})
     return max(codes, key=lambda code: (code == 2, code))
 
 

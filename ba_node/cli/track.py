@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ba_node.cli.console import TargetError, facts, progress_bar, require_mcap
+from ba_node.cli.console import TargetError, facts, progress_bar, require_mcap, write_result
 
 if TYPE_CHECKING:
     from ba_node.config.front_end import FrontEndOptions
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EXAMPLE = "ba track drive.mcap tracks.mcap\n  ba track kitti/sequences/07 tracks.mcap --track max_features=500"
 ATTENTION = 3
 # What is said and is no fault.
-_HARMLESS = "one camera without odometry"
+_HARMLESS = ("one camera without odometry", "the second camera is turned")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         report = track(args.source, args.out, request(args), time.process_time, progress)
     tell(report)
     print(f"written to {args.out}")
+    write_result(args.json, report)
     return ATTENTION if attention(report) else 0
 
 

@@ -15,7 +15,7 @@ class WindowConfig:
 
     max_keyframes: int = option(
         20,
-        "Newest keyframes whose poses are refined in each solve.",
+        "Newest keyframes whose poses are refined in each solve; twice as many of one camera with marginalise.",
         within=(2, 100_000),
         tune=Tune(4, 60, ("accuracy", "latency")),
     )

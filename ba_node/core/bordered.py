@@ -99,7 +99,7 @@ def solve_shared(
         ConfigError: options that cannot be had here: a trust region, PCG, another elimination, f, k1, k2 of each
             keyframe.
     """
-    _require(problem, options)
+    require(problem, options)
     problem.check()
     kernels = SharedKernels(problem, options, shared)
     problem = replace(problem, start=kernels.start)
@@ -108,7 +108,8 @@ def solve_shared(
     return result, result.state
 
 
-def _require(problem: Problem, options: SolverOptions) -> None:
+def require(problem: Problem, options: SolverOptions) -> None:
+    """Raise ConfigError for options with which cameras are not refined."""
     for name, has, needs in (
         ("trust_region", options.trust_region, "none"),
         ("schur", options.schur, "points"),
@@ -281,9 +282,8 @@ class BorderedSystem(NumpySystem):
         return self._reduction.of_border()
 
     def choose(self, asked: str) -> LinearSolver:
-        """Return how to solve systems like this one: dense while it is small."""
-        kind = asked if asked in ("dense", "sparse") else "dense" if len(self.rhs) <= DENSE_LIMIT else "sparse"
-        return LinearSolver(kind, linear_costs.describe(kind, len(self.rhs), None, None))
+        """Return how to solve systems like this one."""
+        return exact_solver(asked, len(self.rhs))
 
     def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return both steps and the reduction of the undamped model, by J p itself."""
@@ -297,6 +297,12 @@ class BorderedSystem(NumpySystem):
         if self._linearisation.factors is not None:
             curvature += self._linearisation.factors.curvature(step_c)
         return step_c, step_p, -float(slope + around.gradient @ z) - 0.5 * curvature
+
+
+def exact_solver(asked: str, n: int) -> LinearSolver:
+    """Return how to solve a bordered system of n unknowns: dense while it is small."""
+    kind = asked if asked in ("dense", "sparse") else "dense" if n <= DENSE_LIMIT else "sparse"
+    return LinearSolver(kind, linear_costs.describe(kind, n, None, None))
 
 
 def moved_cameras(cams: Cameras, unknowns: Sequence[Unknown], theta: FloatArray) -> Cameras:

@@ -16,7 +16,8 @@ Parameters of camera c, in their order:
 - its place on the body, as a local step of camera from body, rotation (rad) and translation (m), against the first
   camera. The place of the first one is held: no track sees where on the body a whole rig sits;
 - its time offset (s): its images show what the body saw so much later than the stamp says, on the way that the
-  keyframes before and after tell. That of the first camera shifts all; those of the others are against the first. The
+  keyframes before and after tell. That of the first camera shifts all, and is held where the way is too rough for the
+  keyframes to tell how velocities change (:func:`_roughness`); those of the others are against the first. The
   pixels are brought to the time of the stamp: ``u - (du/dt) offset`` with ``dX_body/dt = -(omega x X_body) - v``.
 """
 
@@ -48,6 +49,8 @@ _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2")
 _PLACE = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
 _TIME = "time_offset"
 _COLUMNS = dict(zip((*_INTRINSICS, *_PLACE, _TIME), (*range(6), *bordered.PLACE, bordered.TIME), strict=True))
+# The clock of the first camera shows in how velocities change: held where these may be wrong by more than this share.
+_ROUGH = 0.15
 # Standard deviation of fy / fx, which is that of the pixels.
 _NOT_SQUARE = 0.003
 
@@ -76,6 +79,7 @@ class Calibration:
     cameras: Cameras
     time_offset: FloatArray  # (n_cam,) s
     parameters: tuple[Parameter, ...]
+    clock_held: bool = False  # the way is too rough to tell how late the images of the first camera are
 
     def lines(self) -> list[str]:
         """Return what was found, in words: of each camera what was refined, then what the data do not tell."""
@@ -157,10 +161,18 @@ def motion_of(state: State, stamp_s: FloatArray) -> Motion:
         return Motion(np.zeros_like(position), np.zeros_like(position))
     velocity = interpolate.CubicSpline(stamp_s, position)(stamp_s, 1)
     turn = transform.RotationSpline(stamp_s, transform.Rotation.from_matrix(rotation))(stamp_s, 1)
-    straight = (position[2:] - position[:-2]) / (stamp_s[2:] - stamp_s[:-2])[:, None]
-    changes = float(np.sum(np.diff(velocity, axis=0) ** 2))
-    doubt = np.sqrt(np.sum((velocity[1:-1] - straight) ** 2) / changes) if changes > 0.0 else 0.0
-    return Motion((np.swapaxes(rotation, 1, 2) @ velocity[:, :, None])[..., 0], turn, float(doubt))
+    own = (np.swapaxes(rotation, 1, 2) @ velocity[:, :, None])[..., 0]
+    return Motion(own, turn, max(_roughness(own), _roughness(turn)))
+
+
+def _roughness(velocity: FloatArray) -> float:
+    """Return by what share a velocity (n_kf, 3) may be wrong where it changes: 1/4 |second|^2 / |first differences|^2.
+
+    0 where changes go on from keyframe to keyframe; 1/2 for one from a keyframe to the next, of which a spline through
+    the keyframes sees half; 3/4 for noise.
+    """
+    first = float(np.sum(np.diff(velocity, axis=0) ** 2))
+    return 0.25 * float(np.sum(np.diff(velocity, n=2, axis=0) ** 2)) / first if first > 0.0 else 0.0
 
 
 def calibrate(
@@ -173,8 +185,9 @@ def calibrate(
     Returns:
         The problem with the refined cameras and its pixels at the time of the stamps, its solution, and what was found.
     """
-    found = Calibration(problem.cameras, np.zeros(len(problem.cameras.model)), parameters_of(problem, config))
     given, state = problem, _solved(problem, problem.start, _wide(problem, problem.start, options))
+    rough = motion_of(state, stamp_s).doubt > _ROUGH
+    found = Calibration(problem.cameras, np.zeros(len(problem.cameras.model)), parameters_of(problem, config), rough)
     for _ in range(_ROUNDS):
         before = found
         state, found = _round(given, state, found, stamp_s, options)
@@ -232,7 +245,7 @@ def _round(
     n = len(given.cameras.model)
     late = found.time_offset + bordered.offsets(shared.unknowns, moves @ step, n)
     refined = Cameras(*(values[:n] for values in vars(end.cameras).values()))
-    return point_priors.without(end, given), Calibration(refined, late, parameters)
+    return point_priors.without(end, given), Calibration(refined, late, parameters, found.clock_held)
 
 
 def _unknowns(found: Calibration) -> tuple[bordered.Unknown, ...]:
@@ -240,8 +253,9 @@ def _unknowns(found: Calibration) -> tuple[bordered.Unknown, ...]:
 
 
 def _held(found: Calibration, moves: FloatArray) -> FloatArray:
-    """Return how the numbers of the cameras move (q, q), without the place of the first one."""
-    held = [one.camera == 0 and one.name in _PLACE for one in found.parameters]
+    """Return how the numbers of the cameras move (q, q), without the place of the first one, nor its clock if held."""
+    names = (*_PLACE, _TIME) if found.clock_held else _PLACE
+    held = [one.camera == 0 and one.name in names for one in found.parameters]
     return np.where(np.array(held, bool)[:, None], 0.0, moves)
 
 

@@ -39,6 +39,9 @@ _PCG_STEPS, _PCG_STEPS_OF_STRETCH = 60, 20
 _TWO_LEVEL_STEPS = 20
 # From so many steps of PCG on for the cost of forming S PCG is tried first, for half as many.
 _WORTH_A_TRY = 15
+# And only where the map is so many tracks long at most: on longer ones PCG ends after a step or two by a residual of
+# which the weak modes are next to nothing, and iteration after iteration gains next to nothing too.
+_TRIED_STRETCHES = 4.0
 # No factor may take more memory than this.
 MAX_BYTES = 4.8e9
 
@@ -115,8 +118,12 @@ def pcg_tries(sizes: Sizes) -> int:
     That costs as much as forming S at least. At half the steps that cost as much, a try that fails makes one iteration
     half as long again.
     """
-    steps = _form_s(sizes) / _pcg_step_s(sizes) if sizes.edges else 0.0
-    return int(0.5 * steps) if steps >= _WORTH_A_TRY else 0
+    if not sizes.edges:
+        return 0
+    views = 2.0 * sizes.pairs / sizes.edges - 1.0  # of a point, as a keyframe finds it
+    steps = _form_s(sizes) / _pcg_step_s(sizes)
+    is_long = sizes.unknowns / sizes.block > _TRIED_STRETCHES * views
+    return int(0.5 * steps) if steps >= _WORTH_A_TRY and not is_long else 0
 
 
 def flops(sizes: Sizes, factor: Factor) -> float:

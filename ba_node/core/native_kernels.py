@@ -170,8 +170,8 @@ class NativeSystem:
         self.product = kernel.product
         # These are written in every iteration; S only where it is asked for.
         self._x, self._dense = np.empty(n), np.empty((0, 0))
-        # S, and where its blocks on and above the diagonal go, where their transposes, and of which blocks.
-        self._sparse: tuple[scipy.sparse.bsr_matrix, IntArray, IntArray, IntArray] | None = None
+        # S, and where its blocks on and above the diagonal go, and their transposes, -1 for those of the diagonal.
+        self._sparse: tuple[scipy.sparse.bsr_matrix, IntArray, IntArray] | None = None
 
     def renew(self) -> NativeSystem:
         """Return the system after another reduction."""
@@ -192,20 +192,20 @@ class NativeSystem:
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
         """Return S, block-sparse; the next call writes over it."""
-        blocks, columns, starts = self._kernel.sparse()
         if self._sparse is None:
+            columns, starts = self._kernel.schur_pattern()
             n, rows = len(self.rhs), np.repeat(np.arange(self._kernel.n_free), np.diff(starts))
             above = np.flatnonzero(rows != columns)
             all_rows, all_columns = np.concatenate([rows, columns[above]]), np.concatenate([columns, rows[above]])
             order = np.lexsort((all_columns, all_rows))
-            place = np.argsort(order)
+            place, mirrored = np.argsort(order), np.full(len(rows), -1)
+            mirrored[above] = place[len(rows) :]
             ends = np.searchsorted(all_rows[order], np.arange(self._kernel.n_free + 1))
             data = np.empty((len(order), self._size, self._size))
             matrix = scipy.sparse.bsr_matrix((data, all_columns[order], ends), shape=(n, n))
-            self._sparse = matrix, place[: len(rows)], place[len(rows) :], above
-        matrix, place, mirrored, above = self._sparse
-        matrix.data[place] = blocks
-        matrix.data[mirrored] = np.swapaxes(blocks[above], 1, 2)
+            self._sparse = matrix, place[: len(rows)], mirrored
+        matrix, place, mirrored = self._sparse
+        self._kernel.sparse(place, mirrored, matrix.data)
         return matrix
 
     def sizes(self) -> Sizes:
@@ -232,7 +232,7 @@ class NativeSystem:
 
     def _pcg(self, sizes: Sizes) -> LinearSolver:
         text = linear_costs.describe("pcg", sizes.unknowns, None, None)
-        return LinearSolver("pcg", text, linear_costs.preconditioner(sizes, self._kernel.schur_blocks()))
+        return LinearSolver("pcg", text, linear_costs.preconditioner(sizes, len(self._kernel.schur_pattern()[0])))
 
     def pcg_tries(self) -> int:
         """Return how many steps of PCG to try before an exact solution."""

@@ -184,11 +184,7 @@ class NumpySystem:
 
     def solve_sparse(self) -> FloatArray | None:
         """Return the solution by scipy's sparse factorisation; None if S is not positive definite."""
-        matrix = self.sparse()
-        n = len(self.rhs)
-        if matrix.nnz > _DENSE_SHARE * n * n and 8.0 * n * n <= linear_costs.MAX_BYTES:
-            return linear.cholesky(np.asarray(matrix.toarray()), self.rhs).x
-        return linear.cholesky(matrix, self.rhs).x
+        return solve_factored(self.sparse(), self.rhs)
 
     def back_substitute(self, x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return both steps and the reduction of the undamped model, by J p itself."""
@@ -199,6 +195,14 @@ class NumpySystem:
         if self._linearisation.factors is not None:
             curvature += self._linearisation.factors.curvature(step_c)
         return step_c, step_p, -float(slope) - 0.5 * curvature
+
+
+def solve_factored(matrix: scipy.sparse.spmatrix, rhs: FloatArray) -> FloatArray | None:
+    """Return the solution by factorisation, a dense one if the matrix is full; None if it is not positive definite."""
+    n = len(rhs)
+    if matrix.nnz > _DENSE_SHARE * n * n and 8.0 * n * n <= linear_costs.MAX_BYTES:
+        return linear.cholesky(np.asarray(matrix.toarray()), rhs).x
+    return linear.cholesky(matrix, rhs).x
 
 
 class _Operator(Protocol):

@@ -144,15 +144,11 @@ class Objective:
 
     def value(self, state: State) -> float:
         """Return the objective 1/2 sum Psi."""
-        return _total(self.costs(state)) + self.factors_value(state)
+        return _total(self._evaluate(state, self._all)[1]) + self.factors_value(state)
 
     def factors_value(self, state: State) -> float:
         """Return what the factors have of the objective."""
         return 0.0 if self.factors is None else self.factors.value(state)
-
-    def costs(self, state: State, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Return Psi of some observations, (n,)."""
-        return self._evaluate(state, self._all.part(rows))[1]
 
     def linearise(self, state: State, rows: PointRows | None = None) -> Linearisation:
         """Return residuals and Jacobians at a state; what is known of all rows there is not worked out again."""

@@ -14,7 +14,9 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import scipy
 
+from ba_node import native
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import linear, linear_costs, native_kernels, scaling
@@ -91,7 +93,7 @@ class RankKernels:
             )
         self._local, self._communicator = native_kernels.make(part, options), communicator
         self.n_free, self.size = self._local.n_free, self._local.size
-        self._two_level = TwoLevel(np.flatnonzero(~part.fixed), communicator)
+        self._two_level, self._factor = TwoLevel(np.flatnonzero(~part.fixed), communicator), SumFactor()
         self.gradient_norm = np.inf
         self._gradient: FloatArray
         self._diagonals: tuple[FloatArray, FloatArray]
@@ -119,7 +121,7 @@ class RankKernels:
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> RankSystem:
         """Add damping to the diagonals and eliminate the points."""
         own = damping_c if self._communicator.rank == 0 else np.zeros_like(damping_c)
-        return RankSystem(self._local.reduce(own, damping_p), self._communicator, self._two_level)
+        return RankSystem(self._local.reduce(own, damping_p), self._communicator, self._two_level, self._factor)
 
     def damp(self, kind: str, mu: float) -> RankSystem:
         """Add mu D, with D a choice of damping, to the diagonals and eliminate the points."""
@@ -143,14 +145,35 @@ class RankKernels:
         return float(self._communicator.sum(np.array([value]))[0]), moved
 
 
+class SumFactor:
+    """The sparse Cholesky factor of S summed over ranks, on rank 0; its structure is found again where that changes."""
+
+    def __init__(self) -> None:
+        self._pattern: tuple[IntArray, IntArray] = (np.empty(0, np.int64), np.empty(0, np.int64))
+        self._compiled: Any = None
+
+    def solve(self, s: scipy.sparse.bsr_matrix, rhs: FloatArray) -> FloatArray | None:
+        """Return the solution of ``S x = rhs``, None if S is not positive definite; scipy's without C++ kernels."""
+        if native.kernels is None:
+            return linear.cholesky(s, rhs).x
+        s.sort_indices()
+        rows = np.repeat(np.arange(len(s.indptr) - 1), np.diff(s.indptr))
+        upper = np.flatnonzero(s.indices >= rows)
+        pattern = s.indices[upper].astype(np.int64), np.searchsorted(rows[upper], np.arange(len(s.indptr)))
+        if self._compiled is None or not all(map(np.array_equal, pattern, self._pattern)):
+            self._compiled, self._pattern = native.kernels.SparseFactor(s.blocksize[0], *pattern), pattern
+        x = rhs.copy()
+        return x if self._compiled.solve(s.data[upper], x) and np.isfinite(x).all() else None
+
+
 class RankSystem:
     """The reduced system of all points, of which each rank has the part that its own points leave."""
 
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, local: System, communicator: Communicator, two_level: TwoLevel) -> None:
-        self.local, self._communicator, self._two_level = local, communicator, two_level
+    def __init__(self, local: System, communicator: Communicator, two_level: TwoLevel, factor: SumFactor) -> None:
+        self.local, self._communicator, self._two_level, self._factor = local, communicator, two_level, factor
         self.rhs: FloatArray = communicator.sum(local.rhs)
 
     def choose(self, asked: str) -> LinearSolver:
@@ -184,12 +207,11 @@ class RankSystem:
         return total(self._communicator, self.local.sparse())
 
     def solve_sparse(self) -> FloatArray | None:
-        """Return the solution by scipy's sparse factorisation, on rank 0; None if S is not positive definite."""
-        matrix = self.sparse()
-        x: FloatArray | None = self._communicator.broadcast(
-            linear.cholesky(matrix, self.rhs).x if self._communicator.rank == 0 else None
-        )
-        return x
+        """Return the solution by sparse Cholesky, on rank 0; None if S is not positive definite."""
+        parts = self._communicator.gather(self.local.sparse())
+        x = None if parts is None else self._factor.solve(sum(parts[1:], parts[0]), self.rhs)
+        found: FloatArray | None = self._communicator.broadcast(x)
+        return found
 
     def solve_pcg(self, kind: str, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool) -> linear.Solution:
         """Return the solution by PCG in the space scaled by 1 / ``scale``, with products summed over ranks."""

@@ -75,12 +75,11 @@ class ReducedSolver:
         if not np.isfinite(radius):
             return 1.0
         d_c, d_p = hessian()
-        kind, by_points = self._options.scaled_space, system.side == "points"
-        # Nearly always so, and quickly seen: |D x| <= max(D) |x|.
-        if kind == "diag" and by_points and max(d_c.max(), 1.0) * (x @ x) <= radius * radius:
-            return 1.0
-        scaled = system.gather(*scaling.scaled_space(kind, (d_c, d_p[:0] if by_points else d_p))) * x
-        return min(1.0, radius / max(float(np.linalg.norm(scaled)), 1e-300))
+        # Points have no part in S where they were eliminated; most maps have many.
+        d_p = d_p[:0] if system.side == "points" else d_p
+        scaled = system.gather(*scaling.scaled_space(self._options.scaled_space, (d_c, d_p))) * x
+        length2 = float(np.einsum("i,i", scaled, scaled))
+        return 1.0 if length2 <= radius * radius else radius / float(np.sqrt(length2))
 
     def _worth_trying(self, system: System) -> int:
         """Return how many steps of PCG to try before an exact solver."""

@@ -44,7 +44,7 @@ _SAVED_RHO = 0.3
 # A loop that has rejected this many steps in a row has nothing left to gain.
 _MAX_REJECTED = 25
 # Where policy fast stops to lower mu: below, mu diag(H) is lost in rounding, and Cholesky of S begins to break down.
-_LEAST_DAMPING = 1e-13
+_LEAST_DAMPING = 1e-14
 
 
 def solve(
@@ -211,9 +211,7 @@ class _Run:
             self.mu, self.nu = max(self.mu * shrink, min(self.mu, _LEAST_DAMPING)), 2.0
         else:
             self.mu, self.nu = self.mu * self.nu, self.nu * 2.0
-        if solution.x is None:  # says nothing of the region
-            pass
-        elif rho < 0.25:
+        if rho < 0.25:
             self.radius *= 0.25
         elif rho > 0.75 and solution.on_boundary:
             self.radius *= 2.0

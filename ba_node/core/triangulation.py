@@ -34,6 +34,8 @@ _LEAST_COSINE = 0.01
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _ROWS, _COLUMNS = np.transpose(_SYMMETRIC)
 _DIAGONAL = np.arange(3)
+# Observations that are worked on at once: a large map's would take a multiple of the memory of their rays.
+_AT_ONCE = 2**17
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,10 @@ class Rays:
 
     def part(self, which: BoolArray) -> Rays:
         """Return some of them."""
-        return Rays(**{item.name: getattr(self, item.name)[which] for item in dataclasses.fields(self)})
+        if which.all():
+            return self
+        rows = np.flatnonzero(which)
+        return Rays(*(getattr(self, item.name).take(rows, axis=0) for item in dataclasses.fields(self)))
 
 
 @dataclass(frozen=True)
@@ -65,25 +70,43 @@ def rays_of(problem: Problem) -> Rays:
     """Return the rays of all observations of a problem at its start poses."""
     obs, cams = problem.observations, problem.cameras
     # Camera centre: x with R x + t = -Rc' tc.
-    turn, n_cam = np.swapaxes(cams.rotation, -1, -2), len(cams.model)
+    turn = np.swapaxes(cams.rotation, -1, -2)
     body_centre = -(turn @ cams.translation[:, :, None])[..., 0]
     world_from_body = np.swapaxes(problem.start.rotation, -1, -2)
     of_image = body_centre - problem.start.translation[:, None, :]
     centres = (world_from_body[:, None] @ of_image[..., None]).reshape(-1, 3)
-    centre = centres.take(obs.keyframe * n_cam + obs.camera, axis=0)
-    params = cams.params.take(obs.camera, axis=0)
-    ray = cameras.rays(obs.uv, cams.model.take(obs.camera), params)
-    in_body = np.swapaxes(cams.rotation[obs.camera], -1, -2) @ ray[:, :, None]
-    direction = (np.swapaxes(problem.start.rotation[obs.keyframe], -1, -2) @ in_body)[..., 0]
+    n = len(obs)
+    if n <= _AT_ONCE:
+        columns = _columns(problem, centres, slice(n))
+    else:
+        columns = tuple(np.empty((n, 3)) if i < 2 else np.empty(n) for i in range(5))
+        for begin in range(0, n, _AT_ONCE):
+            rows = slice(begin, begin + _AT_ONCE)
+            for whole, part in zip(columns, _columns(problem, centres, rows), strict=True):
+                whole[rows] = part
+    rays = Rays(obs.point, *columns)
+    good = np.isfinite(rays.direction[:, 2])
+    return rays if good.all() else rays.part(good)
+
+
+def _columns(problem: Problem, centres: FloatArray, rows: slice) -> tuple[FloatArray, ...]:
+    """Return what rays hold of some observations; a direction is NaN where no ray projects to the pixel.
+
+    ``centres`` are those of the cameras, (n_kf n_cam, 3), by keyframe.
+    """
+    obs, cams = problem.observations, problem.cameras
+    camera, keyframe = obs.camera[rows], obs.keyframe[rows]
+    centre = centres.take(keyframe * len(cams.model) + camera, axis=0)
+    params = cams.params.take(camera, axis=0)
+    ray = cameras.rays(obs.uv[rows], cams.model.take(camera), params)
+    in_body = np.swapaxes(cams.rotation[camera], -1, -2) @ ray[:, :, None]
+    direction = (np.swapaxes(problem.start.rotation[keyframe], -1, -2) @ in_body)[..., 0]
     # A depth is along the axis: of a ray that is across it, or points back, it tells no distance.
     length = 1.0 / np.where(ray[:, 2] > _LEAST_COSINE, ray[:, 2], np.nan)
     focal = np.sqrt(params[:, cameras.FX] * params[:, cameras.FY])
-    has_depth = len(obs.depth_m) > 0
-    depth = obs.depth_m if has_depth else np.full(len(obs), np.nan)
-    sigma = obs.depth_sigma_m if has_depth else np.full(len(obs), np.nan)
-    rays = Rays(obs.point, centre, direction, focal / obs.sigma_px, depth * length, sigma * length)
-    good = np.isfinite(ray[:, 2])
-    return rays if good.all() else rays.part(good)
+    unknown = np.full(len(camera), np.nan)
+    depth, sigma = (obs.depth_m[rows], obs.depth_sigma_m[rows]) if len(obs.depth_m) else (unknown, unknown)
+    return centre, direction, focal / obs.sigma_px[rows], depth * length, sigma * length
 
 
 def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulation:
@@ -117,9 +140,13 @@ def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulati
 
 def errors(rays: Rays, points: FloatArray) -> FloatArray:
     """Return the angle between each ray and its point, (n,) sigmas; inf where the point is behind it or NaN."""
-    away = points.take(rays.point, axis=0) - rays.centre
-    across = _length(_cross(rays.direction, away)) / np.maximum(_length(away), 1e-300)
-    return np.asarray(np.where((rays.direction * away).sum(axis=1) > 0.0, rays.px_per_rad * across, np.inf))
+    out = np.empty(len(rays.point))
+    for begin in range(0, len(out), _AT_ONCE):
+        rows = slice(begin, begin + _AT_ONCE)
+        direction, away = rays.direction[rows], points.take(rays.point[rows], axis=0) - rays.centre[rows]
+        across = _length(_cross(direction, away)) / np.maximum(_length(away), 1e-300)
+        out[rows] = np.where((direction * away).sum(axis=1) > 0.0, rays.px_per_rad[rows] * across, np.inf)
+    return out
 
 
 def parallax(rays: Rays, n_points: int) -> FloatArray:

@@ -52,15 +52,29 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class TrajectoryError:
-    """Absolute error of a trajectory after alignment (Sturm et al., IROS 2012)."""
+class Errors:
+    """Errors in translation and rotation."""
+
+    translation_m: FloatArray  # (n,) distances
+    rotation_deg: FloatArray  # (n,) angles
+
+    @property
+    def translation(self) -> Statistics:
+        """Return the summary of the distances, m."""
+        return Statistics.of(self.translation_m)
+
+    @property
+    def rotation(self) -> Statistics:
+        """Return the summary of the angles, deg."""
+        return Statistics.of(self.rotation_deg)
+
+
+@dataclass(frozen=True)
+class TrajectoryError(Errors):
+    """Absolute error of a trajectory after alignment (Sturm et al., IROS 2012), of each pose to its partner."""
 
     alignment: Alignment  # from the estimate to the reference
     stamp_ns: NDArray[np.int64]  # (n,) of the estimate's poses that have a partner, by time
-    translation_m: FloatArray  # (n,) distance to the partner
-    rotation_deg: FloatArray  # (n,) angle to the partner
-    translation: Statistics  # summary, m
-    rotation: Statistics  # summary, deg
 
 
 def associate(
@@ -146,14 +160,7 @@ def absolute_error_of(paired: Paired) -> TrajectoryError:
     translation = np.linalg.norm(paired.position[0] - paired.position[1], axis=1)
     difference = np.swapaxes(paired.rotation[1], -1, -2) @ paired.rotation[0]
     rotation = np.degrees(np.linalg.norm(so3_log(difference), axis=1))
-    return TrajectoryError(
-        alignment=paired.alignment,
-        stamp_ns=paired.stamp_ns,
-        translation_m=translation,
-        rotation_deg=rotation,
-        translation=Statistics.of(translation),
-        rotation=Statistics.of(rotation),
-    )
+    return TrajectoryError(translation, rotation, paired.alignment, paired.stamp_ns)
 
 
 def _span(name: str, poses: Poses) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.core.geometry import so3_log
 from ba_node.evaluation.alignment import EvaluationError
-from ba_node.evaluation.metrics import Paired, Statistics
+from ba_node.evaluation.metrics import Errors, Paired
 
 # How far the way between two poses may be off the interval, as a share of it, where all pairs are taken.
 _TOLERANCE = 0.1
@@ -40,14 +40,10 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class RelativeError:
-    """Relative error of a trajectory."""
+class RelativeError(Errors):
+    """Relative error of a trajectory, of each pair of poses."""
 
     pairs: IntArray  # (n, 2) rows of the paired poses
-    translation_m: FloatArray  # (n,)
-    rotation_deg: FloatArray  # (n,)
-    translation: Statistics  # summary, m
-    rotation: Statistics  # summary, deg
 
 
 def relative_error(paired: Paired, interval: Interval = Interval()) -> RelativeError:
@@ -75,7 +71,7 @@ def relative_error(paired: Paired, interval: Interval = Interval()) -> RelativeE
     back = np.swapaxes(theirs[0], -1, -2)
     translation = np.linalg.norm((back @ (ours[1] - theirs[1])[..., None])[..., 0], axis=1)
     rotation = np.degrees(np.linalg.norm(so3_log(back @ ours[0]), axis=1))
-    return RelativeError(pairs, translation, rotation, Statistics.of(translation), Statistics.of(rotation))
+    return RelativeError(translation, rotation, pairs)
 
 
 def _motion(

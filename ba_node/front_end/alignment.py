@@ -145,23 +145,26 @@ class StereoAlignment:
         ray, basis = self._rig.rays(pair.before), self.basis(pair.before)
         sigma_d = np.hypot(pair.disparity_sigma, _FLOOR_PX)
         sigma = np.hypot(pair.sigma, _FLOOR_PX)
-        turn = np.zeros(2)
+        turn, d = np.zeros(2), pair.disparity.copy()
         for _ in range(_STEPS):
-            w = (pair.disparity + basis @ turn) / fb
-            m = ray @ motion.rotation.T + motion.translation * w[:, None]
+            # At the disparities that both images make likely: at those measured, whose errors would look like parallax
+            # where there is none, the scale comes out too small and the yaw too large.
+            m = ray @ motion.rotation.T + motion.translation * (d / fb)[:, None]
             z = np.maximum(m[:, 2], 1e-2)
-            error = pair.after - (f * m[:, :2] / z[:, None] + self._rig.centre)
-            by_m = np.zeros((len(w), 2, 3))
+            by_m = np.zeros((len(d), 2, 3))
             by_m[:, 0, 0] = by_m[:, 1, 1] = f / z
             by_m[:, :, 2] = -f * m[:, :2] / (z * z)[:, None]
             by_d = by_m @ motion.translation / fb
+            off = pair.disparity + basis @ turn - d
+            error = pair.after - (f * m[:, :2] / z[:, None] + self._rig.centre) - by_d * off[:, None]
             smear = by_d * sigma_d[:, None]
             covariance = np.eye(2) * (sigma * sigma)[:, None, None] + smear[:, :, None] * smear[:, None]
             inverse = np.linalg.inv(covariance)
+            likely = d + off + sigma_d * np.einsum("ni,nij,nj->n", smear, inverse, error)
             squared = np.einsum("ni,nij,nj->n", error, inverse, error)
             inverse /= (1.0 + squared / 4.0)[:, None, None]
             jacobian = np.concatenate(
-                [-by_m @ geometry.hat(m), by_m * w[:, None, None], by_d[:, :, None] * basis[:, None]], axis=2
+                [-by_m @ geometry.hat(m), by_m * (d / fb)[:, None, None], by_d[:, :, None] * basis[:, None]], axis=2
             )
             weighted = inverse @ jacobian
             H = np.einsum("nik,nil->kl", jacobian, weighted)
@@ -171,7 +174,7 @@ class StereoAlignment:
             step = np.linalg.solve(H + 1e-12 * np.eye(8) * np.trace(H), b)
             rotation = geometry.so3_exp(step[:3])
             motion = Transform(rotation @ motion.rotation, rotation @ motion.translation + step[3:6])
-            turn = turn + step[6:]
+            turn, d = turn + step[6:], likely
             if np.abs(step[6:]).max() < _SMALL_PX:
                 break
         if np.abs(turn).max() > 5.0 * _PRIOR_PX.max():

@@ -21,6 +21,12 @@ from ba_node.measurements import CameraRig
 
 # Depth cameras tell nothing beyond this, m.
 _FARTHEST_M = 1e4
+# How the second camera is turned is known once its yaw is, to so many px; that it is far off, by so many keyframes.
+_SETTLED_PX, _ENOUGH_KEYFRAMES = 0.1, 6
+# Images that are kept until then.
+_MOST_KEPT = 40
+# A turn that is known too late by more, px, spoils the keyframes from before.
+_FAR_OFF_PX = 0.5
 _ALONE = "one camera without odometry: the scale is free, lengths are in units of the first step"
 
 
@@ -165,7 +171,42 @@ class FrontEnd:
         self._stamp_ns = images.stamp_ns if sure else last_ns
         if session is not None and session.alone and odometry is not None:
             self._end("an odometry is there now, whose scale it has")
-        return self._track(usable, odometry, gap_s, sure)
+        told = self._track(usable, odometry, gap_s, sure)
+        return self._settled(told, (usable, odometry, gap_s, sure))
+
+    def _settled(self, told: Tracked, image: tuple[Images, Transform | None, float, bool]) -> Tracked:
+        """Track the first images again where the second camera turns out to be far from where the rig has it.
+
+        Their keyframes were measured before that was known. What moves tells it within some keyframes.
+        """
+        session = self._session
+        if session is None or session.first_images is None or told.state in (State.STANDING, State.LOST):
+            return told
+        alignment, first_images = session.tracker.alignment, session.first_images
+        if len(first_images) >= _MOST_KEPT:
+            del first_images[1::2]  # so many between few keyframes are near enough to each other
+        first_images.append(image)
+        yaw, roll = alignment.turn.tolist()
+        o = session.options
+        far_off = max(abs(yaw - o.stereo_yaw_px), abs(roll - o.stereo_roll_px)) > _FAR_OFF_PX
+        if alignment.sigma[0] > _SETTLED_PX and not (far_off and session.keyframes >= _ENOUGH_KEYFRAMES):
+            return told
+        session.first_images = None
+        if not far_off:
+            return told
+        notes, self._notes = self._notes, []
+        self._forget()
+        self.session_id += 1
+        again = [self._track(*one) for one in first_images]
+        if self._session is None or any(one.state is State.LOST for one in again):
+            self._session, self.session_id, self._notes = session, session.number, notes
+            return told
+        self._session.first_images = None
+        words = f"{yaw:.2f} px of yaw and {roll:.2f} of roll against the rig: session {self.session_id} begins"
+        words += f" with the same {len(again)} images, tracked again; the one before is void"
+        self._notes = [*notes, f"the second camera is turned by {words}"]
+        earlier = tuple(measurement for one in again[:-1] for measurement in one.measurements())
+        return dataclasses.replace(again[-1], earlier=earlier + again[-1].earlier, again=True)
 
     def _track(self, images: Images, odometry: Transform | None, gap_s: float, sure: bool = True) -> Tracked:
         """Go on with the session, or begin one where there is none, or where it is lost for good."""

@@ -62,11 +62,12 @@ class Tracked:
     # Keyframes that became known together with this one, as when one camera alone has moved enough: earlier ones, each
     # followed by its tracks.
     earlier: tuple[Measurement, ...] = ()
+    # The session before is void: this one began with the same images, tracked again, as more is known of the rig.
+    again: bool = False
     notes: tuple[str, ...] = ()  # what a user has to know, a sentence each, told once a cause
 
     def measurements(self) -> tuple[Measurement, ...]:
         """Return what is to be published or recorded, in order: earlier ones, keyframe, tracks, guesses."""
-        if self.keyframe is None:
-            return ()
+        own = () if self.keyframe is None else (self.keyframe, *self.tracks)
         rest = () if self.guesses is None else (self.guesses,)
-        return (*self.earlier, self.keyframe, *self.tracks, *rest)
+        return (*self.earlier, *own, *rest)

@@ -36,6 +36,9 @@ class Session:
         self.lost = 0  # images in a row without a pose
         self.unseen = 0  # images without a pose since the last keyframe
         self.alone = False  # one camera without odometry
+        # What was taken until it is known how the second camera is turned: arguments of ``FrontEnd._track``.
+        learns = options.stereo_align and ideal.baseline
+        self.first_images: list[tuple[Images, Transform | None, float, bool]] | None = [] if learns else None
         self._ideal, self._fixed_frame = ideal, fixed_frame
         self._motion = _IDENTITY  # camera now from camera at the image before
         self._keyframe_pose: Transform | None = None  # fixed frame from body at the last keyframe
@@ -43,7 +46,7 @@ class Session:
         self._waiting_ns = 0
         self._fixed_from_map = _IDENTITY  # changes when the map is refined, so that published poses do not
         self._odometry = odometry  # at the last image that had a pose
-        self._count = 0  # keyframes
+        self.keyframes = 0
         self._known_id = 0  # points up to this id were told as guesses
 
     def begin(self, frame: Frame) -> Content:
@@ -76,7 +79,7 @@ class Session:
             return self.told(State.STARTING, images)
         earlier = self._measurements(self._waiting_ns, first, self._body(tracker.keyframe_pose))
         self._waiting = None
-        content, _ = tracker.keyframe(self._count + 1)
+        content, _ = tracker.keyframe(self.keyframes + 1)
         return self._keyframe(images, content, earlier)
 
     def take(
@@ -102,7 +105,7 @@ class Session:
         if still or not sure:
             state = State.STANDING if shift < _STANDS_PX else State.TRACKING
             return self.told(state, images, found, odometry)
-        content, refined = self.tracker.keyframe(self._count + 1)
+        content, refined = self.tracker.keyframe(self.keyframes + 1)
         return self._keyframe(images, content, (), refined or found, odometry)
 
     def _expected(self, odometry: Transform | None) -> Transform:
@@ -175,8 +178,8 @@ class Session:
 
     def _measurements(self, stamp_ns: int, content: Content, pose: Transform) -> tuple[Measurement, ...]:
         """Return keyframe and tracks, in pixels of the raw images."""
-        self._count += 1
-        ideal, session, number = self._ideal, self.number, self._count
+        self.keyframes += 1
+        ideal, session, number = self._ideal, self.number, self.keyframes
         orientation = geometry.quaternion_from_matrix(pose.rotation)
         told = self._step_covariance(pose)
         keyframe = Keyframe(session, number, stamp_ns, self._fixed_frame, pose.translation, orientation, told)
@@ -202,7 +205,7 @@ class Session:
         if before is None:
             return np.empty(0)
         if self.tracker.given:
-            return covariance.of_step(before.inverse().after(pose)).reshape(-1)
+            return covariance.of_step(before.inverse().after(pose), self.tracker.lengths.noise).reshape(-1)
         return covariance.of_lost(unseen).reshape(-1) if unseen else np.empty(0)
 
     def _guesses(self, content: Content) -> LandmarkGuesses | None:

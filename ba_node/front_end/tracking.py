@@ -20,6 +20,7 @@ from ba_node.config.front_end import FrontEndOptions
 from ba_node.estimate import Transform
 from ba_node.front_end import features, patches, pose
 from ba_node.front_end.alignment import Pair, StereoAlignment
+from ba_node.front_end.covariance import Lengths
 from ba_node.front_end.depths import Depths, measure_depths
 from ba_node.front_end.frame import Frame
 from ba_node.front_end.local_map import LocalMap, Warp
@@ -77,6 +78,7 @@ class Tracker:
         self.pose = _IDENTITY  # camera from map, of the last image
         self.sigma = np.empty(0)  # their standard deviations at the last keyframe, px
         self.given = False  # True where poses come from an odometry
+        self.lengths = Lengths()  # of its steps
         self.shared = 0  # features of the last keyframe
 
     @property
@@ -277,6 +279,7 @@ class Tracker:
             # What the odometry is off shows in every feature: only those that are far from the others are wrong.
             size = pose.errors(self.rig, seen, self.pose)
             size = size * min(1.0, 2.0 / max(float(np.median(size)), 1e-9))
+            self.lengths.compare(self.keyframe_pose, self.pose, pose.refine(self.rig, seen, self.pose)[0])
             refined, covariance = self.pose, np.full((6, 6), np.nan)
         else:
             refined, covariance, size = pose.refine(self.rig, seen, self.pose)

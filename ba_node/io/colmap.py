@@ -8,8 +8,8 @@ pixel less. Rigs of several cameras stay rigs.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,20 +196,38 @@ def _observations(
 def write_colmap(path: Path, world: Any, *, text: bool = False) -> None:
     """Write a model into a folder, which is made if there is none; another model in it is written over.
 
+    On an error none of its files has changed.
+
     Raises:
-        ModelError: the folder cannot be made, or holds something else.
+        ModelError: the folder cannot be made, or holds something else, or there is no room for temporary files.
+        OSError: a file cannot be written.
     """
     if path.exists() and not is_model(path) and (not path.is_dir() or any(path.iterdir())):
         raise ModelError(f"{path}: is there already and is no model of COLMAP: name another folder")
-    with tempfile.TemporaryDirectory(prefix="ba_colmap_") as made:
+    with tempfile.TemporaryDirectory(prefix="ba_colmap_") as made, contextlib.ExitStack() as stack:
         (world.write_text if text else world.write_binary)(made)
         path.mkdir(exist_ok=True)
         for part in sorted(Path(made).iterdir()):
-            with part.open("rb") as source, whole_file(path / part.name) as stream:
-                shutil.copyfileobj(source, stream)
+            _require_written(part)
+            stream = stack.enter_context(whole_file(path / part.name))
+            stream.write(part.read_bytes())
+            stream.flush()  # all are on the disk before the first of them takes its name
     for name in _FILES:
         # What an older model of the other form has left would be read in its place.
         (path / f"{name}{'.bin' if text else '.txt'}").unlink(missing_ok=True)
+
+
+def _require_written(part: Path) -> None:
+    """Raise ModelError if the end of a file is missing: pycolmap does not say when a disk is full."""
+    if part.suffix == ".bin":
+        try:
+            _require_whole(part)
+            return
+        except ModelError:
+            pass
+    elif part.read_bytes()[-1:] == b"\n":
+        return
+    raise ModelError(f"no room for temporary files in {part.parent.parent}: make room, or name another TMPDIR")
 
 
 def to_colmap(model: Reconstruction) -> Any:

@@ -31,7 +31,7 @@ _POSES: dict[str, Callable[[Any], Iterator[tuple[Any, Any]]]] = {
     "nav_msgs/msg/Path": lambda message: ((one.header, one.pose) for one in message.poses),
 }
 _RECORDINGS = (".mcap", ".db3", ".zstd")
-_TRUTH = "ground_truth/pose"
+TRUTH_TOPIC = "ground_truth/pose"
 _MAX_MESSAGES = 10**6
 # A KITTI file has no stamps: poses are numbered, a second apart.
 _SECOND_NS = 1_000_000_000
@@ -57,14 +57,14 @@ def read_pair(estimate: Path, reference: Path, topic: str = "") -> tuple[Poses, 
     return dataclasses.replace(ours, stamp_ns=theirs.stamp_ns), theirs
 
 
-def read_poses(path: Path, topic: str = "") -> Poses:
+def read_poses(path: Path) -> Poses:
     """Return a trajectory of any of the formats, numbered from 0.
 
     Raises:
         TrajectoryError: it cannot be read.
-        BagError: the recording cannot be read, or has no such topic.
+        BagError: the recording cannot be read, or has several topics of poses.
     """
-    return _read(path, topic)[0]
+    return _read(path, "")[0]
 
 
 def _read(path: Path, topic: str) -> tuple[Poses, bool]:
@@ -118,17 +118,28 @@ def _read_topic(path: Path, topic: str) -> Poses:
         found = {name: kind for name, kind in reader.topics.items() if kind in _POSES}
         wanted = [name for name in found if name.lstrip("/") == topic.lstrip("/")]
         if not topic:
-            wanted = [name for name in found if f"/{name}".endswith(f"/{_TRUTH}")] or list(found)
+            wanted = [name for name in found if f"/{name}".endswith(f"/{TRUTH_TOPIC}")] or list(found)
         if len(wanted) != 1:
             there = ", ".join(sorted(found)) or "none"
             raise BagError(f"{path}: name the topic of the reference with --reference-topic; topics of poses: {there}")
-        poses: dict[int, tuple[float, ...]] = {}
-        for name, kind, _, data in itertools.islice(reader.messages(wanted), _MAX_MESSAGES):
-            for header, pose in _POSES[kind](reader.decode(name, data)):
-                position, turn = pose.position, pose.orientation
-                row = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-                poses[stamp_ns_from_message(header.stamp)] = row
-    if not poses:
+        poses = poses_on(reader, wanted[0])
+    if not len(poses):
         raise BagError(f"{path}: topic {wanted[0]} holds no pose")
-    values = np.array(list(poses.values()))
-    return numbered(np.array(list(poses), np.int64), values[:, :3], values[:, 3:])
+    return poses
+
+
+def poses_on(reader: BagReader, topic: str) -> Poses:
+    """Return the poses on a topic of a recording by time, numbered from 0; of equal stamps the last counts.
+
+    Raises:
+        BagError: a message cannot be read.
+    """
+    poses: dict[int, tuple[float, ...]] = {}
+    for name, kind, _, data in itertools.islice(reader.messages([topic]), _MAX_MESSAGES):
+        for header, pose in _POSES[kind](reader.decode(name, data)):
+            position, turn = pose.position, pose.orientation
+            row = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
+            poses[stamp_ns_from_message(header.stamp)] = row
+    stamps = np.array(sorted(poses), np.int64)
+    values = np.array([poses[stamp] for stamp in stamps.tolist()], np.float64).reshape(-1, 7)
+    return numbered(stamps, values[:, :3], values[:, 3:])

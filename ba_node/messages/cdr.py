@@ -17,6 +17,7 @@ and the gap depends on where it begins: at a multiple of 8, but for the first po
 
 from __future__ import annotations
 
+import functools
 import re
 import struct
 from typing import Any
@@ -41,10 +42,9 @@ class Cdr:
 
     def pack(self, layout: str, *values: float) -> None:
         """Append numbers, given by the letters of ``struct``, each aligned to its size; ``3d`` is three of them."""
-        kinds = re.sub(r"(\d+)(.)", lambda found: found[2] * int(found[1]), layout)
-        for kind, value in zip(kinds, values, strict=True):
-            self._align(struct.calcsize(f"<{kind}"))
-            self._append(struct.pack(f"<{kind}", value))
+        for kind, value in zip(_kinds(layout), values, strict=True):
+            self._align(kind.size)
+            self._append(kind.pack(value))
 
     def text(self, text: str) -> None:
         """Append a string."""
@@ -75,11 +75,19 @@ class Cdr:
         return b"".join([_ENCODING, *self._parts])
 
     def _align(self, size: int) -> None:
-        self._append(bytes(-self._size % size))
+        if self._size % size:
+            self._append(bytes(-self._size % size))
 
     def _append(self, data: bytes | memoryview) -> None:
         self._parts.append(data)
         self._size += len(data)
+
+
+@functools.cache
+def _kinds(layout: str) -> tuple[struct.Struct, ...]:
+    """Return the numbers of a layout one by one."""
+    letters = re.sub(r"(\d+)(.)", lambda found: found[2] * int(found[1]), layout)
+    return tuple(struct.Struct(f"<{letter}") for letter in letters)
 
 
 def pose_messages(poses: Poses, frame_id: str) -> list[bytes]:

@@ -107,11 +107,11 @@ class Kernel:
     def rhs(self, out: Doubles) -> None: ...
     def dense(self, out: Doubles) -> None: ...
     def solve(self, out: Doubles) -> bool: ...
-    def sparse(self) -> tuple[Doubles, NDArray[np.int32], Ints]:
-        """Return blocks (n_blocks, d, d), columns and row starts of the upper triangle of S."""
+    def schur_pattern(self) -> tuple[NDArray[np.int32], Ints]:
+        """Return columns and row starts of the upper triangle of S, by blocks."""
 
-    def schur_blocks(self) -> int:
-        """Return how many blocks S has on and above its diagonal."""
+    def sparse(self, place: Ints, mirrored: Ints, out: Doubles) -> None:
+        """Write block k of that to out[place[k]] (d, d), transposed to out[mirrored[k]] unless that is negative."""
 
     def analyse(self, max_blocks: int, max_products: float) -> tuple[bool, int, float]:
         """Return whether the sparse factor meets the limits, its blocks, and products of blocks to find it."""
@@ -123,6 +123,15 @@ class Kernel:
     def product(self, x: Doubles) -> Doubles: ...
     def diagonal_blocks(self) -> Doubles: ...
     def back_substitute(self, step_c: Doubles) -> tuple[Doubles, float]: ...
+
+class SparseFactor:
+    """The sparse Cholesky factor of a symmetric matrix by d x d blocks, d = 6 or 9, given by its upper triangle."""
+
+    def __init__(self, d: int, columns: Ints, starts: Ints) -> None:
+        """Find its structure from the columns of each row, the diagonal first, and where rows start."""
+
+    def solve(self, blocks: Doubles, x: Doubles) -> bool:
+        """Turn the right-hand side x (n d,) into the solution; False if the matrix is not positive definite."""
 
 class RelativePoses:
     """Factors on relative poses, as core.factors.RelativePoses; the arrays are copied."""

@@ -69,7 +69,7 @@ def read_share(path: Path, communicator: Communicator) -> BalShare:
     cuts = together(communicator, lambda: point_cuts(np.cumsum(seen).astype(np.intp), communicator.size))
     cameras = tokens.rows(int(ends[0]), _CAMERA, np.append(0, np.full(communicator.size, n_cameras)))
     cameras = communicator.broadcast(cameras if communicator.rank == 0 else None)
-    points = tokens.rows(int(ends[1]), _POINT, cuts)
+    points = tokens.rows(int(ends[1]), _POINT, cuts).copy()
     del values, tokens
     owner = np.searchsorted(cuts, point, side="right") - 1
     rows = np.concatenate(communicator.exchange([rows[owner == rank] for rank in range(communicator.size)]))
@@ -112,7 +112,8 @@ class _Tokens:
         """Return this rank's rows (n, width) of a table that begins at a number; rank r has rows bounds[r : r + 2]."""
         ends = np.clip(begin + width * bounds - self.first, 0, len(self.own))
         parts = [self.own[a:b] for a, b in itertools.pairwise(ends)]
-        return np.concatenate(self.communicator.exchange(parts)).reshape(-1, width)
+        found = [part for part in self.communicator.exchange(parts) if len(part)]
+        return (found[0] if len(found) == 1 else np.concatenate([*found, np.empty(0)])).reshape(-1, width)
 
 
 def _piece(path: Path, rank: int, size: int) -> FloatArray:

@@ -106,10 +106,13 @@ class Fleet:
     def each(
         self, function: Callable[[Task], Result], tasks: Sequence[Task], failed: Callable[[Task, str], Result]
     ) -> Iterator[tuple[int, Result]]:
-        """Call a function with each task; yield number and result as they come.
+        """Call a function with each task; yield number and result as they come, those of this process one by one.
 
         ``failed`` makes a result of a task that several workers died of.
         """
+        if isinstance(self._executor, _Here):
+            yield from enumerate(map(function, tasks))
+            return
         futures = {self.submit(function, task): n for n, task in enumerate(tasks)}
         for future in as_completed(futures):
             number = futures.pop(future)
@@ -242,6 +245,8 @@ def _fetching(place: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise FleetError(f"{place}: {error}: URLs need fsspec: pip install ba_node[fleet]") from None
+        # fsspec itself says what else to install, for s3:// and others.
+        hint = ": URLs need fsspec: pip install ba_node[fleet]" if (error.name or "").startswith("fsspec") else ""
+        raise FleetError(f"{place}: {error}{hint}") from None
     except Exception as error:  # each store has errors of its own
         raise FleetError(f"{place}: {type(error).__name__}: {error}") from None

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from ba_node.offline.figures import trajectory_figures
 from ba_node.offline.page import Figure
 from ba_node.offline.run_folder import Comparison
 
+Progress = Callable[[int, int], None]
 _DPI = 110
 # Size of one figure, and of one that takes the whole width of a page, inches.
 _SIZE, _WIDE = (7.0, 5.4), (12.0, 5.4)
@@ -25,15 +26,18 @@ _STEPS = {"hv": "steps-post", "hvh": "steps-mid"}
 _SYMBOLS = {"x": "x"}
 
 
-def write_pictures(folder: Path, figures: Sequence[Figure]) -> None:
+def write_pictures(folder: Path, figures: Sequence[Figure], progress: Progress) -> None:
     """Write each figure as KEY.png into a folder, which is made if there is none.
+
+    ``progress`` is called with how many are done, and how many there are.
 
     Raises:
         OSError: a file cannot be written.
     """
     folder.mkdir(exist_ok=True)
-    for figure in figures:
+    for done, figure in enumerate(figures, start=1):
         draw(folder / f"{figure.key}.png", [figure])
+        progress(done, len(figures))
 
 
 def draw_trajectory(path: Path, comparison: Comparison) -> None:

@@ -4,30 +4,26 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-
-import numpy as np
 
 from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import BagError
 from ba_node.io.bag_writer import BagWriter
+from ba_node.io.reference import TRUTH_TOPIC, poses_on
 from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.messages.conversion import InputMessages
-from ba_node.messages.factory import header_message, pose_message, stamp_ns_from_message
+from ba_node.messages.factory import header_message, pose_message
 from ba_node.messages.topics import INPUT_TYPES, TF_STATIC
-from ba_node.messages.transforms import StaticTree
+from ba_node.offline.rig import static_tree
 
-TRUTH_TOPIC = "ground_truth/pose"
 TRUTH_TYPE = "geometry_msgs/msg/PoseStamped"
 # A day at 10 Hz: more is no list of poses of keyframes.
-_MAX_TRUTH = 10**6
 
 
 def record(
@@ -74,9 +70,7 @@ def placed(
     if frames.extrinsics != "tf_static":
         yield from (measurement for _, _, measurement in measurements)
         return
-    tree = StaticTree()
-    for topic, _, _, data in reader.messages([TF_STATIC]):
-        tree.add(reader.decode(topic, data))
+    tree = static_tree(reader)
     for _, _, measurement in measurements:
         if not isinstance(measurement, CameraRig) or measurement.malformed:
             yield measurement
@@ -109,18 +103,10 @@ def _read_truth(reader: BagReader) -> Poses | None:
     ]
     own = f"{reader.taken.get('keyframes', '').rpartition('/')[0]}/{TRUTH_TOPIC}"
     topics.sort(key=lambda topic: topic != own)
-    for topic in topics[:1]:
-        reader.check(topic)
-    raw = reader.messages(topics[:1]) if topics else iter(())
-    messages = [reader.decode(topic, data) for topic, _, _, data in itertools.islice(raw, _MAX_TRUTH)]
-    if not messages:
+    if not topics:
         return None
-    poses = [message.pose for message in messages]
-    stamps = np.array([stamp_ns_from_message(message.header.stamp) for message in messages], dtype=np.int64)
-    order = np.argsort(stamps, kind="stable")
-    position = np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
-    orientation = np.array([(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses])
-    return Poses(np.arange(len(order), dtype=np.uint64), stamps[order], position[order], orientation[order])
+    reader.check(topics[0])
+    return poses_on(reader, topics[0]) or None
 
 
 def _set(message: Any, fields: Mapping[str, Any]) -> None:

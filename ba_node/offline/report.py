@@ -14,16 +14,16 @@ import numpy as np
 from ba_node.config import Config
 from ba_node.offline.figures import figures, verdicts
 from ba_node.offline.page import Page, PageError, html_table, write_page
-from ba_node.offline.pictures import draw_trajectory, write_pictures
+from ba_node.offline.pictures import Progress, draw_trajectory, write_pictures
 from ba_node.offline.run_folder import Run, read_run
 
 REPORT = "report.html"
 
 
-def write_report(folders: Sequence[Path], path: Path) -> str:
+def write_report(folders: Sequence[Path], path: Path, progress: Progress = lambda *_: None) -> str:
     """Write a page of one replay, or of several side by side, and each figure as PNG; return what to say of them.
 
-    The pictures go to a folder beside the page, of the same name without its end.
+    The pictures go to a folder beside the page, of the same name without its end; ``progress`` is called as they come.
 
     Raises:
         RunError: a folder holds no results.
@@ -31,7 +31,7 @@ def write_report(folders: Sequence[Path], path: Path) -> str:
     """
     runs = [read_run(folder, name) for folder, name in zip(folders, _names(folders), strict=True)]
     drawn = figures(runs)
-    write_pictures(path.with_suffix(""), drawn)
+    write_pictures(path.with_suffix(""), drawn, progress)
     head = [_subtitle(runs), *map(_verdict, runs)]
     head.append(_tiles(runs[0]) if len(runs) == 1 else _side_by_side(runs))
     tail = [_guard(run, several=len(runs) > 1) for run in runs] + [_parameters(runs), _origin(runs)]
@@ -44,7 +44,7 @@ def write_report(folders: Sequence[Path], path: Path) -> str:
     return f"{path.name}, {pictures}"
 
 
-def show(folder: Path) -> str:
+def show(folder: Path, progress: Progress = lambda *_: None) -> str:
     """Write page and pictures of a replay into its folder; return what to say of them.
 
     Raises:
@@ -52,7 +52,7 @@ def show(folder: Path) -> str:
         OSError: a file cannot be written.
     """
     draw_trajectory(folder / "trajectory.png", read_run(folder))
-    return f"trajectory.png, {write_report([folder], folder / REPORT)}"
+    return f"trajectory.png, {write_report([folder], folder / REPORT, progress)}"
 
 
 def _names(folders: Sequence[Path]) -> list[str]:

@@ -16,10 +16,11 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
-from ba_node.core.bordered import Shared, Unknown, place_of, solve_shared
+from ba_node.core.bordered import Shared, Unknown, place_of
 from ba_node.core.objective import reprojection_errors, rms_px, squared_errors
 from ba_node.core.problem import Cameras, Problem, State
 from ba_node.core.result import Result
+from ba_node.core.shared_focal import solve_cameras
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration, Poses
 from ba_node.io.colmap import ColmapModel, read_colmap, write_colmap
@@ -60,15 +61,16 @@ class ModelSolution:
     def write(self, path: Path) -> None:
         """Write the model with the solution in its own format; of COLMAP binary, ids and all else are those read.
 
-        What was behind its camera at the start, and so took no part, is no observation there any more, as in COLMAP.
+        What is behind its camera, at the start, so that it took no part, or at the end, is no observation there any
+        more, as in COLMAP: no other program could do anything with it.
         """
         if self.colmap is None:
             write_g2o(path, self.refined())
             return
         left_out = np.zeros(len(self.colmap.views), dtype=bool)
         if self.options.cheirality == "drop":
-            behind = np.isnan(reprojection_errors(self.problem, self.problem.start)[:, 0])
-            left_out[np.argsort(self.model.point, kind="stable")] = behind
+            behind = [np.isnan(reprojection_errors(*end)[:, 0]) for end in self._ends()]
+            left_out[np.argsort(self.model.point, kind="stable")] = np.logical_or(*behind)
         self.colmap.take(self.refined(), left_out)
         write_colmap(path, self.colmap.world)
 
@@ -137,7 +139,7 @@ def solve_model(
     unknowns = tuple(unknowns_of(model, groups))
     ready = clock()
     if unknowns:
-        result, end = solve_shared(problem, Shared(unknowns), options, clock=clock, on_iteration=on_iteration)
+        result, end = solve_cameras(problem, Shared(unknowns), options, clock=clock, on_iteration=on_iteration)
         cameras = end.cameras
     else:
         result, cameras = solve(problem, options, clock=clock, on_iteration=on_iteration), problem.cameras

@@ -3,8 +3,7 @@
 """Track the images of a recording or a folder, and write what comes of it as a recording of keyframes and tracks.
 
 The back-end runs along: what it refines goes back to the tracker, as it does live. The recording holds what the tracker
-told, not what was refined. Where the second camera turns out to be far from where the rig has it, images are tracked
-once more with what was learned.
+told, not what was refined.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.config.front_end import FrontEndOptions
@@ -34,8 +32,6 @@ from ba_node.offline.images import ImageRequest, ImageSource, open_images
 from ba_node.offline.recording import record
 
 _TRUTH = "poses.txt"
-# A second camera that is turned by more, px, spoils the keyframes from before that is known.
-_FAR_OFF_PX = 0.5
 
 
 class TrackError(ValueError):
@@ -71,11 +67,6 @@ def track(
     poses = None if request.odometry is None else _poses(request.odometry)
     with open_images(path, dataclasses.replace(request.images, poses=poses)) as source:
         run = _Run(source, request, clock).track(progress)
-        turn = run.learned()
-        if turn is not None and np.abs(turn).max() > _FAR_OFF_PX and run.keyframes:
-            # The first keyframes were measured before it was known: once more, with what is known now.
-            options = dataclasses.replace(request.options, stereo_yaw_px=float(turn[0]), stereo_roll_px=float(turn[1]))
-            run = _Run(source, dataclasses.replace(request, options=options), clock).track(progress)
         if not run.keyframes:
             why = "; ".join(run.notes) or "no image could be used"
             raise TrackError(f"{path}: no keyframe came of {source.total} images: {why}")
@@ -123,11 +114,6 @@ class _Run:
             self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
         return self
 
-    def learned(self) -> FloatArray | None:
-        """Return yaw and roll of the second camera as learned, px; None of one camera."""
-        turn = None if self._front_end is None else self._front_end.alignment
-        return None if turn is None or len(self.rig) < 2 else turn[0]
-
     def _take(self, images: Images, odometry: Transform | None) -> None:
         """Track images."""
         began = self._clock()
@@ -153,12 +139,15 @@ class _Run:
 
     def _add(self, tracked: Tracked, front_end: FrontEnd) -> None:
         """Keep what came of images, and refine the tracker's map."""
+        if tracked.again:
+            self.keyframes, self.measurements = [], []
+            self._backend.reset()
         for measurement in tracked.measurements():
             if isinstance(measurement, Keyframe):
                 self.keyframes.append(measurement)
             self.measurements.append((self.keyframes[-1].stamp_ns, measurement))
             self._backend.add(measurement)
-        if tracked.keyframe is not None:
+        if tracked.measurements():
             self._backend.flush()
             estimate = self._backend.solve()
             if estimate is not None and estimate.report.status.usable:

@@ -155,9 +155,9 @@ class Sessions:
             return Kind.BACK, keyframe, back
         if row is not None:
             return Kind.REUSED, keyframe, f"{name} has the id of another keyframe"
-        if -ahead_s > late_s(scene):
+        if ahead_s < 0.0 and -ahead_s > late_s(scene):
             return Kind.LATE, keyframe, back
-        if 0.0 < unusual_s(scene) < ahead_s:
+        if limit_s < ahead_s and 0.0 < unusual_s(scene) < ahead_s:
             text = f"{name} is {ahead_s:.1f} s newer than the newest (scene.max_reorder_s = {limit_s:g})"
             return Kind.FORWARD, keyframe, text
         return None

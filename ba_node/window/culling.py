@@ -15,6 +15,7 @@ import numpy as np
 from ba_node.arrays import IntArray
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
+from ba_node.window.old_keyframes import window_size
 
 # So many others have to see a point; so many keyframes are looked at together; views of a point that are looked at.
 _OTHERS, _TOGETHER, _VIEWS = 3, 10, 50
@@ -24,7 +25,7 @@ _LEAST_POINTS = 10
 
 def cull(scene: Scene, config: Config) -> None:
     """Take redundant keyframes out that have left the window and were not looked at yet."""
-    share, end = config.scene.redundant_share, len(scene.keyframes) - config.window.max_keyframes
+    share, end = config.scene.redundant_share, len(scene.keyframes) - window_size(scene, config)
     first = max(1, int(np.searchsorted(scene.keyframes.stamp_ns[scene.order], scene.culled_ns, side="right")))
     if share <= 0.0 or end - first < _TOGETHER:
         return

@@ -48,13 +48,15 @@ def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
     obs, n_kf = problem.observations, problem.n_keyframes
     fixed, unscaled = old.copy(), np.full(n_kf, -1)
     part_of = _parts(problem, tied)
-    shows_scale = _shows_scale(problem)
     has_tie = np.zeros(n_kf, bool)
     has_tie[:-1] |= tied
     has_tie[1:] |= tied
     strong = has_tie | (np.bincount(obs.keyframe, minlength=n_kf) >= _ANCHOR_OBSERVATIONS)
-    for part in np.unique(part_of):
-        members = part_of == part
+    parts = [part_of == part for part in np.unique(part_of)]
+    # To look for what shows the scale takes as long as all the rest; poses that are held and steps show it too.
+    known = all((members & old).any() and (members & has_tie).any() for members in parts)
+    shows_scale = np.zeros(n_kf, bool) if known else _shows_scale(problem)
+    for members in parts:
         free = np.flatnonzero(members & ~old)
         scaled = bool(np.any(shows_scale & members))
         needed = 1 if scaled or np.any(members & has_tie) else 2

@@ -86,7 +86,7 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     rows = np.flatnonzero(doubted.take(point))
     if not len(rows):
         return state
-    views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
+    views = part_of(whole, rows, doubted)
     start = dataclasses.replace(state, points=whole.start.points[doubted])
     before = native_kernels.residual_norms(views, start, kernels)
     support = np.bincount(views.observations.point[before <= gate], minlength=views.n_points)
@@ -227,7 +227,7 @@ def _place_anew(
     rows = np.flatnonzero(doubted.take(point))
     if not len(rows):
         return
-    views = part_of(whole, rows, np.ones(whole.n_keyframes, bool), doubted)
+    views = part_of(whole, rows, doubted)
     found = agreed_points(views, tracks, tracks.outlier_px, kernels)
     start = dataclasses.replace(views.start, points=found.points)
     at = native_kernels.residual_norms(views, start, kernels)

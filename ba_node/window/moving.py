@@ -71,7 +71,7 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     rows = np.flatnonzero(found.take(point))
     if not len(rows):
         return found
-    doubted = part_of(problem, rows, np.ones(problem.n_keyframes, bool), found)
+    doubted = part_of(problem, rows, found)
     places, _ = consensus.triangulate(triangulation.rays_of(doubted), doubted.n_points, _BOUND, kernels)
     at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
     again = native_kernels.residual_norms(doubted, at, kernels) / off.take(doubted.observations.keyframe)

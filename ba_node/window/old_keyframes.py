@@ -11,7 +11,7 @@
   A track that goes on becomes a new point where one keyframe alone places it (several cameras, depths). If it stayed as
   it is, without the views of the keyframe that has left, nothing would tie the window to the way behind it where all
   tracks are long: on a straight road the error was three times as large. With one camera a new point would have no
-  parallax, which costs more; there the view is given up, and such a road drifts.
+  parallax, which costs more; there the view is given up, but by keyframes two windows old: few tracks last so long.
 
 The prior is given up, and the next windows begin as with `fix`, where anything but windows has moved its keyframes: a
 solve of everything, a loop that was closed, solutions that were taken back.
@@ -32,6 +32,9 @@ from ba_node.core.marginalisation import marginalise
 from ba_node.core.problem import Problem, State
 from ba_node.core.rows import DEPTHS, MARGINAL, Rows, rows_of
 from ba_node.scene.scene import Scene
+
+# So many of the newest observations tell whether depths are measured.
+_LOOKED_AT = 100
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,14 @@ class Memory:
         here = keyframe_id[numbers] == self.keyframe_id
         found = self.prior.kept(here, numbers[here])
         return None if found is None else found.moved(origin - self.origin)
+
+
+def window_size(scene: Scene, config: Config) -> int:
+    """Return how many of the newest keyframes are refined: twice as many where one camera's are marginalised."""
+    size = config.window.max_keyframes
+    if config.window.old_keyframes != "marginalise" or scene.cameras is None or len(scene.cameras.model) > 1:
+        return size
+    return size if np.isfinite(scene.observations.depth_m[-_LOOKED_AT:]).any() else 2 * size
 
 
 def note(

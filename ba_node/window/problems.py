@@ -60,30 +60,31 @@ def some_observations(problem: Problem, rows: IntArray) -> Problem:
     return dataclasses.replace(problem, observations=_taken(problem.observations, rows))
 
 
-def part_of(problem: Problem, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> Problem:
-    """Return a problem with some observations, keyframes and points of another.
+def part_of(problem: Problem, rows: IntArray, points: BoolArray, keyframes: BoolArray | None = None) -> Problem:
+    """Return a problem with some observations, points and keyframes (None: all) of another.
 
-    ``rows`` of observations are ascending, all of kept keyframes (n_kf,) and points (n_pt,).
+    ``rows`` of observations are ascending, all of kept points (n_pt,) and keyframes (n_kf,).
     """
-    obs, start = _taken(problem.observations, rows), problem.start
+    start, kept = problem.start, slice(None) if keyframes is None else keyframes
+    of_keyframe = None if keyframes is None else np.cumsum(keyframes) - 1
     return Problem(
-        State(start.rotation[keyframes], start.translation[keyframes], start.points[points], start.intrinsics),
-        problem.fixed[keyframes],
+        State(start.rotation[kept], start.translation[kept], start.points[points], start.intrinsics),
+        problem.fixed[kept],
         problem.cameras,
-        dataclasses.replace(
-            obs,
-            keyframe=(np.cumsum(keyframes) - 1).take(obs.keyframe),
-            point=(np.cumsum(points) - 1).take(obs.point),
-        ),
+        _taken(problem.observations, rows, np.cumsum(points) - 1, of_keyframe),
     )
 
 
-def _taken(obs: Observations, rows: IntArray) -> Observations:
+def _taken(
+    obs: Observations, rows: IntArray, of_point: IntArray | None = None, of_keyframe: IntArray | None = None
+) -> Observations:
+    """Return some observations; (n_pt,) and (n_kf,) are the new numbers of points and keyframes, None for the old."""
     has_depth = len(obs.depth_m) > 0
+    keyframe, point = obs.keyframe.take(rows), obs.point.take(rows)
     return Observations(
-        obs.keyframe.take(rows),
+        keyframe if of_keyframe is None else of_keyframe.take(keyframe),
         obs.camera.take(rows),
-        obs.point.take(rows),
+        point if of_point is None else of_point.take(point),
         obs.uv.take(rows, axis=0),
         obs.sigma_px.take(rows),
         obs.depth_m.take(rows) if has_depth else obs.depth_m,

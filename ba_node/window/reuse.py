@@ -16,7 +16,7 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import consensus, triangulation
 from ba_node.core.problem import Problem
 from ba_node.scene.scene import Scene
-from ba_node.window.problems import part_of
+from ba_node.window.problems import some_observations
 from ba_node.window.selection import Selection
 
 # Views of either run: two may agree by chance, but where ids are known to be used again that is the better explanation.
@@ -117,7 +117,7 @@ def _keyframes_of(track: IntArray, keyframe: IntArray, n: int) -> IntArray:
 
 def _agrees(whole: Problem, rows: IntArray, gate: float, kernels: str) -> BoolArray:
     """Return for each point whether most of some of its views agree with each other."""
-    rays = triangulation.rays_of(part_of(whole, rows, np.ones(whole.n_keyframes, bool), np.ones(whole.n_points, bool)))
+    rays = triangulation.rays_of(some_observations(whole, rows))
     agree = consensus.agreeing(rays, whole.n_points, gate, kernels)
     views = np.bincount(whole.observations.point[rows], minlength=whole.n_points)
     return np.asarray(np.bincount(rays.point, agree, whole.n_points) >= _AGREEING * views)

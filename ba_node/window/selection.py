@@ -96,7 +96,7 @@ class _Part:
 
     def only(self, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> _Part:
         """Return some of it, see ``part_of``."""
-        problem = part_of(self.problem, rows, keyframes, points)
+        problem = part_of(self.problem, rows, points, keyframes)
         turned = None if self.turned is None else self.turned.take(keyframes)
         places = self.rows.take(rows), self.keyframes[keyframes], self.landmarks[points]
         return _Part(problem, *places, self.origin, turned)
@@ -104,7 +104,7 @@ class _Part:
 
 def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
     """Return the keyframes of the newest window among the first ``end`` keyframes (all by default), oldest first."""
-    return scene.order[:end][-config.window.max_keyframes :]
+    return scene.order[:end][-old_keyframes.window_size(scene, config) :]
 
 
 def select(scene: Scene, config: Config, end: int | None = None, without: tuple[int, ...] = ()) -> Selection | str:
@@ -200,16 +200,18 @@ def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     part = _turned(scene, _reach(scene, window, config, without), window, config)
     problem, kernels, new = part.problem, config.solver.kernels, ~scene.landmarks.has_position[part.landmarks]
     points = np.where(new[:, None], 0.0, problem.start.points)
-    norms = native_kernels.residual_norms(problem, _at(problem, points).start, kernels)
+    start = dataclasses.replace(problem.start, points=points)  # what is put into these is put into it
+    norms = native_kernels.residual_norms(problem, start, kernels)
     of_new = new.take(problem.observations.point)
     heard = ~scene.observations.outlier.take(part.rows)
     points[new] = np.nan
     rows = np.flatnonzero(of_new & heard)
     if len(rows):
         points[new] = _first_positions(scene, part, rows, (new, norms[heard & ~of_new]), config)
-        found = part_of(problem, np.flatnonzero(of_new), np.ones(len(part.keyframes), bool), new)
-        norms[of_new] = native_kernels.residual_norms(found, _at(found, np.nan_to_num(points[new])).start, kernels)
-    return dataclasses.replace(part, problem=_at(problem, points)), norms
+        found = part_of(problem, np.flatnonzero(of_new), new)
+        at = dataclasses.replace(found.start, points=np.nan_to_num(points[new]))
+        norms[of_new] = native_kernels.residual_norms(found, at, kernels)
+    return dataclasses.replace(part, problem=dataclasses.replace(problem, start=start)), norms
 
 
 def _first_positions(
@@ -220,17 +222,13 @@ def _first_positions(
     ``among`` tells which they are, (n_pt,), and how far off the views of the others are, sigmas.
     """
     new, norms = among
-    of_new = part_of(part.problem, rows, np.ones(len(part.keyframes), bool), new)
+    of_new = part_of(part.problem, rows, new)
     guess = moved_guesses(scene, part.landmarks[new]) - part.origin
     if len(norms) < _BULK:
         gate = poses_gate(of_new, config.tracks, config.solver.kernels)
     else:
         gate = widened(config.tracks.max_triangulation_px, norms)
     return initial_points(of_new, guess, config.tracks, gate, config.solver.kernels)
-
-
-def _at(problem: Problem, points: FloatArray) -> Problem:
-    return dataclasses.replace(problem, start=dataclasses.replace(problem.start, points=points))
 
 
 def _nothing(scene: Scene, window: IntArray) -> str:

@@ -40,6 +40,8 @@ _HOW = """\
   coordinates, what takes minutes from fewer; figures are medians, the least and the largest in brackets. {starts}
   Each comparison is made again with the worst and the best that seeds and another machine may make of it (another tenth
   of a time, half of a gradient, 1e-4 of an objective): a verdict that would change says so.
+- The second run has its start points, seeds and order of work from the first, and other machine code: the kernels for
+  AVX2 and OpenBLAS for Haswell (`BA_NODE_SIMD=avx2 OPENBLAS_CORETYPE=Haswell`), whose sums are rounded otherwise.
 - "Elsewhere" are the same comparisons on data on which none of our choices was made.
 - Times are processor time of one thread; only ratios are compared with the thesis's (Matlab, another machine). Where it
   compares curves against time, ours are compared at the time at which the first of them ends.

@@ -77,7 +77,13 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "stamps in us": (("mono",), "stamps in another unit.*microseconds"),
     "stamps in ms": (("mono",), "stamps in another unit.*milliseconds"),
 }
-CASES = [(wrong, mode) for wrong, (modes, _) in NAMED.items() for mode in modes]
+# Told by adjustments of seconds, in which all cameras change alike: the quick tests do with one rig.
+ADJUSTED = ("focal 0.8", "focal 0.5", "fx alone", "binning", "not rectified", "rectified", "fisheye given")
+CASES = [
+    pytest.param(wrong, mode, marks=[pytest.mark.slow] if wrong in ADJUSTED and mode != "mono" else [])
+    for wrong, (modes, _) in NAMED.items()
+    for mode in modes
+]
 
 
 @pytest.mark.parametrize(("wrong", "mode"), CASES)

@@ -22,6 +22,7 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
     text = capsys.readouterr().out
     assert stop.value.code == 0
     assert f"example:\n  ba {command}" in text
+    assert "--json FILE" in text
 
 
 @pytest.mark.parametrize("command", ["steps", "sphere", "robustness", "thesis"])

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from ba_node.io.model import Reconstruction
 from ba_node.io.ply import read_ply
 from ba_node.io.reference import read_poses
 from ba_node.offline import solve_model
+from ba_node.offline.solver_settings import solver_options
 from tests.models import LENSES, adjusted, make_model, objective, written
 
 
@@ -82,6 +84,23 @@ def test_points_behind_a_camera_and_seen_twice_are_told(tmp_path: Path, capsys: 
     capsys.readouterr()
     assert main(["convert", str(model), str(tmp_path / "scene.mcap")]) == 0
     assert "without 1 observations of points that an image saw already" in capsys.readouterr().out
+
+
+def test_what_ends_behind_its_camera_is_not_written(tmp_path: Path) -> None:
+    world = make_model("PINHOLE")
+    model = written(world, tmp_path / "model")
+    options = solver_options("auto", ["cheirality=drop", "trust_region=none", "max_iterations=2"])
+    found = solve_model.solve_model(model, options, ("focal",), clock=lambda: 0.0)
+    state = found.result.state
+    camera = np.linalg.inv(np.vstack([np.column_stack([state.rotation[0], state.translation[0]]), [0, 0, 0, 1]]))
+    points = state.points.copy()
+    points[found.model.point[np.flatnonzero(found.model.frame == 0)[0]]] = (camera @ [0.0, 0.0, -2.0, 1.0])[:3]
+    result = dataclasses.replace(found.result, state=dataclasses.replace(state, points=points))
+    dataclasses.replace(found, result=result).write(tmp_path / "end")
+    count = pycolmap.Reconstruction(tmp_path / "end").compute_num_observations()
+    assert count < world.compute_num_observations()
+    again = solve_model.solve_model(tmp_path / "end", options, (), clock=lambda: 0.0)
+    assert again.attention() == ([], False)
 
 
 def test_one_scene_in_every_format_has_one_objective(bal_file: Path, tmp_path: Path) -> None:

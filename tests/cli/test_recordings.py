@@ -127,29 +127,6 @@ def test_parts_merge_to_what_they_were(bag: Path, tmp_path: Path, capsys: pytest
     assert "/keyframes is in several of them" in capsys.readouterr().err
 
 
-def test_every_command_gives_json(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    for command in (
-        ["replay", str(bag), "--out", str(out), "--no-report", "--save-map", str(tmp_path / "map.npz")],
-        ["check", str(bag)],
-        ["evaluate", str(out / "trajectory.tum"), str(out / "ground_truth.tum")],
-        ["map", "info", str(tmp_path / "map.npz")],
-        ["params"],
-        ["convert", str(bag), str(tmp_path / "a.ply")],
-        ["synth", str(tmp_path / "s.mcap"), "--keyframes", "3"],
-        ["cut", str(bag), "--out", str(tmp_path / "c.mcap")],
-    ):
-        capsys.readouterr()
-        assert main([*command, "--json", "-"]) == 0
-        assert json.loads(capsys.readouterr().out), command
-        file = tmp_path / "result.json"
-        file.unlink(missing_ok=True)
-        assert main([*command, "--json", str(file)]) == 0
-        assert json.loads(file.read_text()), command
-    assert main(["params", "--json", str(tmp_path / "no" / "file.json")]) == 2
-    assert "there is no folder" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

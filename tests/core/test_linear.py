@@ -105,3 +105,20 @@ def test_stops_where_further_steps_add_little(seed: int) -> None:
     gains = [float(b @ x - 0.5 * x @ a @ x) for x in (whole.x, early.x)]
     assert early.iterations < whole.iterations
     assert 0.5 * gains[0] <= gains[1] <= gains[0] * (1.0 + 1e-9), f"{gains[1]:.6g} of {gains[0]:.6g}"
+
+
+def test_weak_modes_are_seen_by_the_residual_in_energy() -> None:
+    """Forty weak modes have half of the energy, and a millionth of |b|: by |r| PCG ends with a quarter of all left."""
+    stiffness = np.repeat([1e6, 1e-6], 40)
+    inverse = np.concatenate([np.full(40, 1e-6), 1e6 * np.random.default_rng(1).uniform(0.2, 1.5, 40)])
+    rhs = np.repeat([1e4, 1e-2], 40)
+
+    def left(*, energy: bool) -> float:
+        limits = linear.PcgLimits(0.01, 100, energy=energy)
+        x = linear.pcg_steihaug(lambda x: stiffness * x, rhs, lambda r: inverse * r, limits).x
+        assert x is not None
+        error = x - rhs / stiffness
+        return float(np.sqrt(error @ (stiffness * error) / (rhs @ (rhs / stiffness))))
+
+    assert left(energy=False) > 0.25
+    assert left(energy=True) < 0.02

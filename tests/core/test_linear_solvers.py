@@ -168,6 +168,13 @@ def test_pcg_is_tried_where_its_steps_cost_next_to_nothing(make_problem: Make) -
     assert linear_costs.pcg_tries(few) == 0
 
 
+@pytest.mark.parametrize(("keyframes", "is_tried"), [(100, True), (300, True), (500, False), (36_000, False)])
+def test_pcg_is_not_tried_on_maps_that_are_many_tracks_long(keyframes: int, is_tried: bool) -> None:
+    """Each point is seen by 95 keyframes; on 36 000 ten iterations of a step each were lost before the factor."""
+    sizes = Sizes(unknowns=6 * keyframes, block=6, edges=190 * keyframes, pairs=190 * 48 * keyframes)
+    assert (linear_costs.pcg_tries(sizes) > 0) == is_tried
+
+
 @built
 def test_a_try_that_does_not_get_there_is_the_last(make_problem: Make) -> None:
     problem, _ = make_problem(keyframes=12, points=300, fixed=0)

@@ -231,7 +231,7 @@ class TestLadybug:
         found = solve(problem, chosen)
         alone = solve(problem, dataclasses.replace(chosen, trust_region="none"))
         for result in (found, alone):
-            assert result.status is Status.CONVERGED and min(row.damping for row in result.trace) >= 1e-13
+            assert result.status is Status.CONVERGED and min(row.damping for row in result.trace) >= 1e-14
         assert found.objective_after == pytest.approx(alone.objective_after, rel=1e-7)
         rejected = [sum(not row.accepted for row in result.trace) for result in (found, alone)]
         assert rejected[0] < rejected[1] and len(found.trace) <= len(alone.trace), rejected

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ba_node import native
 from ba_node.config import SolverOptions
-from ba_node.core import cameras, geometry, objective
+from ba_node.core import cameras, geometry, objective, triangulation
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.core.triangulation import parallax, rays_of, triangulate
+from ba_node.core.triangulation import errors, parallax, rays_of, triangulate
 
 both = pytest.mark.parametrize(
     "backend",
@@ -174,3 +174,14 @@ def test_kernels_agree(offset: float) -> None:
     wide = np.isnan(oracle.points[:, 0]) | oracle.measured | (oracle.parallax_rad > 0.01)
     assert np.count_nonzero(wide) > 150
     np.testing.assert_allclose(ours.points[wide], oracle.points[wide], rtol=1e-9, atol=1e-7)
+
+
+def test_pieces_of_many_observations_give_the_same_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = make_problem(seed=9, noise_px=0.5)
+    whole = rays_of(problem)
+    error = errors(whole, problem.start.points)
+    monkeypatch.setattr(triangulation, "_AT_ONCE", 7)
+    pieces = rays_of(problem)
+    for field in dataclasses.fields(whole):
+        np.testing.assert_allclose(getattr(pieces, field.name), getattr(whole, field.name), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(errors(pieces, problem.start.points), error, rtol=1e-9)

@@ -15,7 +15,8 @@ from ba_node.config.front_end import FrontEndOptions
 from ba_node.core import cameras, geometry
 from ba_node.estimate import Cloud, Poses, Transform
 from ba_node.front_end import FrontEnd, FrontEndError, Images, State, Tracked
-from ba_node.measurements import CameraRig
+from ba_node.front_end.covariance import Lengths
+from ba_node.measurements import CameraRig, Keyframe
 from tests.front_end import world
 
 OPTIONS = FrontEndOptions(max_features=300)
@@ -123,19 +124,29 @@ def test_raw_images_of_a_turned_rig(truth: list[Transform]) -> None:
 
 @pytest.mark.slow
 def test_second_camera_turned_against_the_rig() -> None:
-    """A pixel of disparity that the calibration does not know of: found, and the scale is right again."""
-    long = world.drive(24)
+    """A pixel of disparity that the calibration does not know of: found, and the scale is right again.
+
+    So it is from the first image on, as these are tracked again once the turn is known.
+    """
+    poses = world.drive(24)
     yaw = 1.0 / world.FOCAL
     real = world.rig(turn=np.array([0.0, yaw, 0.0]))
-    frames = [world.images(real, pose, i) for i, pose in enumerate(long)]
+    frames = [world.images(real, pose, i) for i, pose in enumerate(poses)]
     blind = follow(FrontEnd(world.rig(), PLAIN), frames)
     front_end = FrontEnd(world.rig(), OPTIONS)
     found = follow(front_end, frames)
     assert front_end.alignment is not None
     assert abs(front_end.alignment[0][0]) == pytest.approx(1.0, abs=0.15)
-    begin = 12
-    wrong = scale_and_error(blind[begin:], long[begin:])[0]
-    right = scale_and_error(found[begin:], long[begin:])[0]
+    (number,) = [i for i, one in enumerate(found) if one.again]
+    assert found[number].notes[-1].endswith("the one before is void")
+    told = [one for one in found[number].measurements() if isinstance(one, Keyframe)]
+    told += [one.keyframe for one in found[number + 1 :] if one.keyframe]
+    assert (told[0].session_id, told[0].keyframe_id, told[0].stamp_ns) == (2, 1, found[0].stamp_ns)
+    assert [one.session_id for one in found] == [1] * number + [2] * (len(found) - number)
+    wrong = scale_and_error(blind, poses)[0]
+    at = {one.stamp_ns: pose.translation for one, pose in zip(found, poses, strict=True)}
+    ours, theirs = np.array([one.position for one in told]), np.array([at[one.stamp_ns] for one in told])
+    right = np.linalg.norm(np.diff(ours, axis=0), axis=1).sum() / np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum()
     assert abs(wrong - 1.0) > 0.03, f"without: {wrong:.4f}"
     assert abs(right - 1.0) < 0.012, f"with: {right:.4f}"
 
@@ -160,17 +171,29 @@ def test_one_camera_with_odometry(truth: list[Transform]) -> None:
         assert np.array_equal(one.pose.translation, pose.translation)
     keyframes = [one for one in found if one.keyframe]
     assert len(keyframes) >= 3
-    # Lengths are the odometry's: a step of half a metre is told to a millimetre along and five across.
+    # Of the first steps nobody knows how their lengths scatter: to two per cent along, and one across.
     first, second = (one.keyframe for one in keyframes[:2])
     assert first and second and not len(first.covariance)
     before, step = (truth[found.index(one)] for one in keyframes[:2])
     told = second.covariance.reshape(6, 6)[:3, :3]
     moved = before.rotation.T @ (step.translation - before.translation)
     length, across = float(np.linalg.norm(moved)), np.array([1.0, 0.0, 0.0])
-    assert np.sqrt(moved @ told @ moved) / length == pytest.approx(0.0005 + 0.001 * length, rel=1e-6)
+    assert np.sqrt(moved @ told @ moved) / length == pytest.approx(0.0005 + np.hypot(0.001, 0.02) * length, rel=1e-6)
     assert np.sqrt(across @ told @ across) == pytest.approx(0.0005 + 0.01 * length, rel=0.1)
     shared = np.intersect1d(keyframes[0].tracks[0].track_id, keyframes[2].tracks[0].track_id)
     assert len(shared) > 20
+
+
+@pytest.mark.parametrize(("scatter", "told"), [(0.0, 0.0), (0.003, 0.0), (0.03, 0.03)])
+def test_how_lengths_of_an_odometry_scatter_is_learned(scatter: float, told: float) -> None:
+    """Beyond what images are unsure by, and not by what they all differ by."""
+    rng, lengths = np.random.default_rng(2), Lengths()
+    before, step = Transform(np.eye(3), np.zeros(3)), np.array([0.0, 0.1, 1.0])
+    assert lengths.noise == 0.02
+    for share in 1.01 + scatter * rng.standard_normal(30):
+        after = [Transform(np.eye(3), -length * step) for length in (1.0, share)]
+        lengths.compare(before, *after)
+    assert lengths.noise == pytest.approx(told, abs=0.25 * told + 0.001)
 
 
 def test_one_camera_alone(truth: list[Transform]) -> None:

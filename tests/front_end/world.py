@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ STEP_NS = 100_000_000
 _PLANES = ((1, 1.2, 90.0), (1, -2.0, 90.0), (0, -2.2, 80.0), (0, 2.2, 80.0), (2, 22.0, 50.0))
 
 
+@functools.cache
 def _texture(seed: int) -> Any:
     """Return noise of several sizes: (1024, 1024) float32, grey values; it repeats."""
     rng, total = np.random.default_rng(seed), np.zeros((1024, 1024), np.float32)
@@ -31,9 +33,6 @@ def _texture(seed: int) -> Any:
         noise = cv2.GaussianBlur(rng.normal(size=total.shape).astype(np.float32), (0, 0), sigma)
         total += weight * noise / noise.std()
     return np.clip(total + 120.0, 5.0, 250.0)
-
-
-_TEXTURES = [_texture(seed) for seed in range(len(_PLANES))]
 
 
 def rig(cameras_count: int = 2, distortion: tuple[float, ...] = (), turn: FloatArray | None = None) -> CameraRig:
@@ -50,6 +49,15 @@ def rig(cameras_count: int = 2, distortion: tuple[float, ...] = (), turn: FloatA
     )  # fmt: skip
 
 
+@functools.cache
+def _rays(model: int, params: tuple[float, ...]) -> FloatArray:
+    """Return where each pixel of a camera looks, (n, 3) with z = 1."""
+    x, y = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
+    uv = np.column_stack([x.ravel(), y.ravel()])
+    flat = cameras.normalise(uv, np.full(len(uv), model), np.tile(params, (len(uv), 1)))
+    return np.column_stack([flat, np.ones(len(uv))])
+
+
 @dataclass(frozen=True)
 class View:
     """A grey image and its depths."""
@@ -60,22 +68,19 @@ class View:
 
 def render(of: CameraRig, index: int, body: Transform, noise: float = 1.0) -> View:
     """Return what a camera of a rig on a body sees."""
-    x, y = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
     model, params = cameras.parameters(of.models[index], of.intrinsics[index], of.distortion[index])
-    uv = np.column_stack([x.ravel(), y.ravel()])
-    flat = cameras.normalise(uv, np.full(len(uv), model), np.tile(params, (len(uv), 1)))
-    ray = np.column_stack([flat, np.ones(len(uv))])
+    ray = _rays(int(model), tuple(params.tolist()))
     eye = body.rotation @ of.position[index] + body.translation
     direction = ray @ (body.rotation @ geometry.matrix_from_quaternion(of.orientation[index])).T
     nearest, grey = np.full(len(ray), np.inf), np.zeros(len(ray), np.float32)
-    for (axis, place, scale), texture in zip(_PLANES, _TEXTURES, strict=True):
+    for seed, (axis, place, scale) in enumerate(_PLANES):
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = (place - eye[axis]) / direction[:, axis]
         seen = (depth > 0.05) & (depth < nearest)
         along = np.where(seen, depth, 0.0)[:, None]
         at = (eye + direction * along)[:, [i for i in range(3) if i != axis]] * scale
         at = np.mod(at, 1023.0).astype(np.float32).reshape(*SIZE[::-1], 2)
-        grey[seen] = cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR).ravel()[seen]
+        grey[seen] = cv2.remap(_texture(seed), at[..., 0], at[..., 1], cv2.INTER_LINEAR).ravel()[seen]
         nearest[seen] = depth[seen]
     rng = np.random.default_rng(round(1e6 * float(np.abs(body.translation).sum())) + index)
     noisy = cv2.GaussianBlur(grey.reshape(SIZE[::-1]), (0, 0), 0.7) + noise * rng.normal(size=SIZE[::-1])

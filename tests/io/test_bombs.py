@@ -34,8 +34,9 @@ from ba_node.io.bal import BalError, read_bal
 from ba_node.io.map_file import MapFileError, read_map, write_map
 from ba_node.io.mcap_index import MAGIC
 from ba_node.io.parameters import configure, read_parameters
+from ba_node.io.reference import TRUTH_TOPIC
 from ba_node.io.trajectory import TrajectoryError, read_tum
-from ba_node.offline.recording import TRUTH_TOPIC, TRUTH_TYPE, record
+from ba_node.offline.recording import TRUTH_TYPE, record
 from ba_node.offline.replay import replay
 from ba_node.scene.map_content import MapContent
 from ba_node.synthetic import SyntheticOptions, generate

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,30 @@ def test_the_simplest_lens_is_found(lens: str) -> None:
     for number, of in enumerate(columns):
         params[list(of)] = number + 1.0
     assert lens_of(family, params) == lens
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_what_cannot_be_written_leaves_the_older_model(text: bool, tmp_path: Path) -> None:
+    world = make_model("PINHOLE")
+    path = written(world, tmp_path / "m", text=text)
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    for camera in world.cameras.values():
+        camera.params = np.array(camera.params) * 2.0
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
+        with pytest.raises(ModelError, match="no room for temporary files"):
+            write_colmap(path, world, text=text)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
+    rigs = path / ("rigs.txt" if text else "rigs.bin")
+    rigs.unlink()
+    rigs.mkdir()
+    with pytest.raises(OSError, match=rigs.name):
+        write_colmap(path, world, text=text)
+    del before[rigs.name]
+    assert {file.name: file.read_bytes() for file in path.iterdir() if file != rigs} == before
 
 
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D", "frames", "rigs"])

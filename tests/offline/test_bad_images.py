@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from ba_node.cli.main import main
-from ba_node.io.mcap import BagReader
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.rig_file import rig_yaml
 from ba_node.measurements import Keyframe
 from tests.front_end import world

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -80,6 +81,14 @@ def test_what_kills_every_worker_is_given_up_and_named(cluster: Any) -> None:
     assert found == {0: (1, "3 workers died of it, perhaps for want of memory (KilledWorker)")}
 
 
+def test_one_process_tells_of_each_recording_as_it_is_done() -> None:
+    begun: list[int] = []
+    with Fleet() as fleet:
+        for number, _ in fleet.each(begun.append, [0, 1, 2], lambda *_: None):
+            assert begun == list(range(number + 1)), "the next one has begun before this one was told of"
+    assert len(begun) == 3
+
+
 def test_results_are_one_table_and_page(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["replay", str(MONO), str(broken), str(STEREO), "--out", str(out), "--no-report"]) == 3
@@ -119,6 +128,14 @@ def test_recordings_and_results_may_be_urls(tmp_path: Path) -> None:
     ).read_bytes()
     with pytest.raises(FleetError, match="nothing is there that matches"):
         expand([f"{url}/*.db3"])
+
+
+def test_what_a_store_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for missing, words in (("s3fs", "^s3://a/[*]: Install s3fs to access S3$"), ("fsspec", "pip install ba_node")):
+        monkeypatch.setitem(sys.modules, missing, None)
+        monkeypatch.setitem(sys.modules, f"{missing}.core", None)
+        with pytest.raises(FleetError, match=words):
+            expand(["s3://a/*"])
 
 
 def test_all_bad_is_two(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,11 +15,12 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.config import Config
 from ba_node.io.bag_writer import BagWriter
+from ba_node.io.reference import TRUTH_TOPIC
 from ba_node.io.ros_types import ROSBAGS_FACTORY
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES
-from ba_node.offline.recording import TRUTH_TOPIC, TRUTH_TYPE, _true_pose
+from ba_node.offline.recording import TRUTH_TYPE, _true_pose
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -46,7 +47,10 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_pictures_become_a_map(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["run", str(pictures), "--out", str(out), "--no-report", "--track", "max_features=300"]) == 0
+    found = tmp_path / "found.json"
+    options = ["--no-report", "--track", "max_features=300", "--json", str(found)]
+    assert main(["run", str(pictures), "--out", str(out), *options]) == 0
+    assert json.loads(found.read_text())["exit_codes"] == {"track": 0, "check": 0, "replay": 0}
     text, errors = capsys.readouterr()
     assert "12, stereo" in text
     assert "error to ground truth" in text

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,14 +52,23 @@ def aligned_rms(position: FloatArray, truth: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum((here @ turn.T - there) ** 2, axis=1))))
 
 
-def street_data() -> SyntheticData:
+def error_in_world(estimate: Estimate, data: SyntheticData) -> float:
+    """Return the rms distance to the truth in the world that :func:`fixes` are in, m."""
+    assert estimate.world is not None and estimate.world.geodetic is not None
+    turn = geometry.matrix_from_quaternion(estimate.world.orientation)
+    here = estimate.trajectory.position @ turn.T + estimate.world.position
+    here = here + np.array(pymap3d.geodetic2enu(*estimate.world.geodetic, *ORIGIN))
+    there = data.truth.position @ TURN.T + SHIFT
+    return float(np.sqrt(np.mean(np.sum((here - there) ** 2, axis=1))))
+
+
+def street_data(**changes: Any) -> SyntheticData:
     """Return a street of 300 m that few tracks with much noise show: vision drifts by metres."""
-    return generate(
-        SyntheticOptions(
-            seed=3, keyframes=100, length_m=250.0, landmarks=5000, path="line", noise_px=1.0, tracks=60, track_loss=0.1,
-            max_range_m=40.0, reobserve=False, drift_rotation_deg=0.3, drift_translation=0.02,
-        )
+    options = SyntheticOptions(
+        seed=3, keyframes=100, length_m=250.0, landmarks=5000, path="line", noise_px=1.0, tracks=60, track_loss=0.1,
+        max_range_m=40.0, reobserve=False, drift_rotation_deg=0.3, drift_translation=0.02,
     )  # fmt: skip
+    return generate(dataclasses.replace(options, **changes))
 
 
 def first(data: SyntheticData, n: int) -> SyntheticData:
@@ -100,7 +110,7 @@ def wheels(data: SyntheticData) -> More:
 ANTENNA = {"factors.antenna_x_m": 0.5, "factors.antenna_y_m": 0.1, "factors.antenna_z_m": 1.2}
 
 
-def round_trip(noise_px: float) -> SyntheticData:
+def round_trip(noise_px: float, **changes: Any) -> SyntheticData:
     """Return a loop of which the last keyframes see the first ones' points again, under other ids."""
     n = 200
     options = SyntheticOptions(
@@ -113,7 +123,7 @@ def round_trip(noise_px: float) -> SyntheticData:
         step = np.linalg.norm(np.diff(path.position[rows], axis=0), axis=1)
         return world, Motion(path.position[rows], path.rotation[rows], np.append(0.0, np.cumsum(step + 1e-3)))
 
-    return generate(options, again)
+    return generate(dataclasses.replace(options, **changes), again)
 
 
 def merges(data: SyntheticData, count: int = 20) -> list[tuple[int, int]]:

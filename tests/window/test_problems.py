@@ -30,7 +30,7 @@ def test_a_part_is_what_would_have_been_made_of_its_rows(depth_share: float) -> 
     keyframes, points = rng.random(len(scene.order)) < 0.7, rng.random(len(landmarks)) < 0.7
     kept = np.flatnonzero(keyframes[obs.keyframe] & points[obs.point])
     assert 10 < len(kept) < len(obs) - 10
-    part = part_of(whole, kept, keyframes, points)
+    part = part_of(whole, kept, points, keyframes)
     again = problem_of(
         scene,
         rng.permutation(rows[kept]),

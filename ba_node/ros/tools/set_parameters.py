@@ -21,7 +21,7 @@ class NoNodeError(ValueError):
     """A node that is not there, or refuses."""
 
 
-def set_parameters(node_name: str, path: Path, domain: int | None = None) -> list[str]:
+def set_parameters(node_name: str, path: Path) -> list[str]:
     """Set the parameters in a file on a node; return what was done, a sentence each.
 
     Raises:
@@ -35,7 +35,7 @@ def set_parameters(node_name: str, path: Path, domain: int | None = None) -> lis
     said = [f"{node_name}: {name} takes effect at its start only: give it {path} as --params-file" for name in others]
     if not live:
         return [*said, f"{path}: nothing to set on {node_name}"]
-    with node_apart("ba_tune", domain=domain) as (node, executor):
+    with node_apart("ba_tune") as (node, executor):
         _set(node, executor, node_name, live)
     return [*said, *(f"{node_name}: {name} = {value}" for name, value in live.items())]
 

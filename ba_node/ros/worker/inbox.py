@@ -85,10 +85,10 @@ class Inbox:
                 self._keyframes_dropped += kind is Keyframe
             self._changed.notify()
 
-    def post(self, command: Command, time_s: float = 0.0) -> None:
+    def post(self, command: Command) -> None:
         """Add something for the worker to do after what has arrived before it."""
         with self._changed:
-            self._commands.append(self._numbered(Arrival(time_s, command)))
+            self._commands.append(self._numbered(Arrival(0.0, command)))
             self._changed.notify()
 
     def close(self) -> None:

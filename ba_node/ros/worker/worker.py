@@ -10,6 +10,7 @@ keyframe counts as complete with what has arrived.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import threading
 import time
 import traceback
@@ -29,6 +30,8 @@ from ba_node.ros.worker.latency import Budget, Lag
 _MAX_OUTPUTS = 20
 # A report on what was turned away goes out without a solve, but not more often.
 _REPORT_PERIOD_S = 1.0
+# For so long a step of a check waits for a solve to end: where solves follow each other at once it must get on too.
+_GIVES_WAY_S = 0.2
 # Texts that begin alike say the same.
 _HEAD = 40
 # Falling behind for this long is warned about.
@@ -92,6 +95,7 @@ class Worker:
         self._settled = True
         self._behind = False
         self._failures: Counter[str] = Counter()
+        self._resting = threading.Event()  # set while there is nothing to do
         self._thread = threading.Thread(target=self._run, name="solver", daemon=True)
 
     @property
@@ -115,8 +119,9 @@ class Worker:
         return not self._thread.is_alive()
 
     def check_elsewhere(self, check: Check) -> None:
-        """Check a set-up on a thread of its own, so that no keyframe waits; what is found comes back as a command."""
-        self._elsewhere("setup_check", check.run, lambda backend: backend.take_check(check))
+        """Check a set-up on a thread of its own, between solves; what is found comes back as a command."""
+        work = functools.partial(check.run, functools.partial(self._resting.wait, _GIVES_WAY_S))
+        self._elsewhere("setup_check", work, lambda backend: backend.take_check(check))
 
     def adjust_elsewhere(self, adjustment: Adjustment) -> None:
         """Bend and refine a copy of the map likewise."""
@@ -141,9 +146,11 @@ class Worker:
 
     def _run(self) -> None:
         while True:
+            self._resting.set()
             arrivals = self._inbox.drain(self._patience_s())
             if self._inbox.closed:
                 return
+            self._resting.clear()
             self._guard(self.step, arrivals)
 
     def _patience_s(self) -> float | None:

@@ -153,14 +153,23 @@ def test_what_cannot_be_tracked_is_said_with_figures(start_node: StartNode, make
     assert node.out.startswith("stopped: 0 images, 0 keyframes; left out: no right/image_raw = "), node.out
 
 
-def at_10_hz(camera: Camera, kitti: Kitti, rows: range, again: Callable[[], None] = lambda: None) -> None:
-    """Publish pairs as a camera does, whatever the node is doing, and take messages in between."""
+def at_10_hz(camera: Camera, kitti: Kitti, rows: range, turned_deg: float = 0.0) -> None:
+    """Publish pairs as a camera does, whatever the node is doing, and take messages in between.
+
+    The second camera is turned by so much about its vertical axis.
+    """
     read = {(side, i): kitti.image(side, i) for i in rows for side in ("left", "right")}
+    if turned_deg:
+        K = kitti.p[1].reshape(3, 4)[:, :3]
+        warp = K @ cv2.Rodrigues(np.array([0.0, np.radians(turned_deg), 0.0]))[0] @ np.linalg.inv(K)
+        for (side, i), image in list(read.items()):
+            if side == "right":
+                size = image.shape[::-1]
+                read[side, i] = cv2.warpPerspective(image, warp, size, None, cv2.INTER_CUBIC, cv2.BORDER_REFLECT)
     began = time.monotonic()
     for n, i in enumerate(rows):
         while time.monotonic() < began + n * STEP_NS / 1e9:
             camera.peer.executor.spin_once(timeout_sec=0.005)
-        again()
         for side, p in zip(("left", "right"), kitti.p, strict=True):
             camera.publish(side, BEGIN_NS + i * STEP_NS, read[side, i], p)
 
@@ -196,6 +205,32 @@ def test_pairs_at_10_hz_come_back_as_refined_keyframes(
     refined = errors(kitti, last.stamp_ns, np.asarray(last.position).reshape(-1, 3))
     for name, error in (("tracked", tracked), ("refined", refined)):
         assert error.max() < 0.1 + 0.01 * length_m, f"{name}: {error.max():.3f} m on {length_m:.1f} m"
+
+
+def test_a_turned_second_camera_begins_the_map_again(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
+    """By 0.1 degree: the first keyframes come again, as another session, and its map is as near to the truth."""
+    back_end, node, peer = start_node(), start_node(program=PROGRAM), make_peer()
+    peer.listen("refined_keyframes", "report")
+    as_back_end(peer)
+    camera = begin(peer, "left", "right")
+    peer.until(lambda: peer.node.count_subscribers("keyframes") > 1, "the back-end")
+    at_10_hz(camera, kitti, range(20), turned_deg=0.1)
+    sent, refined = peer.received["keyframes"], peer.received["refined_keyframes"]
+    last_ns = BEGIN_NS + 17 * STEP_NS
+
+    def is_refined() -> bool:
+        return bool(refined) and refined[-1].session_id == sent[-1].session_id and max(refined[-1].stamp_ns) >= last_ns
+
+    peer.until(is_refined, "the last keyframe")
+    first, second = sorted({one.session_id for one in sent})
+    began_ns = next(stamp_of(one) for one in sent if one.session_id == second)
+    assert (second, began_ns) == (first + 1, BEGIN_NS)
+    assert "px of yaw" in node.err and "tracked again; the one before is void" in node.err
+    stamps, at = np.asarray(refined[-1].stamp_ns), np.asarray(refined[-1].position).reshape(-1, 3)
+    true = kitti.truth[(stamps - BEGIN_NS) // STEP_NS, :, 3]
+    ways = [float(np.linalg.norm(np.diff(one, axis=0), axis=1).sum()) for one in (at, true)]
+    assert ways[0] / ways[1] == pytest.approx(1.0, abs=0.01), ways
+    assert node.stop() == 0 and back_end.stop() == 0
 
 
 def as_back_end(peer: Any) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from ba_node.config import Config
 from ba_node.estimate import Status
+from ba_node.ros.worker import worker
 from ba_node.ros.worker.worker import Notice
 from tests.ros.worker.fakes import Rig, reports
 
@@ -106,6 +108,38 @@ def test_commands_reach_the_backend_between_measurements() -> None:
     rig.keyframe(2)
     rig.step()
     assert seen == [1]
+
+
+def test_a_check_gives_way_to_solves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "_GIVES_WAY_S", 60.0)
+    rig, done = Rig(), []
+    solving, looking, go_on = threading.Event(), threading.Event(), threading.Event()
+
+    def solve(_: Callable[[Any], bool]) -> None:
+        solving.set()
+        assert go_on.wait(10.0)
+        done.append("solved")
+
+    def look(give_way: Callable[[], object]) -> None:
+        looking.set()
+        give_way()
+        done.append("looked")
+        rig.new.set()
+
+    rig.backend.while_solving = solve
+    rig.worker.start()
+    try:
+        rig.keyframe(1)
+        assert solving.wait(10.0)
+        rig.worker.check_elsewhere(SimpleNamespace(run=look))  # type: ignore[arg-type]
+        assert looking.wait(10.0)
+        go_on.set()
+        while len(done) < 2:
+            rig.wait_for_output()
+        assert done == ["solved", "looked"]
+    finally:
+        go_on.set()
+        assert rig.worker.stop()
 
 
 def test_stops_a_long_solve_after_an_iteration() -> None:

@@ -113,13 +113,16 @@ class KernelOf final : public Kernel {
   void rhs(double* out) const override { reduced_.rhs(out); }
   void dense(double* out) override { reduced_.dense(out); }
   bool solve(double* x) override { return reduced_.solve(x); }
-  std::int64_t schur_blocks() override { return reduced_.schur_blocks(); }
   const Fill& analyse(const FillLimits& limits) override { return reduced_.analyse(limits); }
   bool solve_sparse(double* x) override { return reduced_.solve_sparse(x); }
-  const Rows32& assemble() override { return reduced_.assemble().pattern(); }
-  void write_blocks(double* out) override {
-    const auto n = static_cast<std::int64_t>(reduced_.assembled().pattern().index.size());
-    for (std::int64_t k = 0; k < n; ++k) write_block(reduced_.assembled().blocks()[k], out + k * D * D, D);
+  const Rows32& schur_pattern() override { return reduced_.schur().pattern(); }
+  void sparse(const std::int64_t* place, const std::int64_t* mirrored, double* out) override {
+    const SparseSchur<D>& s = reduced_.assemble();
+    const auto n = static_cast<std::int64_t>(s.pattern().index.size());
+    for (std::int64_t k = 0; k < n; ++k) {
+      write_block(s.blocks()[k], out + place[k] * D * D, D);
+      if (mirrored[k] >= 0) write_transposed(s.blocks()[k], out + mirrored[k] * D * D, D);
+    }
   }
   PcgEnd pcg(const double* scale, Preconditioner kind, const PcgLimits& limits, bool formed, double* x) override {
     return reduced_.pcg(scale, kind, limits, formed, x);
@@ -183,6 +186,29 @@ class KernelOf final : public Kernel {
   bool is_prepared_ = false;
   std::vector<Buffer<Images>> images_;  // of each thread
   std::vector<Buffer<V8>> staged_;      // the same: rows of a batch
+};
+
+template <int D>
+class SparseFactorOf final : public SparseFactor {
+ public:
+  explicit SparseFactorOf(const Rows32& upper)
+      : factor_(upper, {std::numeric_limits<std::int64_t>::max(), std::numeric_limits<double>::infinity()}),
+        blocks_(upper.index.size()) {}
+
+  bool solve(const double* blocks, double* x) override {
+    for (Block<D>& block : blocks_) {
+      clear(&block, 1);
+      for (int r = 0; r < D; ++r)
+        for (int c = 0; c < D; ++c) set_entry(block, r, c, *blocks++);
+    }
+    if (!factor_.factor(blocks_.data())) return false;
+    factor_.solve(x);
+    return true;
+  }
+
+ private:
+  SparseCholesky<D> factor_;
+  Buffer<Block<D>> blocks_;
 };
 
 }  // namespace ba::BA_TARGET

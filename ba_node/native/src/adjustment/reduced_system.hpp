@@ -113,8 +113,11 @@ class ReducedSystem {
     return all_finite(x, n);
   }
 
-  // Blocks of S on and above its diagonal.
-  std::int64_t schur_blocks() { return static_cast<std::int64_t>(schur().pattern().index.size()); }
+  // S by blocks, of which nothing but the structure need be known yet.
+  SparseSchur<D>& schur() {
+    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, factors_, pool_.threads());
+    return *schur_;
+  }
 
   // The size of the sparse factor, found once if it meets the limits.
   const Fill& analyse(const FillLimits& limits) {
@@ -127,9 +130,6 @@ class ReducedSystem {
     schur().assemble(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); }, pairs_);
     return schur();
   }
-
-  // What the last assemble made.
-  const SparseSchur<D>& assembled() const { return *schur_; }
 
   // Solve S x = rhs by sparse Cholesky, after analyse; false if S is not positive definite.
   bool solve_sparse(double* x) {
@@ -286,11 +286,6 @@ class ReducedSystem {
 
   const Block<D>* find_diagonal() {
     return schur().diagonal(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); });
-  }
-
-  SparseSchur<D>& schur() {
-    if (!schur_) schur_ = std::make_unique<SparseSchur<D>>(l_, factors_, pool_.threads());
-    return *schur_;
   }
 
   // B and the damping of keyframe k, onto its diagonal block.

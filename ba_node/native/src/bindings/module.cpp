@@ -111,11 +111,15 @@ py::array_t<T> copy(const std::vector<T>& values) {
   return py::array_t<T>(static_cast<py::ssize_t>(values.size()), values.data());
 }
 
-py::tuple sparse(Kernel& k) {
-  const Rows32& pattern = *without_gil([&] { return &k.assemble(); });
-  Doubles blocks = empty({static_cast<py::ssize_t>(pattern.index.size()), k.size(), k.size()});
-  k.write_blocks(blocks.mutable_data());
-  return py::make_tuple(blocks, copy(pattern.index), copy(pattern.start));
+py::tuple schur_pattern(Kernel& k) {
+  const Rows32& pattern = *without_gil([&] { return &k.schur_pattern(); });
+  return py::make_tuple(copy(pattern.index), copy(pattern.start));
+}
+
+void sparse(Kernel& k, const Ints& place, const Ints& mirrored, OutDoubles out) {
+  const std::int64_t *to = place.data(), *turned = mirrored.data();
+  double* blocks = out.mutable_data();
+  without_gil([&] { k.sparse(to, turned, blocks); });
 }
 
 py::tuple inner_iterations(Kernel& k, const py::object& state, int steps) {
@@ -214,7 +218,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              return without_gil([&] { return k.solve(x); });
            })
       .def("sparse", &sparse)
-      .def("schur_blocks", [](Kernel& k) { return without_gil([&] { return k.schur_blocks(); }); })
+      .def("schur_pattern", &schur_pattern)
       .def("analyse",
            [](Kernel& k, std::int64_t max_blocks, double max_products) {
              const Fill& fill = *without_gil([&] { return &k.analyse({max_blocks, max_products}); });
@@ -238,6 +242,15 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              return out;
            })
       .def("back_substitute", &back_substitute);
+}
+
+// columns, starts: of the rows of the upper triangle of a matrix by d x d blocks.
+SparseFactor* make_factor(int d, const Ints& columns, const Ints& starts) {
+  Rows32 upper;
+  upper.index.assign(columns.data(), columns.data() + columns.size());
+  upper.start.assign(starts.data(), starts.data() + starts.size());
+  const auto make = d == 9 ? target->make_factor9 : target->make_factor6;
+  return without_gil([&] { return make(upper); });
 }
 
 RelativePoseFactors* make_relative_poses(const py::object& factors, const Ints& column, const Ints& pair) {
@@ -272,6 +285,16 @@ void bind_relative_poses(py::module_& m) {
       });
 }
 
+void bind_sparse_factor(py::module_& m) {
+  py::class_<SparseFactor>(m, "SparseFactor")
+      .def(py::init(&make_factor))
+      .def("solve", [](SparseFactor& f, const Doubles& blocks, OutDoubles x) {
+        const double* from = blocks.data();
+        double* out = x.mutable_data();
+        return without_gil([&] { return f.solve(from, out); });
+      });
+}
+
 }  // namespace
 
 }  // namespace ba
@@ -284,6 +307,7 @@ PYBIND11_MODULE(_kernels, m) {
   kernel.def(pybind11::init(&ba::make_kernel));
   ba::bind_assembly(kernel);
   ba::bind_reduced_system(kernel);
+  ba::bind_sparse_factor(m);
   ba::bind_relative_poses(m);
   m.def("targets", &ba::target_names);
   m.def("target", [] { return ba::target->name; });

@@ -287,4 +287,10 @@ inline void write_block(const Block<D>& s, double* out, std::int64_t stride) {
     for (int r = 0; r < D; ++r) out[r * stride + c] = entry(s, r, c);
 }
 
+template <int D>
+inline void write_transposed(const Block<D>& s, double* out, std::int64_t stride) {
+  for (int c = 0; c < D; ++c)
+    for (int r = 0; r < D; ++r) out[c * stride + r] = entry(s, r, c);
+}
+
 }  // namespace ba::BA_TARGET

@@ -6,6 +6,7 @@ namespace ba {
 
 // Here, so that no target has the only copy of what they share.
 Kernel::~Kernel() = default;
+SparseFactor::~SparseFactor() = default;
 RelativePoseFactors::~RelativePoseFactors() = default;
 
 }  // namespace ba

@@ -54,15 +54,14 @@ class Kernel {
   virtual void rhs(double* out) const = 0;
   // S, symmetric, (n x n), n = n_free d.
   virtual void dense(double* out) = 0;
-  // The upper triangle of S by blocks: its pattern, and the blocks of the last one assembled, (n_blocks x d x d).
-  virtual const Rows32& assemble() = 0;
-  virtual void write_blocks(double* out) = 0;
+  // The pattern of the upper triangle of S; its blocks (d x d), block k to place[k] of out, and transposed to
+  // mirrored[k] unless that is negative.
+  virtual const Rows32& schur_pattern() = 0;
+  virtual void sparse(const std::int64_t* place, const std::int64_t* mirrored, double* out) = 0;
   // S x without forming S, and the diagonal blocks of S, (n_free x d x d).
   virtual void product(const double* x, double* out) = 0;
   virtual void diagonal_blocks(double* out) = 0;
 
-  // Blocks of S on and above its diagonal.
-  virtual std::int64_t schur_blocks() = 0;
   // Solve S x = rhs by dense Cholesky, or by sparse Cholesky after analyse; false if S is not positive definite.
   virtual bool solve(double* x) = 0;
   virtual const Fill& analyse(const FillLimits& limits) = 0;
@@ -89,11 +88,24 @@ class RelativePoseFactors {
   virtual double linearise(const StateView& s, const FactorSums& out) const = 0;
 };
 
+// The sparse Cholesky factor of a symmetric matrix by d x d blocks, for sums of S; linalg/sparse_cholesky.hpp.
+class SparseFactor {
+ public:
+  virtual ~SparseFactor();
+
+  // blocks: of the upper triangle in the order of the pattern, (n_blocks x d x d). x: right-hand side in, solution out.
+  // False if the matrix is not positive definite.
+  virtual bool solve(const double* blocks, double* x) = 0;
+};
+
 // What is compiled for one kind of processor.
 struct Target {
   const char* name;
   Kernel* (*make_kernel6)(KernelArguments&&);
   Kernel* (*make_kernel9)(KernelArguments&&);
+  // upper: rows of the upper triangle with the diagonal first.
+  SparseFactor* (*make_factor6)(const Rows32& upper);
+  SparseFactor* (*make_factor9)(const Rows32& upper);
   RelativePoseFactors* (*make_relative_poses)(const RelativePosesView&);
   void (*residual_norms)(const ProblemView&, const StateView&, double* out);
   void (*triangulate)(const RaysView&, std::int64_t n_points, double* points, double* parallax, bool* measured);
@@ -105,6 +117,8 @@ struct Target {
   extern const Target kTarget;                       \
   Kernel* make_kernel6(KernelArguments&& arguments); \
   Kernel* make_kernel9(KernelArguments&& arguments); \
+  SparseFactor* make_factor6(const Rows32& upper);   \
+  SparseFactor* make_factor9(const Rows32& upper);   \
   }
 BA_DECLARE_TARGET(baseline)
 BA_DECLARE_TARGET(avx2)
