@@ -59,7 +59,7 @@ CASES = (
     Combined(
         (("one_keyframe_far", 60.0),), "mono", 814, {"distortion": "equidistant", "fov_deg": 120.0, "path": "loop"}, ""
     ),
-    Combined((("ids_reused", None),), "mono", 815, {"path": "loop", "look_deg": 90.0}, "", pending=True),
+    Combined((("ids_reused", None),), "mono", 815, {"path": "loop", "look_deg": 90.0}, ""),
     Combined((("stands_still", 15.0), ("wrong_ids", 3.0)), "mono", 816, {}, ""),
     Combined((("stands_still", 30.0), ("outliers_uniform", 0.3)), "mono", 817, {}, ""),
     Combined((("stops_midway", 20.0), ("outliers_moving", 0.4)), "stereo", 818, {}, ""),
