@@ -260,7 +260,7 @@ class GuardConfig:
     )
     min_points: int = option(
         5,
-        "A keyframe that sees fewer points of a solve is not refined; one camera without depths needs 3 times as many.",
+        "A keyframe that sees fewer points of a solve is not refined; one camera without depths needs twice as many.",
         within=(2, 1000),
     )
     held_out_tracks: int = option(

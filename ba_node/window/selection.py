@@ -40,7 +40,7 @@ _MOST_TURNS = 200
 # Places in the order of time by which sessions are told apart.
 _APART = 10**9
 # So many times as many points does a keyframe need where images have no scale of their own.
-_WITHOUT_SCALE = 3
+_WITHOUT_SCALE = 2
 # As many residuals of known points tell how good the poses are.
 _BULK = 100
 
