@@ -35,6 +35,7 @@ from collections.abc import Callable, Iterable, Iterator
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.summary import MapEnded
+from ba_node.check.departure import departed
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
 from ba_node.core.problem import Cameras
@@ -188,7 +189,7 @@ class Backend:
         wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
         estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
-        return estimate if wrong else self.adjust() or estimate
+        return estimate if wrong else self.take_check(departed(self.scene)) or self.adjust() or estimate
 
     def adjust(self, *, final: bool = False) -> Estimate | None:
         """Bend the map and refine all of it, if a loop or what is absolute asks for it, see ``window/adjustment.py``.
@@ -259,9 +260,9 @@ class Backend:
         if isinstance(one, Keyframe) and self.scene.find_keyframe(one.keyframe_id) is not None:
             yield one
 
-    def take_check(self, check: Check) -> Estimate | None:
+    def take_check(self, check: Check | None) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
-        if not self.config.checks_setup or check.scene is not self.scene or not self.setup.take(check):
+        if check is None or not self.config.checks_setup or check.scene is not self.scene or not self.setup.take(check):
             return None
         self.map.hold_all(self.solve_count, self.setup.reason(self.scene))
         return self.estimate()
@@ -276,8 +277,7 @@ class Backend:
         if isinstance(begun, str):
             return None
         begun.solve(self.config.solver, by=by)
-        merged = self.merge(begun)
-        return merged[0] if merged else None
+        return merged[0] if (merged := self.merge(begun)) else None
 
     def begin_optimization(self) -> full.Optimization | str:
         """Return a solve of everything, to be run on any thread and then merged, or why there is none."""

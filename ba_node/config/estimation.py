@@ -258,7 +258,11 @@ class GuardConfig:
         "A solution that fewer of its observations agree with (within tracks.outlier_px) is held.",
         within=(0.0, 1.0),
     )
-    min_points: int = option(5, "A keyframe that sees fewer points of a solve is not refined.", within=(2, 1000))
+    min_points: int = option(
+        5,
+        "A keyframe that sees fewer points of a solve is not refined; one camera without depths needs 3 times as many.",
+        within=(2, 1000),
+    )
     held_out_tracks: int = option(
         16,
         "Tracks that a solution is tried on, at most one in 128 of which takes no part in it; 0: no trial.",

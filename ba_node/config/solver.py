@@ -243,7 +243,9 @@ class SolverOptions(SolverConfig):
         within=(0, 1000),
         aliases=("polish_steps",),
     )
-    t_eps: float = option(0.1, "PCG stops at |r| <= min(t_eps, |b|) |b|.", within=(0.0, 1e100))
+    t_eps: float = option(
+        0.1, "PCG stops at |r| <= min(t_eps, |b|) |b|; on two levels |r| is sqrt(r'M^-1 r).", within=(0.0, 1e100)
+    )
     q_eps: float = option(
         0.0,
         "PCG also stops where step i adds less than q_eps / i of what the model has gained; 0 for never.",

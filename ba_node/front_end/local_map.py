@@ -25,7 +25,7 @@ from ba_node.front_end.rectify import IdealRig
 # Inverse depths below this are as good as zero, 1/m.
 _FAR = 1e-4
 # Most points, and how many there is room for at first.
-_MOST, _ROOM = 6_000, 2_000
+_MOST, _ROOM = 6_000, 7_000
 _COLUMNS = ("track_id", "anchor", "uv", "inverse_depth", "sigma", "slant", "last_seen")
 
 

@@ -26,9 +26,8 @@ from ba_node.front_end.frame import Frame
 from ba_node.front_end.local_map import LocalMap, Warp
 from ba_node.front_end.rectify import IdealRig
 
-# Correlation of a patch and what is found for it, below which it is another thing; of one that was lost, and of one
-# that is to be cut anew.
-_SAME, _SAME_AGAIN, _RENEW = 0.7, 0.85, 0.8
+# Correlation of a patch and what is found for it, below which it is another thing; and of one that was lost.
+_SAME, _SAME_AGAIN = 0.7, 0.85
 # How far from where the pose says a patch may be found: followed ones, lost ones, px.
 _NEAR_PX, _AGAIN_PX = 4.0, 4.0
 # Least sigma of one camera, px; and as it is told beside an odometry, whose lengths must not be bent by what all points

@@ -47,10 +47,16 @@ class SessionRecord:
     def add(self, estimate: Estimate, current: CurrentMap) -> None:
         """Take in the next estimate; ``current`` is its map, as it is now."""
         before, now = self.last.trajectory, estimate.trajectory
-        # The oldest are forgotten first.
-        if len(before) and not np.array_equal(before[:1].keyframe_id, now[:1].keyframe_id):
+        if len(before) and len(now) <= len(before):
             gone = ~np.isin(before.keyframe_id, now.keyframe_id)
-            self.forgotten += [before[gone]] if gone.any() else []
+            if gone[0]:
+                # The oldest are forgotten first.
+                self.forgotten.append(before[gone])
+            else:
+                self.refined -= set(before.keyframe_id[gone].tolist())
+        if len(now) > len(self.inputs):
+            # Keyframes of a session before that was joined with this one.
+            self.inputs.update({one.keyframe_id: one for one in current.input_keyframes()} | self.inputs)
         self.last = estimate
         report = estimate.report
         self.statuses[report.status.name] += 1

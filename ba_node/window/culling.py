@@ -37,6 +37,7 @@ def cull(scene: Scene, config: Config) -> None:
     for row in candidates.tolist():
         if int(scene.keyframes.keyframe_id[row]) not in named and _seen_by_others(scene, row, gone) >= share:
             gone.append(row)
+    scene.log.notice("redundant", len(gone))
     if gone:
         scene.take_out(np.array(gone, np.intp))
 

@@ -9,7 +9,7 @@
   ``arrival.py``), or where several solves agree on it and the tracks that span it bear it out: so a loop may close.
   Where half the steps are off, or all are too long or turn too far by one factor, no track helps: the cameras or the
   depths are not what they are said to be, and fit each other all the same. Where much of what is seen moves, half as
-  much is too far.
+  much is too far, and steps that are all off to one side are what the moving objects make of them.
 - **Better**: it explains some tracks, most of which took no part, no worse than the front-end's poses do, for all
   cameras together and for each alone (``trial.py``).
 
@@ -44,8 +44,9 @@ _MIN_SPANNING = 10
 _SPANNING_SHARE = 0.5
 # A point that so many keyframes agree on ties them together.
 _TIED = 3
-# By how much bounds narrow where much of what is seen moves, or seems to.
-_NARROW = 0.5
+# By how much bounds narrow where much of what is seen moves, or seems to; and how surely steps may be off to one side
+# there, see ``steps.bias``.
+_NARROW, _MAX_BIAS = 0.5, 24.0
 # If more of the keyframes would have to be held one by one, it is the solution that is wrong.
 _MAX_HELD_SHARE = 0.25
 
@@ -203,6 +204,13 @@ class _Compared:
             return f"it turns {turn:.3g} times as far as the front-end: the focal length is not the true one"
         # The lower of two in the middle: of four steps two may lead to one keyframe that is far off.
         typical = float(np.sort(self.off.sigmas)[(len(self.first) - 1) // 2])
+        if self.selection.much_moves and steps.bias(self.solved, self.measured) > _MAX_BIAS:
+            aside = float(np.linalg.norm(np.mean(self.solved.move - self.measured.move, axis=0)))
+            turned = float(np.degrees(np.median(self.off.turn_rad)))
+            return (
+                f"its steps are off the front-end's to one side, by {aside:.2g} m and"
+                f" {turned:.2g} deg each, and much of what is seen moves: that may have carried it along"
+            )
         if typical > guard.max_typical_sigmas:
             move, angle = float(np.median(self.off.move_m)), float(np.degrees(np.median(self.off.turn_rad)))
             return (

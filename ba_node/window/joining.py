@@ -52,7 +52,7 @@ class Earlier:
         Returns:
             The session that it was joined with, and what is to be solved then; None if there is none.
         """
-        for before in reversed(self.scenes):
+        for before in reversed(self.scenes if len(scene.keyframes) and scene.cameras is not None else []):
             rows, known = _shared(scene, before)
             if len(rows) < LEAST:
                 continue

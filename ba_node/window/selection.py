@@ -39,6 +39,8 @@ _ABSURD = 25.0
 _MOST_TURNS = 200
 # Places in the order of time by which sessions are told apart.
 _APART = 10**9
+# So many times as many points does a keyframe need where images have no scale of their own.
+_WITHOUT_SCALE = 3
 # As many residuals of known points tell how good the poses are.
 _BULK = 100
 
@@ -121,7 +123,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     lost = _contradicted(scene, part, usable)
     moves = _moving(scene, part, norms, config)
     much_moves = moving.much(part.problem, moves)
-    least = config.guard.min_points if config.guard.enabled else 2
+    least = _least_points(part.problem, config)
     kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]
@@ -345,6 +347,14 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
         own = np.flatnonzero(obs.keyframe == k)
         far[own] = norms[own] > widened(gate, norms[own[classified[own]]], 1)
     return usable & ~far
+
+
+def _least_points(problem: Problem, config: Config) -> int:
+    """Return how many points a keyframe has to see: more where images have no scale of their own."""
+    if not config.guard.enabled:
+        return 2
+    has_scale = len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
+    return config.guard.min_points * (1 if has_scale else _WITHOUT_SCALE)
 
 
 def _moving(scene: Scene, part: _Part, norms: FloatArray, config: Config) -> BoolArray:

@@ -21,8 +21,8 @@ _TELLING = 3.0
 # One standard deviation of a normal distribution, in median absolute deviations; and of the median of n of its samples.
 _SPREAD = 1.4826
 _MEDIAN = 1.2533
-# Fewer steps than this show no common factor.
-_FEW = 5
+# Fewer steps than this show no common factor; so few show no bias.
+_FEW, _LEAST_BIASED = 5, 7
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,22 @@ def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
         return 1.0
     turns, wanted = (_axes(one.turn[telling]) for one in (steps, measured))
     return _common(turns, wanted, found.sigma_rad[telling])
+
+
+def bias(steps: Steps, measured: Steps) -> float:
+    """Return how surely steps are off measured ones to one side: the sum of squares of six means, in standard errors.
+
+    Errors of the front-end that are independent leave 6 on average (chi-square of six degrees of freedom, but for the
+    tails); few steps leave 0.
+    """
+    n = len(steps.move)
+    if n <= _LEAST_BIASED:
+        return 0.0
+    turned = _axes(np.swapaxes(measured.turn, 1, 2) @ steps.turn)
+    off = np.hstack([steps.move - measured.move, turned])
+    squared = np.mean(off, axis=0) ** 2 / np.maximum(np.var(off, axis=0, ddof=1) / n, 1e-24)
+    # The square of a variable of Student's distribution with n - 1 degrees of freedom is (n - 1) / (n - 3) on average.
+    return float(np.sum(squared)) * (n - 3) / (n - 1)
 
 
 def _axes(turn: FloatArray) -> FloatArray:

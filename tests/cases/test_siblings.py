@@ -13,21 +13,15 @@ from ba_node.offline.recording import record
 from experiments.robustness.faults import FAULTS, Recording, spoiled
 from tests.cases.conftest import Replay, harmless
 
-# Fault and rig that are not mended yet; one goes as soon as its tests pass. Of what one camera sees 40 % move, and in
-# places far more than half.
-PENDING = {("outliers_moving", "mono")}
-
 
 def siblings() -> list[Any]:
     """Return fault, rig, amount and seed of each fault, by turns; `ba robustness` takes all rigs and amounts."""
-    pending = pytest.mark.xfail(strict=True, reason="not mended yet")
     return [
         pytest.param(
             name,
             fault.rigs[i % len(fault.rigs)],
             fault.amounts[i % len(fault.amounts)],
             100 + number + 50 * i,
-            marks=[pending] if (name, fault.rigs[i % len(fault.rigs)]) in PENDING else [],
         )
         for number, (name, fault) in enumerate(FAULTS.items())
         # Of a motion the usual rig, to which it does most harm, and another; of the others one, by turns.

@@ -14,9 +14,8 @@ import pytest
 from ba_node.config.front_end import FrontEndOptions
 from ba_node.core import cameras, geometry
 from ba_node.estimate import Cloud, Poses, Transform
-from ba_node.front_end import FrontEnd, FrontEndError, Images, State, Tracked
-from ba_node.front_end.covariance import Lengths
-from ba_node.measurements import CameraRig, Keyframe
+from ba_node.front_end import FrontEnd, Images, State, Tracked
+from ba_node.measurements import Keyframe
 from tests.front_end import world
 
 OPTIONS = FrontEndOptions(max_features=300)
@@ -182,18 +181,6 @@ def test_one_camera_with_odometry(truth: list[Transform]) -> None:
     assert np.sqrt(across @ told @ across) == pytest.approx(0.0005 + 0.01 * length, rel=0.1)
     shared = np.intersect1d(keyframes[0].tracks[0].track_id, keyframes[2].tracks[0].track_id)
     assert len(shared) > 20
-
-
-@pytest.mark.parametrize(("scatter", "told"), [(0.0, 0.0), (0.003, 0.0), (0.03, 0.03)])
-def test_how_lengths_of_an_odometry_scatter_is_learned(scatter: float, told: float) -> None:
-    """Beyond what images are unsure by, and not by what they all differ by."""
-    rng, lengths = np.random.default_rng(2), Lengths()
-    before, step = Transform(np.eye(3), np.zeros(3)), np.array([0.0, 0.1, 1.0])
-    assert lengths.noise == 0.02
-    for share in 1.01 + scatter * rng.standard_normal(30):
-        after = [Transform(np.eye(3), -length * step) for length in (1.0, share)]
-        lengths.compare(before, *after)
-    assert lengths.noise == pytest.approx(told, abs=0.25 * told + 0.001)
 
 
 def test_one_camera_alone(truth: list[Transform]) -> None:
@@ -368,20 +355,6 @@ def test_refined_poses_move_the_map_and_not_what_is_published(stereo: list[Image
         a, b = one.process(frame), other.process(frame)
         assert a.pose is not None and b.pose is not None
         assert np.linalg.norm(a.pose.translation - b.pose.translation) < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"position": np.zeros((2, 3))}, "sit in one place"),
-        ({"models": ("fov", "fov")}, "distortion_model 'fov'"),
-        ({"position": np.array([[0.0, 0, 0], [0, 0, 0.3]])}, "expected two side by side"),
-    ],
-)
-def test_rigs_that_cannot_be_used(changes: dict[str, object], words: str) -> None:
-    broken: CameraRig = dataclasses.replace(world.rig(), **changes)  # type: ignore[arg-type]
-    with pytest.raises(FrontEndError, match=words):
-        FrontEnd(broken)
 
 
 def _noise(one: Images) -> Images:

@@ -20,6 +20,7 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.synthetic import SyntheticOptions, generate
+from tests.window.test_joining import CUT, N, small_eight, two_sessions
 
 S = 1_000_000_000
 HOUR = 3600 * S
@@ -174,3 +175,31 @@ def test_the_lower_session_of_a_front_end_that_restarted_is_written(tmp_path: Pa
     assert (report["session_id"], report["keyframes"]) == (0, 8)
     assert [(entry["folder"], entry["keyframes"]) for entry in report["older_sessions"]] == [("session_6", 10)]
     assert any("below the current 6: a new session begins" in line for line in report["attention"])
+
+
+TOPICS = {CameraRig: "camera_rig", Keyframe: "keyframes", FeatureTracks: "feature_tracks"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("joined", [True, False])
+def test_sessions_that_are_joined_are_written_as_one(tmp_path: Path, joined: bool) -> None:
+    data = small_eight()
+    rows = ((TOPICS[type(one)], data.keyframes[0].stamp_ns + i, one) for i, one in enumerate(two_sessions(data)))
+    record(tmp_path / "two.mcap", rows, data.truth)
+    chosen = ["--set", f"scene.join_sessions={str(joined).lower()}", "--no-report"]
+    assert main(["replay", str(tmp_path / "two.mcap"), "--out", str(tmp_path / "out"), *chosen]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (report["keyframes"], report["keyframes_refined"]) == ((N, N) if joined else (N - CUT, N - CUT))
+    assert report["trajectory_error_m"]["refined"] < 0.02
+    assert len(read_tum(tmp_path / "out" / "trajectory.tum")) == report["keyframes"]
+
+
+@pytest.mark.slow
+def test_keyframes_that_are_culled_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "loop.mcap"
+    record(path, timeline(path="loop", keyframes=40, length_m=24.0, landmarks=1500), None)
+    chosen = ["--set", "scene.redundant_share=0.6", "--set", "window.max_keyframes=10", "--no-report"]
+    assert main(["replay", str(path), "--out", str(tmp_path / "out"), *chosen]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["notices"]["redundant"] > 3
+    assert report["keyframes"] == report["keyframes_refined"] == 40 - report["notices"]["redundant"]

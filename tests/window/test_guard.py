@@ -27,6 +27,22 @@ def steps_of(found: tuple[np.ndarray, np.ndarray]) -> steps.Steps:
     return steps.between(*found, first, first + 1)
 
 
+def test_steps_that_are_off_to_one_side_stand_out_of_noise() -> None:
+    """Six means of independent errors leave 6, a shift of 5 % of a metre leaves far more."""
+    rng = np.random.default_rng(3)
+    measured = steps.Steps(np.tile(np.eye(3), (20, 1, 1)), np.tile([1.0, 0.0, 0.0], (20, 1)))
+    found = []
+    for _ in range(400):
+        turn, move = geometry.so3_exp(0.01 * rng.normal(size=(20, 3))), 0.02 * rng.normal(size=(20, 3))
+        found.append(steps.bias(steps.Steps(turn, measured.move + move), measured))
+    assert np.mean(found) == pytest.approx(6.0, abs=0.5)
+    assert np.mean(np.array(found) > 24.0) < 0.02
+    moved = steps.Steps(turn, measured.move + move + [0.0, 0.05, 0.0])
+    assert steps.bias(moved, measured) > 30.0
+    few = steps.Steps(moved.turn[:7], moved.move[:7])
+    assert steps.bias(few, steps.Steps(measured.turn[:7], measured.move[:7])) == 0.0
+
+
 def test_steps_do_not_depend_on_where_the_map_lies() -> None:
     rotation, translation = poses(np.random.default_rng(0), 8)
     turn, shift = geometry.so3_exp(np.array([0.3, -0.2, 1.0])), np.array([5.0, -2.0, 8.0])

@@ -25,10 +25,14 @@ FAR = np.uint64(10**6)
 TURN, SHIFT = geometry.so3_exp(np.array([0.0, 0.0, 2.0])), np.array([300.0, -50.0, 7.0])
 
 
-@pytest.fixture(scope="module")
-def data() -> SyntheticData:
+def small_eight() -> SyntheticData:
     """Return a figure of eight: its second half sees again what the first has seen, under the same ids."""
     return generate(SyntheticOptions(seed=2, keyframes=N, landmarks=1200, tracks=60, length_m=40.0))
+
+
+@pytest.fixture(scope="module")
+def data() -> SyntheticData:
+    return small_eight()
 
 
 def two_sessions(data: SyntheticData, *, merged: bool = False) -> Iterator[Measurement]:

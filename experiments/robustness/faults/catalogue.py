@@ -9,7 +9,7 @@ One line makes a recording with a fault and its truth::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -170,7 +170,7 @@ FAULTS: dict[str, Fault] = {
     "wrong_ids": Fault("keyframes with wrong ids", tracks.wrong_ids, amounts=(5.0, 1.0, 2.0)),
     "outliers_uniform": Fault("outliers anywhere, share", tracks.outliers_uniform, amounts=(0.3, 0.5, 0.1), rigs=_ALL),
     "outliers_jumping": Fault("tracks jump, share", tracks.outliers_jumping, amounts=(0.3, 0.5, 0.1), rigs=_ALL),
-    "outliers_moving": Fault("moving objects, share", tracks.outliers_moving, amounts=(0.3, 0.4, 0.1), rigs=_ALL),
+    "outliers_moving": Fault("moving objects, share", tracks.outliers_moving, amounts=(0.3, 0.4, 0.6), rigs=_ALL),
     "one_keyframe_far": Fault(
         "one keyframe off, m",
         tracks.one_keyframe_far,
@@ -225,7 +225,41 @@ FAULTS: dict[str, Fault] = {
             "length_m": 10.0,
         },
     ),
+    # What is nearly right.
+    "focal_slightly_off": Fault(
+        "focal length slightly off, times", setup.focal_off, amounts=(1.05, 0.95, 1.1, 0.9), rigs=_ALL
+    ),
+    "depth_slightly_off": Fault(
+        "depth slightly off, times", setup.depth_in_mm, amounts=(1.05, 0.95), rigs=(RGBD,), named=("depth",)
+    ),
+    "baseline_off": Fault("baseline, times", setup.baseline_off, amounts=(1.05, 0.95, 1.1), rigs=_TWO),
+    "steps_scaled": Fault("positions of the keyframes, times", setup.steps_scaled, amounts=(1.08, 0.93), rigs=_ALL),
+    "sigma_off": Fault("sigma_px, times", setup.sigma_off, amounts=(10.0, 0.1, 4.0), rigs=_ALL),
 }
+
+
+def spoiled_by(
+    faults: Sequence[tuple[str, float | None]], rig: str | None = None, seed: int = 0, **changes: Any
+) -> Recording:
+    """Return a recording with several faults at once, see :func:`spoiled`; each with its amount, None for the usual."""
+    options = dict(_BASE)
+    known = [(name, FAULTS[name], FAULTS[name].amounts[0] if amount is None else amount) for name, amount in faults]
+    for _, fault, _ in known:
+        options |= fault.changes
+    options |= RIGS[rig or (known[0][1].rigs[0] if known else STEREO)] | changes
+
+    def moved(world: World, path: Path) -> tuple[World, Path]:
+        for _, fault, much in known:
+            if fault.motion is not None:
+                world, path = fault.motion(world, path, much)
+        return world, path
+
+    data = generate(SyntheticOptions(**options, seed=seed), moved)
+    recording = Recording(data, tuple(data.timeline()))
+    for name, fault, much in known:
+        if fault.edit is not None:
+            recording = fault.edit(recording, much, np.random.default_rng([seed, *name.encode()]))
+    return recording
 
 
 def spoiled(name: str, rig: str | None = None, amount: float | None = None, seed: int = 0, **changes: Any) -> Recording:
@@ -242,15 +276,7 @@ def spoiled(name: str, rig: str | None = None, amount: float | None = None, seed
         KeyError: no such fault or rig.
         ConfigError: an option out of range.
     """
-    fault = Fault("nothing") if name == SOUND else FAULTS[name]
-    much = fault.amounts[0] if amount is None else amount
-    options = SyntheticOptions(**{**_BASE, **RIGS[rig or fault.rigs[0]], **fault.changes, **changes}, seed=seed)
-    move = fault.motion
-    data = generate(options, None if move is None else lambda world, path: move(world, path, much))
-    recording = Recording(data, tuple(data.timeline()))
-    if fault.edit is None:
-        return recording
-    return fault.edit(recording, much, np.random.default_rng([seed, *name.encode()]))
+    return spoiled_by([] if name == SOUND else [(name, amount)], rig, seed, **changes)
 
 
 SOUND = "sound"

@@ -67,6 +67,29 @@ def camera_turned(recording: Recording, amount: float, rng: np.random.Generator)
     return recording.changed(CameraRig, change)
 
 
+def baseline_off(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Multiply the distance of the second camera from the first."""
+
+    def change(rig: CameraRig) -> CameraRig:
+        position = rig.position.copy()
+        position[1] = position[0] + amount * (position[1] - position[0])
+        return dataclasses.replace(rig, position=position)
+
+    return recording.changed(CameraRig, change)
+
+
+def sigma_off(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Multiply the stated standard deviation of image coordinates."""
+    return recording.changed(FeatureTracks, lambda image: dataclasses.replace(image, sigma_px=amount * image.sigma_px))
+
+
+def steps_scaled(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Multiply the positions of the keyframes."""
+    return recording.changed(
+        Keyframe, lambda keyframe: dataclasses.replace(keyframe, position=amount * keyframe.position)
+    )
+
+
 def depth_in_mm(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
     """Multiply depths, by 1000 where they are in millimetres."""
     return recording.changed(FeatureTracks, lambda image: dataclasses.replace(image, depth_m=amount * image.depth_m))

@@ -1,0 +1,80 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""A map whose steps are all off the front-end's by one factor is given up, and both that may be wrong are named."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from ba_node.check.departure import departed
+from ba_node.config import Config
+from ba_node.core import geometry
+from ba_node.scene.scene import Scene
+from ba_node.synthetic import SyntheticData
+from tests.check.set_ups import recording, scene_of
+
+STEP_NOISE_M = 0.02
+
+
+def refined(data: SyntheticData, factor: float, keyframes: int = 30, seed: int = 0) -> Scene:
+    """Return a scene whose keyframes count as refined: poses as given, stretched by a factor and with noise."""
+    scene = scene_of(data, keyframes)
+    table, rng = scene.keyframes, np.random.default_rng(seed)
+    noise = np.cumsum(STEP_NOISE_M * rng.normal(size=(keyframes, 3)), axis=0)
+    table.position[:] = factor * table.input_position + noise
+    table.rotation[:] = geometry.so3_exp(np.array([0.1, 0.0, 0.4])) @ table.input_rotation
+    table.position[:] = table.position @ geometry.so3_exp(np.array([0.1, 0.0, 0.4])).T
+    table.refined[:] = True
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("mode", "factor", "words"),
+    [
+        ("stereo", 1.05, r"scale of focal length or baseline: lengths are 1\.0[45]\d? times .* 0\.9[456]\d? times"),
+        ("stereo", 0.95, r"lengths are 0\.9[456]\d? times"),
+        ("rgbd", 1.05, r"scale of depth_m: it is 1\.0[45]\d? times .* what depth_m tells"),
+    ],
+)
+def test_one_factor_is_named(mode: str, factor: float, words: str) -> None:
+    check = departed(refined(recording(mode=mode, path="line"), factor))
+    assert check is not None and check.found is not None
+    found = check.found
+    assert found.harmful
+    assert re.search(words, found.causes()), found.causes()
+
+
+@pytest.mark.parametrize("mode", ["stereo", "rgbd"])
+def test_noise_is_no_factor(mode: str) -> None:
+    """A factor below that of good rigs and wheels, and the spread of the steps, say nothing."""
+    data = recording(mode=mode, path="line")
+    for seed in range(40):
+        for factor in (0.99, 1.0, 1.01):
+            assert departed(refined(data, factor, seed=seed)) is None, f"seed {seed}, factor {factor}"
+
+
+def test_where_it_cannot_be_asked() -> None:
+    assert departed(refined(recording(mode="mono", path="line"), 1.1)) is None, "one camera has no scale"
+    data = recording(path="line")
+    assert departed(refined(data, 1.1, keyframes=10)) is None, "too few steps"
+    assert departed(Scene(Config().scene)) is None
+    half = refined(data, 1.1)
+    half.keyframes.refined[::2] = False
+    assert departed(half) is None, "no step has both ends refined"
+
+
+def test_steps_that_are_noise_tell_nothing() -> None:
+    """As those of a robot that turns on the spot: the front-end's are longer, whatever is right."""
+    scene, rng = refined(recording(path="line"), 1.0), np.random.default_rng(5)
+    scene.keyframes.position[:] = np.cumsum(1e-3 * rng.normal(size=(30, 3)), axis=0)
+    scene.keyframes.input_position[:] = 1.2 * scene.keyframes.position + 5e-4 * rng.normal(size=(30, 3))
+    assert departed(scene) is None
+
+
+def test_a_way_that_is_standing_still_tells_nothing() -> None:
+    scene = refined(recording(path="line"), 1.0)
+    scene.keyframes.input_position[:] = scene.keyframes.position[:] = 0.0
+    assert departed(scene) is None
