@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
+import pytest
+
+pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap")
 
 # fx ... and distortion of each camera model, for images of 1024 x 768.
 LENSES = {

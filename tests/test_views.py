@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 import yaml
-from foxglove import layouts
 
 from ba_node.estimate import SolveReport
 from ba_node.io.parameters import NODE_NAME
@@ -84,6 +83,7 @@ def test_every_panel_of_the_foxglove_layout_has_a_place() -> None:
 
 
 def test_the_library_of_foxglove_knows_every_setting_of_the_layout() -> None:
+    layouts = pytest.importorskip("foxglove.layouts", reason="needs foxglove-sdk")
     """A setting that the app does not know is passed over in silence."""
     configs = {
         "3D": layouts.ThreeDeeConfig,

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 
 from ba_node.cli import solve as solve_command
@@ -26,7 +25,7 @@ from ba_node.io.ply import read_ply
 from ba_node.io.reference import read_poses
 from ba_node.offline import solve_model
 from ba_node.offline.solver_settings import solver_options
-from tests.models import LENSES, adjusted, make_model, objective, written
+from tests.models import LENSES, adjusted, make_model, objective, pycolmap, written
 
 
 def solved(path: Path, out: Path, *options: str) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import resource
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 
 from ba_node.config import SolverOptions
@@ -14,7 +13,7 @@ from ba_node.core.objective import Objective
 from ba_node.io.colmap import read_colmap, to_colmap, write_colmap
 from ba_node.io.model import LENSES as KNOWN
 from ba_node.io.model import ModelError, lens_of
-from tests.models import LENSES, make_model, objective, written
+from tests.models import LENSES, make_model, objective, pycolmap, written
 
 
 def ours(path: Path) -> float:

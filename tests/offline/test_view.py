@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tornado.websocket import websocket_connect
 
 from ba_node.cli.main import main
 from ba_node.io.bag_reader import BagReader
@@ -21,12 +20,14 @@ from ba_node.offline.recording import record
 from ba_node.offline.view import ViewError, ViewOptions, serve, view
 from ba_node.synthetic import SyntheticOptions, generate
 
+pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+websocket = pytest.importorskip("tornado.websocket", reason="needs tornado")
 _MESSAGE = 1
 
 
 async def listen(address: str, wanted: int) -> tuple[dict[str, dict[str, Any]], dict[str, list[bytes]]]:
     """Subscribe to all channels; return these by topic, and so many messages."""
-    client = await websocket_connect(address, subprotocols=["foxglove.sdk.v1"])
+    client = await websocket.websocket_connect(address, subprotocols=["foxglove.sdk.v1"])
     channels: dict[str, dict[str, Any]] = {}
     topics: dict[int, str] = {}
     got: dict[str, list[bytes]] = {}
