@@ -109,7 +109,7 @@ class _Tokens:
     communicator: Communicator
 
     def rows(self, begin: int, width: int, bounds: IntArray) -> FloatArray:
-        """Return this rank's rows (n, width) of a table that begins at a number; rank r has rows bounds[r : r + 2]."""
+        """Return what this rank has of a table, (n, width), that begins at a number; rank r has bounds[r : r + 2]."""
         ends = np.clip(begin + width * bounds - self.first, 0, len(self.own))
         parts = [self.own[a:b] for a, b in itertools.pairwise(ends)]
         found = [part for part in self.communicator.exchange(parts) if len(part)]
