@@ -25,7 +25,7 @@ setup: ## make .venv with ROS 2 Jazzy, ba_msgs and ba_node; the commands below d
 demo: setup ## play a recording into the node over DDS, compare with ground truth, write out/demo/
 	@$(RUN) -m ba_node.cli.main demo --out out/demo $(ARGS)
 
-test: setup ## run the quick tests (about 5 minutes on two cores; ARGS="-k solver", ARGS="-m slow")
+test: setup ## run the quick tests (about 6 minutes on two cores; ARGS="-k solver", ARGS="-m slow")
 	@$(PYTEST) -m "not slow" $(ARGS)
 
 test-all: setup ## run all tests, the slow ones too
