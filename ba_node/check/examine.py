@@ -7,6 +7,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+import numpy as np
+
 from ba_node.check import ids, intrinsics, motion, placement, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
@@ -16,6 +18,8 @@ _RELATIONS = frozenset({"cameras", "poses"})
 _BUILD_ON_THESE = ("intrinsics", "lengths")
 # Sizes of the image whose losses differ by no more than this factor are both named.
 _ALIKE = 1.1
+# Part of the loss as given that another size may leave where the poses alone do not tell.
+_CLEARLY = 0.9
 # What nothing can be told without.
 _PIXELS = "pixels"
 
@@ -95,10 +99,16 @@ def _of_size(tracks: Tracks, pairs: list[Relation], outcome: Diagnosis) -> Findi
         if fit.sound:
             outcome.rows.append(dataclasses.replace(fit.rows[0], hypothesis=model.cause))
             fits.append((intrinsics.loss_of(other, related), model.cause, model.change))
-    if not fits:
+    # Where the poses as given were not told, they are not known to contradict the tracks: the images have to say it.
+    if not fits or (not outcome.findings and not _is_clear(min(fits)[0], intrinsics.loss_of(tracks, pairs))):
         return None
     # Few keyframes cannot tell these apart.
     causes, changes = zip(
         *((cause, change) for loss, cause, change in sorted(fits) if loss <= _ALIKE * min(fits)[0]), strict=True
     )
     return Finding(causes, evidence, changes, usual=True)
+
+
+def _is_clear(loss: float, given: float) -> bool:
+    """Return True if another size leaves clearly less of a loss that is known."""
+    return given < np.inf and loss < _CLEARLY * given

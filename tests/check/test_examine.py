@@ -16,6 +16,7 @@ from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from experiments.robustness.faults import spoiled
 from tests.check.set_ups import recording, seen
+from tests.window.street import round_trip
 
 # Mistake -> modes in which it shows, and what the likely mistake says.
 NAMED: dict[str, tuple[tuple[str, ...], str]] = {
@@ -208,6 +209,13 @@ def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
     tracks = tracks_of(scene)
     assert tracks is not None
     assert re.search("region of interest", examine(tracks).summary())
+
+
+@pytest.mark.parametrize(("noise_px", "seed", "keyframes"), [(1.0, 3, 15), (1.0, 5, 15), (2.0, 2, 40)])
+def test_a_street_seen_low_in_the_image_is_no_region(noise_px: float, seed: int, keyframes: int) -> None:
+    """Points lie in the lower half of the image, and too little parallax leaves the poses untold."""
+    found = examine(seen(round_trip(noise_px, seed=seed, drift_rotation_deg=1.5), keyframes))
+    assert not found.harmful, found.summary()
 
 
 @pytest.mark.parametrize(
