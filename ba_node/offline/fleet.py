@@ -80,7 +80,7 @@ class Fleet:
         if not self.remote:
             os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), _QUIET]))
             address = stack.enter_context(
-                cluster(n_workers=self._jobs, threads_per_worker=1, dashboard_address=None, silence_logs=50)
+                cluster(n_workers=self._jobs, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
             )
         try:
             client = stack.enter_context(connect(address, timeout=_CONNECT_S))

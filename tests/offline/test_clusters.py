@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 MONO = ROOT / "bags" / "mono_loop.mcap"
 MANIFEST = ROOT / "examples" / "kubernetes.yaml"
 PORT = "18786"
-pytest.importorskip("distributed", reason="needs dask.distributed: pip install ba_node[fleet]")
+distributed = pytest.importorskip("distributed", reason="needs dask.distributed: pip install ba_node[fleet]")
 
 
 @contextmanager
@@ -101,7 +101,6 @@ def test_the_manifest_is_one_of_kubernetes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="workers may come later than the check asks for them", strict=False)
 def test_the_commands_of_the_manifest_make_a_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [
         " ".join(part["spec"]["template"]["spec"]["containers"][0]["args"])
@@ -111,5 +110,7 @@ def test_the_commands_of_the_manifest_make_a_cluster(tmp_path: Path, capsys: pyt
         for line in words:
             here = line.replace("ba-scheduler", "127.0.0.1").replace("8786", PORT)
             stack.enter_context(dask(*here.split(), "--no-dashboard"))
+        with distributed.Client(f"tcp://127.0.0.1:{PORT}", timeout=60) as client:
+            client.wait_for_workers(1, timeout=60)
         assert checked(f"tcp://127.0.0.1:{PORT}", tmp_path) == 0
     assert f"{MONO}: ok" in capsys.readouterr().out

@@ -32,7 +32,7 @@ _START_S = 60.0
 def cluster() -> Iterator[Any]:
     """Return a Dask cluster of two processes."""
     distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as made:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as made:
         yield made
 
 
@@ -41,6 +41,14 @@ def broken(tmp_path: Path) -> Path:
     path = tmp_path / "broken.mcap"
     path.write_bytes(MONO.read_bytes()[:3000])
     return path
+
+
+@pytest.mark.slow
+def test_two_fleets_at_once_do_not_ask_for_the_same_port() -> None:
+    """Dask's own choice is 8787, with a warning where somebody has it; warnings fail a test."""
+    pytest.importorskip("distributed", reason="needs dask.distributed")
+    with Fleet(jobs=2) as one, Fleet(jobs=2) as other:
+        assert one.size == other.size == 2
 
 
 @pytest.mark.slow
