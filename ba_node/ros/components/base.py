@@ -82,9 +82,6 @@ class Component:
     def deactivate(self) -> None:
         """Pause: nothing may be published until :meth:`activate`. ``host.active`` is False already."""
 
-    def reconfigure(self, before: Config) -> None:
-        """Follow a change of parameters: ``host.config`` is new already. The back-end is told by the node."""
-
     def take_report(self, outcome: Outcome) -> None:
         """Take what the worker reports, of every solve and on what was turned away; only while active."""
 
