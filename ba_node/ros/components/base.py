@@ -36,7 +36,7 @@ from ba_node.measurements import CameraRig
 from ba_node.messages.report import Report
 from ba_node.messages.topics import Topic
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.worker import Notice, Outcome, Worker
