@@ -45,10 +45,9 @@ from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
 from ba_node.scene.map_content import MapContent
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
-from ba_node.window import adjustment, full, guard, quality
-from ba_node.window.adjustment import Adjustment
-from ba_node.window.joining import Earlier
+from ba_node.window import adjustment, full, guard, joining, precision, quality
 
+Work = adjustment.Adjustment | precision.Study  # what may run beside solves
 _REFUSED_KEPT = 1000
 
 
@@ -63,12 +62,12 @@ class Backend:
         self.extras = Extras()  # what the next solve is to work out beside the estimate
         self.setup = SetUpWatch()  # the check of the set-up; while it gives a reason, every solve is held
         self.refusal = ""  # why the last solve of everything was held, in words; empty if it was not
-        # runs an adjustment on another thread, which then goes to :meth:`take_adjustment`; None: at once
-        self.adjust_elsewhere: Callable[[Adjustment], None] | None = None
-        self._adjusting: Adjustment | None = None
+        # runs what takes long on another thread, and then gives it to :meth:`take_work`; None: at once
+        self.elsewhere: Callable[[Work], None] | None = None
+        self._adjusting: adjustment.Adjustment | None = None
         self._clock = clock
         self._sessions = Sessions()
-        self._earlier = Earlier()
+        self._earlier = joining.Earlier()
 
     @property
     def config(self) -> Config:
@@ -92,11 +91,6 @@ class Backend:
     def rejection_notes(self) -> deque[str]:
         """Return the last rejections in words, oldest first."""
         return self.scene.log.notes
-
-    @property
-    def rejection_cause(self) -> str:
-        """Return the first case of what was turned away by itself, in words; empty if nothing was."""
-        return self.scene.log.cause()
 
     @property
     def ready(self) -> bool:
@@ -185,6 +179,8 @@ class Backend:
         wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
         estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
+        if (study := self.map.begun_study()) is not None:
+            self._work(study)
         return estimate if wrong else self.take_check(departed(self.scene)) or self.adjust() or estimate
 
     def adjust(self, *, final: bool = False) -> Estimate | None:
@@ -201,15 +197,21 @@ class Backend:
         what = joined or adjustment.due(self.scene, self.config, final=final)
         if what is None:
             return None
-        begun = self._adjusting = Adjustment(self.scene, what, self.config, self.extras)
-        if self.adjust_elsewhere is not None and not final:
-            self.adjust_elsewhere(begun)
+        begun = self._adjusting = adjustment.Adjustment(self.scene, what, self.config, self.extras)
+        return self._work(begun, at_once=final)
+
+    def _work(self, begun: Work, *, at_once: bool = False) -> Estimate | None:
+        if self.elsewhere is not None and not at_once:
+            self.elsewhere(begun)
             return None
         begun.run()
-        return self.take_adjustment(begun)
+        return self.take_work(begun)
 
-    def take_adjustment(self, done: Adjustment) -> Estimate | None:
-        """Take in an adjustment that was run; return what is known then, None if the map stays as it is."""
+    def take_work(self, done: Work) -> Estimate | None:
+        """Take in what was run; return what is known then, None if the map stays as it is."""
+        if isinstance(done, precision.Study):
+            self.map.learn(done)
+            return None
         if done is not self._adjusting or done.scene is not self.scene:
             return None
         self._adjusting = None
@@ -325,7 +327,7 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
-        self._earlier = Earlier()
+        self._earlier = joining.Earlier()
         self._sessions.reset()
         self._renew(None, self.scene.next_cameras or self.scene.cameras)
         self.map.report = SolveReport(reason="reset: the map is empty")
@@ -344,7 +346,7 @@ class Backend:
         known.scene.config = self.config.scene
         self.map = CurrentMap(self.config, known.scene, self.map.index + 1)
         self.map.report, self.map.correction = known.report, known.correction
-        self._earlier = Earlier()
+        self._earlier = joining.Earlier()
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
         newest = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
         self.map.completion = Completion(newest, known.settled, known.delivered)
