@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 
 pytestmark = pytest.mark.dds
 

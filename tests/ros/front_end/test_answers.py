@@ -16,7 +16,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 
 from ba_node.messages.factory import header_message
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory, message_class
 
 pytestmark = pytest.mark.dds
 StartNode = Callable[..., Any]
