@@ -106,9 +106,9 @@ class NativeKernels:
         """Return the keyframes' part of the gradient, (n_free, d)."""
         return self._kernel.gradient()
 
-    def diagonals(self) -> tuple[FloatArray, FloatArray]:
-        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
-        d_c, d_p = self._kernel.diagonals()
+    def diagonals(self, *, of_points: bool = True) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3) unless that is wanted too."""
+        d_c, d_p = self._kernel.diagonals(of_points)
         return d_c, d_p
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NativeSystem:

@@ -96,8 +96,8 @@ class Kernel:
     def gradient(self) -> Doubles:
         """Return the keyframes' part of the gradient, (n_free, d)."""
 
-    def diagonals(self) -> tuple[Doubles, Doubles]:
-        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
+    def diagonals(self, of_points: bool) -> tuple[Doubles, Doubles]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3)."""
 
     def step(self, state: State, step_c: Doubles, steps: int, out: State) -> tuple[float, float, float, float]:
         """Return predicted reduction, 1/2 p'Dp, and the objective before and after the inner iterations."""

@@ -200,9 +200,9 @@ void bind_assembly(py::class_<Kernel>& kernel) {
              return out;
            })
       .def("diagonals",
-           [](const Kernel& k) {
-             Doubles d_c = empty({k.n_free(), k.size()}), d_p = empty({k.n_points(), 3});
-             k.diagonals(d_c.mutable_data(), d_p.mutable_data());
+           [](const Kernel& k, bool of_points) {
+             Doubles d_c = empty({k.n_free(), k.size()}), d_p = empty({of_points ? k.n_points() : 0, 3});
+             k.diagonals(d_c.mutable_data(), of_points ? d_p.mutable_data() : nullptr);
              return py::make_tuple(d_c, d_p);
            })
       .def("step", &step);
