@@ -95,6 +95,7 @@ class Asker:
 
 
 def test_the_front_end_answers_while_it_tracks(start_node: StartNode, make_peer: MakePeer) -> None:
+    pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
     node, peer = start_node("--ros-args", "-p", "mode:=mono", program="ba_node.ros.front_end.main:main"), make_peer()
     asker = Asker(peer, "ba_front_end")
     images = peer.node.create_publisher(message_class("sensor_msgs/msg/Image"), "image_raw", qos.reliable(100))
