@@ -18,10 +18,9 @@ A replay solves once for every keyframe, however the messages are spaced, just b
 
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
-due again if it was not refined without them. A higher session id begins a new map with the same rig; the last estimate
-of the one before is kept in ``finished``. So do keyframes far older than the newest, as when a recording is played
-again; their session id stays as the front-end has it. A keyframe that is odd is held until others tell what it was, see
-``scene/sessions.py``; then several are taken in at once.
+due again if it was not refined without them. A higher session id begins a new map with the same rig, and so do
+keyframes far older than the newest, as when a recording is played again; their session id stays as the front-end has
+it. One that is odd is held until others tell what it was, see ``scene/sessions.py``; then several are taken in at once.
 
 Nothing here reads a clock: the caller passes one, for the report alone.
 """
@@ -49,7 +48,7 @@ from ba_node.scene.sessions import Sessions
 from ba_node.window import adjustment, full, guard, joining, precision, quality
 
 Work = adjustment.Adjustment | precision.Study  # what may run beside solves
-FINISHED_KEPT, _REFUSED_KEPT = 8, 1000
+_REFUSED_KEPT = 1000
 
 
 class Backend:
@@ -58,7 +57,6 @@ class Backend:
     def __init__(self, config: Config, *, clock: Callable[[], float] = lambda: 0.0) -> None:
         """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
         self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
-        self.finished: list[tuple[int, Estimate]] = []  # id and last estimate of the last sessions, oldest first
         self.solve_count = 0  # solves since the beginning
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)  # the last keyframes that were turned away
         self.extras = Extras()  # what the next solve is to work out beside the estimate
@@ -195,9 +193,8 @@ class Backend:
             return None
         joined = self._earlier.join(self.scene, self.config, final=final)
         if joined is not None:
-            self.finished = [one for one in self.finished if one[0] != joined[0]]
             self.map.correct(int(self.scene.order[-1]))
-        what = joined[1] if joined else adjustment.due(self.scene, self.config, final=final)
+        what = joined or adjustment.due(self.scene, self.config, final=final)
         if what is None:
             return None
         begun = self._adjusting = adjustment.Adjustment(self.scene, what, self.config, self.extras)
@@ -330,7 +327,7 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
-        self.finished, self._earlier = [], joining.Earlier()
+        self._earlier = joining.Earlier()
         self._sessions.reset()
         self._renew(None, self.scene.next_cameras or self.scene.cameras)
         self.map.report = SolveReport(reason="reset: the map is empty")
@@ -339,10 +336,7 @@ class Backend:
         """Return a copy of all that is known, for a file; see docs/map_format.md."""
         known, done = self.map, self.map.completion
         of_newest = done.row(self.scene), done.closed, tuple(done.delivered)
-        state = archive.MapState(
-            self.scene, self.finished, known.report, known.correction, *of_newest, self.solve_count
-        )
-        return archive.pack(state)
+        return archive.pack(archive.MapState(self.scene, known.report, known.correction, *of_newest, self.solve_count))
 
     def take_over(self, known: archive.MapState) -> None:
         """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
@@ -354,7 +348,6 @@ class Backend:
         self.map.report, self.map.correction = known.report, known.correction
         self._earlier = joining.Earlier()
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
-        self.finished = known.finished[-FINISHED_KEPT:]
         newest = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
         self.map.completion = Completion(newest, known.settled, known.delivered)
         self.solve_count = max(self.solve_count, known.solve_count)
@@ -383,9 +376,6 @@ class Backend:
         if len(before.keyframes) and not begin.replaces:
             assert before.session_id is not None
             before.end_pending()
-            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.map.rejected.items())))
-            self.finished.append((before.session_id, self.map.estimate()))
-            del self.finished[:-FINISHED_KEPT]
             self._earlier.keep(before, self.config)
         self._renew(session_id, before.next_cameras or before.cameras)
         self.scene.pending = waiting.pending

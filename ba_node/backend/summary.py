@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
@@ -34,6 +35,7 @@ class MapSummary:
     rejection_cause: str  # the first case of what was turned away by itself, in words; empty if nothing was
     warnings: dict[str, str]  # what somebody has to know or mend, by kind
     observed: quality.Residuals  # of each observation, by what is refined
+    body_from_camera: FloatArray  # (3, 3) axes of the first camera on the body; those of the body before a rig came
 
 
 @dataclass(frozen=True)
@@ -63,4 +65,5 @@ def summary_of(scene: Scene, config: Config) -> MapSummary:
         rejection_cause=scene.log.cause(),
         warnings=dict(scene.log.warnings),
         observed=quality.residuals(scene, config, "refined"),
+        body_from_camera=np.eye(3) if scene.cameras is None else scene.cameras.rotation[0].T,
     )

@@ -195,10 +195,8 @@ class BaNode(ManagedNode):
         host = self._host
         if host is None:
             return
-        before, host.config = host.config, config
+        host.config = config
         host.inbox.post(lambda backend: backend.configure(config))
-        for component in self._components:
-            component.reconfigure(before)
 
     def _distribute(self) -> None:
         """Give the components what the worker has made."""
