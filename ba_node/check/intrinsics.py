@@ -16,7 +16,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.check.adjusted import LARGE, Adjusted, Freed, Measure, problem_of
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
-from ba_node.check.relations import AGREED, Relation, median_share
+from ba_node.check.relations import AGREED, Relation, in_motion, median_share
 from ba_node.check.tracks import Tracks
 from ba_node.core import cameras
 from ba_node.core.cameras import CX, CY, DISTORTION, FX, FY
@@ -27,7 +27,7 @@ _FACTORS = (0.5, 0.7, 1.4, 2.0)
 # Changes of the focal length, and of the principal point in focal lengths, that are not named; and the standard
 # deviations that they have to be worth. What has a larger standard deviation than the last is not told.
 _LEAST_FACTOR, _LEAST_SHIFT = 0.03, 0.02
-_SIGMAS, _TOLD = 4.0, 0.01
+_SIGMAS, _TOLD = (3.0, 4.0, 4.0), 0.01
 # Two estimates of a factor, and of a shift in focal lengths, agree to this.
 _SAME_FACTOR, _SAME_SHIFT = 1.06, 0.05
 # Factors by which images are made smaller or larger, and how nearly focal length and principal point show one.
@@ -38,9 +38,10 @@ _BARREL = (-0.1, -0.2, -0.3, -0.4)
 _OFF_CENTRE = 0.2
 # Pixels of cameras are square to better than this.
 _SQUARE = 1.05
-# Another model is better if its sum of residuals is lower by so many times its mean, and by this share:
-# what lenses do that no model says leaves less.
-_SURE = 16.0
+# Another model is better if its sum of residuals is lower by so many times its mean, and by this share: what lenses do
+# that no model says leaves less. A focal length alone needs no share, and less of a sum: both halves of the tracks have
+# to find the same.
+_SURE, _SURE_OF_FOCAL = 16.0, 8.0
 _LOWER = 0.05
 # A lens is named rather than a focal length and a principal point that leave no less than this part of its sum.
 _RATHER = 0.9
@@ -58,6 +59,11 @@ class Model:
     change: str  # what to change
     params: FloatArray  # (n_cam, 12)
     lens: cameras.Model | None = None  # the model of all cameras; None for those given
+    focal_alone: bool = False  # it differs in the focal length, by many of its standard deviations
+
+    def of(self, tracks: Tracks) -> Tracks:
+        """Return tracks as these cameras see them."""
+        return tracks.seen(params=self.params, lens=self.lens)
 
     def confirms(self, other: Model) -> bool:
         """Return True if it says the same, whatever the precise numbers."""
@@ -88,18 +94,19 @@ def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diag
     free = _freed(problem, given, measure, tracks)
     rows = [Row(_TEST, "as given", _explained(now)), Row(_TEST, "free", _explained(measure(free)))]
     lenses = [(model, Adjusted(problem, model.params, model.lens)) for model in other_lenses(tracks)]
-    rows += [Row(_TEST, model.cause, _explained(measure(one))) for model, one in lenses]
+    rows += _lens_rows([(model.cause, measure(one)) for model, one in lenses])
     found: list[tuple[Model, Adjusted | Freed]] = []
     if lenses:
         found = [min(lenses, key=lambda one: measure(one[1]))]
-    if not found or measure(free) < _RATHER * measure(found[0][1]) or not _is_lower(measure(found[0][1]), now, n):
+    clear = bool(found) and _is_lower(measure(found[0][1]), now, n)
+    if not clear or measure(free) < _RATHER * measure(found[0][1]):
         off = _named(tracks, free)
         found = [] if off is None else [(off, free)]
     for model, best in found:
-        lowest = measure(best)
+        lowest, alone = measure(best), model.focal_alone
         # Then the given model gets every chance: many iterations, and to begin where the other one ended.
-        if _is_lower(lowest, now, n) and _is_lower(lowest, given.thorough(best.state, measure), n):
-            if lowest > _left(relations) * now:
+        if _is_lower(lowest, now, n, alone) and _is_lower(lowest, given.thorough(best.state, measure), n, alone):
+            if lowest > _left(relations) * now and lowest > _left(in_motion(model.of(tracks))) * now:
                 return Diagnosis(untold=["too many outliers to judge the intrinsics"], rows=rows), None
             evidence = f"a free adjustment leaves {lowest / now:.0%} of the loss that it leaves as given"
             return Diagnosis([Finding((model.cause,), evidence, (model.change,))], rows=rows), model
@@ -107,6 +114,16 @@ def _compare(tracks: Tracks, relations: list[Relation], part: int) -> tuple[Diag
         what = "the focal length" if free.sigma[0] > _TOLD else "the principal point"
         return Diagnosis(untold=[f"the motion so far does not tell {what}"], rows=rows), None
     return Diagnosis(sound=["focal length and principal point fit"], rows=rows), None
+
+
+def _lens_rows(costs: list[tuple[str, float]]) -> list[Row]:
+    """Return one row a cause, of the lens that leaves the lowest mean loss."""
+    rows = []
+    for cause in dict.fromkeys(cause for cause, _ in costs):
+        of_cause = [cost for name, cost in costs if name == cause]
+        name = cause if len(of_cause) == 1 else f"{cause} (best of {len(of_cause)} lenses)"
+        rows.append(Row(_TEST, name, _explained(min(of_cause))))
+    return rows
 
 
 def _left(relations: list[Relation]) -> float:
@@ -134,9 +151,10 @@ def loss_of(tracks: Tracks, relations: list[Relation]) -> float:
     return Measure(adjusted.norms, noise=1.0)(adjusted)
 
 
-def _is_lower(cost: float, other: float, observations: int) -> bool:
+def _is_lower(cost: float, other: float, observations: int, focal_alone: bool = False) -> bool:
     """Return True if a mean loss is clearly lower than another."""
-    return other > (1.0 + _LOWER) * cost and observations * (other / cost - 1.0) > _SURE
+    share, sure = (0.0, _SURE_OF_FOCAL) if focal_alone else (_LOWER, _SURE)
+    return other > (1.0 + share) * cost and observations * (other / cost - 1.0) > sure
 
 
 def _explained(cost: float) -> float:
@@ -158,7 +176,7 @@ def _freed(problem: Problem, given: Adjusted, measure: Measure, tracks: Tracks) 
 
 def _named(tracks: Tracks, free: Freed) -> Model | None:
     """Return in words how the cameras that fit differ from the given ones; None if they do not."""
-    given, fits, sigma = tracks.cameras.params[0], free.params[0], _SIGMAS * free.sigma
+    given, fits, sigma = tracks.cameras.params[0], free.params[0], np.array(_SIGMAS) * free.sigma
     factor, shift = float(fits[FX] / given[FX]), (fits[CX : CY + 1] - given[CX : CY + 1]) / given[FX]
     scaled = [
         b
@@ -177,8 +195,9 @@ def _named(tracks: Tracks, free: Freed) -> Model | None:
         causes.append(_region(given[CX : CY + 1], f"the tracks fit {_at(fits[CX : CY + 1])}"))
     if not causes:
         return None
-    change = f"k of {_INFO}" if len(causes) == 1 and "focal" in causes[0] else _ROI
-    return Model(", and ".join(causes), change, free.params)
+    if len(causes) == 1 and "focal" in causes[0]:
+        return Model(causes[0], f"k of {_INFO}", free.params, focal_alone=True)
+    return Model(", and ".join(causes), _ROI, free.params)
 
 
 def _near(value: float, other: float) -> bool:

@@ -89,9 +89,16 @@ class Tracks:
         """Return the length of a pixel in the rays of some rows."""
         return float(np.median(1.0 / _focal(self.cameras)[self.camera[rows]])) if len(rows) else 0.0
 
-    def seen(self, uv: FloatArray | None = None, params: FloatArray | None = None) -> Tracks:
-        """Return the same with other pixels (n_obs, 2), or seen through cameras with other intrinsics (n_cam, 12)."""
+    def seen(
+        self,
+        uv: FloatArray | None = None,
+        params: FloatArray | None = None,
+        lens: camera_models.Model | None = None,
+    ) -> Tracks:
+        """Return the same with other pixels (n_obs, 2), or seen through other intrinsics (n_cam, 12) or another lens."""
         cameras = self.cameras if params is None else dataclasses.replace(self.cameras, params=params)
+        if lens is not None:
+            cameras = dataclasses.replace(cameras, model=np.full_like(cameras.model, lens))
         return dataclasses.replace(self, cameras=cameras, uv=self.uv if uv is None else uv)
 
     def between_cameras(self, a: int, b: int) -> Pose:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ba_node.arrays import FloatArray
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
-from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+from ba_node.evaluation.metrics import AbsoluteError, absolute_error
 from ba_node.offline import viewpoint
 from ba_node.offline.page import Figure
 from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Comparison, Run
@@ -62,7 +62,7 @@ class _Shown:
         self.poses, self.colour, self.several = comparison, colour, several
         self.before, self.after = (self._error(poses) for poses in (comparison.before, comparison.after))
 
-    def _error(self, poses: Poses | None) -> TrajectoryError | None:
+    def _error(self, poses: Poses | None) -> AbsoluteError | None:
         if poses is None or self.poses.truth is None:
             return None
         try:
@@ -114,7 +114,7 @@ class _ShownRun(_Shown):
         self.solve_s = self.seconds(run.details["solve_stamp_ns"])
 
 
-def _aligned(points: FloatArray, error: TrajectoryError | None) -> FloatArray:
+def _aligned(points: FloatArray, error: AbsoluteError | None) -> FloatArray:
     return points if error is None else error.alignment.apply(points)
 
 

@@ -37,7 +37,7 @@ _HOW = """\
   of two, or of ten where its curves lie orders of magnitude apart (`experiments/thesis/margins.py`). Depth is the value
   at the end of a run.
 - `ba thesis` makes every solve from three starts, the file's and two that differ from it by 1e-13 of the points'
-  coordinates, what takes minutes from fewer; figures are medians, the least and the largest in brackets. {starts}
+  coordinates; figures are medians, the least and the largest in brackets. {starts}
   Each comparison is made again with the worst and the best that seeds and another machine may make of it (another tenth
   of a time, half of a gradient, 1e-4 of an objective): a verdict that would change says so.
 - The second run has its start points, seeds and order of work from the first, and other machine code: the kernels for

@@ -83,9 +83,9 @@ CASES = (
     Combined((("outliers_jumping", 0.6),), "mono", 836, {}, ""),
     Combined((("sigma_off", 0.02), ("focal_slightly_off", 1.05)), "rgbd", 837, {}, ""),
     Combined((("poses_inverted", None), ("outliers_moving", 0.3)), "mono", 838, {"path": "loop"}, "invert"),
-    Combined((("focal_slightly_off", 1.05),), "mono", 839, {"look_deg": 90.0}, "", pending=True),
+    Combined((("focal_slightly_off", 1.05),), "mono", 839, {"look_deg": 90.0}, "focal"),
     Combined((("focal_slightly_off", 0.93),), "rgbd", 840, {"path": "loop"}, "focal"),
-    Combined((("rectified_with_distortion", 0.5),), "mono", 841, {"path": "loop"}, "", pending=True),
+    Combined((("rectified_with_distortion", 0.5),), "mono", 841, {"path": "loop"}, "rectified though a distortion"),
     Combined((("steps_scaled", 0.95),), "stereo", 842, {}, "scale"),
 )
 # A few of them run in the quick tests.

@@ -67,6 +67,7 @@ def unpacked(page: Path, part: str) -> str:
 
 
 def test_the_page_has_all_figures_and_facts(folder: Path) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     text = (folder / REPORT).read_text()
     data = json.loads(unpacked(folder / REPORT, "data"))
     assert [figure["key"] for figure in data] == KEYS
@@ -181,6 +182,7 @@ def test_several_runs_stand_side_by_side(folder: Path, tmp_path: Path) -> None:
 def test_a_replay_leaves_a_page_and_a_picture_unless_told_not_to(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     assert main(["replay", str(BAG), "--out", str(tmp_path / "with")]) == 0
     assert "trajectory.png, report.html, each figure as PNG in report/" in capsys.readouterr().out
     assert (tmp_path / "with" / REPORT).stat().st_size > 1_000_000

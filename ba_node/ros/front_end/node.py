@@ -51,8 +51,8 @@ from ba_node.messages.rig import rig_from_infos
 from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
 from ba_node.messages.transforms import StaticTree, tf_message
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Severity, Throttle, log
+from ba_node.ros.message_factory import RclpyFactory, message_class
 from ba_node.ros.parameters import declare
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.tools.adapter import PUBLISHED

@@ -21,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from ba_node.io import ros_types
 from ba_node.io.bag_writer import BagWriter
 from ba_node.messages.topics import INPUT_TYPES, ON_DEMAND, OUTPUT_TYPES, TF_STATIC, TOPICS
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.tools.node import node_apart
 
 _POLL_S, _LOOK_S = 0.05, 0.5

@@ -20,8 +20,9 @@ from ba_node.estimate import Correction
 from ba_node.messages.factory import header_message
 from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory, message_class
 
+pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
 pytestmark = pytest.mark.dds
 PROGRAM = "ba_node.ros.front_end.main:main"
 FACTORY = RclpyFactory()
