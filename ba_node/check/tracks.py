@@ -95,7 +95,7 @@ class Tracks:
         params: FloatArray | None = None,
         lens: camera_models.Model | None = None,
     ) -> Tracks:
-        """Return the same with other pixels (n_obs, 2), or seen through other intrinsics (n_cam, 12) or lenses."""
+        """Return the same with other pixels (n_obs, 2), or seen by other intrinsics (n_cam, 12) or another lens."""
         cameras = self.cameras if params is None else dataclasses.replace(self.cameras, params=params)
         if lens is not None:
             cameras = dataclasses.replace(cameras, model=np.full_like(cameras.model, lens))

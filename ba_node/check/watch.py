@@ -5,6 +5,9 @@
 What the tracks can tell depends on how the robot moves: two cameras can be compared at once, poses need parallax, a
 focal length needs turns. So the check runs at numbers of keyframes that double, each time only with the tests that are
 still open, until all have told or the last of these numbers is reached.
+
+What was right at first may change on the way: cameras exchanged, images of another size. So some keyframes after solves
+have first said that tracks contradict them, those since then are checked by themselves, with all tests.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ _ONCE = frozenset({"pixels", "stamps"})
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
 # The newest of them are looked at.
 _NEWEST = 60
+# So many keyframes after solves have first said such a thing, those since then are checked by themselves.
+_SINCE = (5, 12, 24)
 
 
 @dataclass
@@ -57,28 +62,38 @@ class SetUpWatch:
         self._told: frozenset[str] = frozenset()
         self._next = 0
         self._busy = False
+        self._doubted = 0  # keyframes when solves first said that tracks contradict them
+        self._looked = 0  # how many of _SINCE are done
 
     def look(self, scene: Scene) -> str:
         """Check a scene if it has come to a number of keyframes at which that is due; return why to hold its solves."""
         if scene is not self._scene:
             self._scene, self._told, self._next, self._busy, self._reason = scene, frozenset(), 0, False, ""
+            self._doubted = self._looked = 0
         count = len(scene.keyframes)
-        if not (self._reason or self._busy or self._next >= len(_AT) or count < _AT[self._next]):
+        if not self._doubted and not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES):
+            self._doubted = count
+        if self._reason or self._busy:
+            return self._reason
+        if self._next < len(_AT) and count >= _AT[self._next]:
             again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
-            self._check(scene, self._told & _ONCE if again else self._told)
+            self._check(scene, self._told & _ONCE if again else self._told, _NEWEST)
+        elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked]:
+            self._looked += 1
+            self._check(scene, _ONCE, count - self._doubted)
         return self._reason
 
     def reason(self, scene: Scene) -> str:
         """Return why the solves of a scene are held, empty if they are not."""
         return self._reason if scene is self._scene else ""
 
-    def _check(self, scene: Scene, told: frozenset[str]) -> None:
+    def _check(self, scene: Scene, told: frozenset[str], newest: int) -> None:
         if not two_view.available():
             scene.log.notice("setup_unchecked")
             self._next = len(_AT)
             return
-        tracks = tracks_of(scene, _NEWEST)
+        tracks = tracks_of(scene, newest)
         if tracks is None:
             return
         check = Check(scene, lambda: examine(tracks, told))

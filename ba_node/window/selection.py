@@ -288,11 +288,12 @@ def _older(scene: Scene, window: IntArray, keyframe: NDArray[np.int32]) -> IntAr
     ``keyframe`` is that of each inlier observation of its points. A keyframe that was never refined would only hold the
     others to the front-end's drift.
     """
-    seeing = scene.by_time(scene.distinct(keyframe))
-    shared = np.bincount(scene.numbers(keyframe, seeing), minlength=len(seeing))
-    first = int(scene.places()[window[0]]) if len(window) else 0
+    place = scene.places().take(keyframe)
+    before = keyframe[place < (int(scene.places()[window[0]]) if len(window) else 0)]
+    seeing = scene.by_time(scene.distinct(before))
+    shared = np.bincount(scene.numbers(before, seeing), minlength=len(seeing))
     # Newest first, so that of those that share equally many the newest are taken.
-    older = np.flatnonzero((scene.places()[seeing] < first) & scene.keyframes.refined[seeing])[::-1]
+    older = np.flatnonzero(scene.keyframes.refined[seeing])[::-1]
     return seeing[older[np.argsort(-shared[older], kind="stable")]]
 
 

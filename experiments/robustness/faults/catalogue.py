@@ -18,7 +18,7 @@ import numpy as np
 from ba_node.synthetic.generate import generate
 from ba_node.synthetic.options import SyntheticOptions
 from ba_node.synthetic.world import Path, World
-from experiments.robustness.faults import motion, setup, stamps, tracks
+from experiments.robustness.faults import midway, motion, setup, stamps, tracks
 from experiments.robustness.faults.recording import Recording
 
 Edit = Callable[[Recording, float, np.random.Generator], Recording]
@@ -235,6 +235,59 @@ FAULTS: dict[str, Fault] = {
     "baseline_off": Fault("baseline, times", setup.baseline_off, amounts=(1.05, 0.95, 1.1), rigs=_TWO),
     "steps_scaled": Fault("positions of the keyframes, times", setup.steps_scaled, amounts=(1.08, 0.93), rigs=_ALL),
     "sigma_off": Fault("sigma_px, times", setup.sigma_off, amounts=(10.0, 0.1, 4.0), rigs=_ALL),
+    # Said wrongly in ways of their own. What is added stands at the end: seeds of tests are counted by place.
+    "poses_w_first": Fault("quaternions with w first", setup.poses_w_first, named=("w first",), codes=_LOOK),
+    "poses_optical": Fault("poses of a body that looks along z", setup.poses_optical, named=("z looks",), codes=_LOOK),
+    "sigma_zero": Fault(
+        "sigma_px of zero, share", tracks.sigma_zero, amounts=(0.05, 1.0), named=("sigma",), codes=_LOOK
+    ),
+    "huge_coordinate": Fault(
+        "one coordinate of an image, px",
+        tracks.huge_coordinate,
+        amounts=(1e9, 1e30),
+        named=("out_of_range",),
+        codes=_LOOK,
+    ),
+    "new_ids_twice": Fault("keyframes again under new ids, after s", midway.new_ids_twice, amounts=(0.01, 0.0)),
+    # What was right at first no longer is.
+    "poses_inverted_midway": Fault(
+        "poses inverted from midway on",
+        midway.from_midway(setup.poses_inverted),
+        named=("poses contradict the tracks|poses inverted",),
+        codes=_LOOK,
+    ),
+    "swapped_midway": Fault(
+        "cameras swapped from midway on",
+        midway.from_midway(setup.cameras_swapped),
+        rigs=_TWO,
+        named=("swapped",),
+        codes=_LOOK,
+    ),
+    "smaller_midway": Fault(
+        "images smaller from midway on, times",
+        midway.from_midway(midway.smaller),
+        amounts=(2.0, 1.5),
+        named=("binning|region",),
+        codes=_LOOK,
+    ),
+    "depth_mm_midway": Fault(
+        "depth in mm from midway on",
+        midway.from_midway(setup.depth_in_mm),
+        amounts=(1000.0,),
+        rigs=(RGBD,),
+        named=("millimetres",),
+        codes=_LOOK,
+    ),
+    "rig_changes": Fault(
+        "focal length of a second rig, times",
+        midway.rig_changes,
+        amounts=(1.3, 0.5),
+        rigs=_ALL,
+        named=("rig_changed",),
+        codes=_LOOK,
+    ),
+    "odometry_freezes": Fault("odometry freezes, keyframes", midway.odometry_freezes, amounts=(3.0, 10.0), rigs=_ALL),
+    "numbered_anew": Fault("keyframe ids begin anew, from", midway.numbered_anew, amounts=(1000.0,)),
 }
 
 

@@ -35,6 +35,8 @@ class Recording:
     timeline: tuple[Entry, ...]
     # fields of CameraInfo that a measurement does not have, for every camera; those of ``roi`` as a mapping
     camera_info: Mapping[str, Any] = field(default_factory=dict)
+    # ids of keyframes that the sound recording has under another, by their new ids
+    renamed: Mapping[int, int] = field(default_factory=dict)
 
     @property
     def measurements(self) -> tuple[Measurement, ...]:
@@ -70,7 +72,7 @@ class Recording:
 
     def number(self, keyframe_id: int) -> int:
         """Return which keyframe of the sound recording an id names, from 0."""
-        return self.projector.number[keyframe_id]
+        return self.projector.number[self.renamed.get(keyframe_id, keyframe_id)]
 
     @cached_property
     def projector(self) -> Projector:

@@ -67,6 +67,24 @@ def camera_turned(recording: Recording, amount: float, rng: np.random.Generator)
     return recording.changed(CameraRig, change)
 
 
+def poses_w_first(recording: Recording, _amount: float, _rng: np.random.Generator) -> Recording:
+    """Write the quaternions of the poses with w first."""
+    return recording.changed(
+        Keyframe, lambda keyframe: dataclasses.replace(keyframe, orientation=np.roll(keyframe.orientation, 1))
+    )
+
+
+def poses_optical(recording: Recording, _amount: float, _rng: np.random.Generator) -> Recording:
+    """Publish poses of a body whose z looks ahead, where its x is asked for."""
+    optical = np.array([0.5, -0.5, 0.5, -0.5])
+
+    def change(keyframe: Keyframe) -> Keyframe:
+        rotation = geometry.matrix_from_quaternion(keyframe.orientation) @ geometry.matrix_from_quaternion(optical)
+        return dataclasses.replace(keyframe, orientation=geometry.quaternion_from_matrix(rotation))
+
+    return recording.changed(Keyframe, change)
+
+
 def baseline_off(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
     """Multiply the distance of the second camera from the first."""
 

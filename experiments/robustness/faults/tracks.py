@@ -170,3 +170,24 @@ def _noise_px(image: FeatureTracks) -> float:
 def _with_pixels(image: FeatureTracks, wrong: NDArray[np.bool_], uv: FloatArray) -> FeatureTracks:
     moved = np.where(wrong[:, None], uv, image.uv)
     return dataclasses.replace(image, uv=moved.astype(np.float32).astype(np.float64))
+
+
+def sigma_zero(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
+    """Say of a share of the observations that they are exact."""
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        exact = rng.random(len(image.uv)) < amount
+        return dataclasses.replace(image, sigma_px=np.where(exact, 0.0, image.sigma_px))
+
+    return recording.changed(FeatureTracks, change)
+
+
+def huge_coordinate(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Give one observation of every image a coordinate of many pixels."""
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        uv = image.uv.copy()
+        uv[: min(len(uv), 1)] = [amount, -amount]
+        return dataclasses.replace(image, uv=uv)
+
+    return recording.changed(FeatureTracks, change)

@@ -1,0 +1,108 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""A recording that begins well and goes wrong on the way: what was right at first no longer is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from ba_node.core import geometry
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
+from experiments.robustness.faults import setup
+from experiments.robustness.faults.recording import Entry, Recording
+
+Edit = Callable[[Recording, float, np.random.Generator], Recording]
+# Keyframes that a new id is given to lie so far behind those of the sound recording.
+_NEW_IDS = 10**6
+
+
+def from_midway(edit: Edit) -> Edit:
+    """Return a fault that befalls the second half of a recording alone."""
+
+    def edited(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
+        half = len(recording.keyframes) // 2
+        spoiled = edit(recording, amount, rng)
+        timeline: list[Entry] = []
+        for before, after in zip(recording.timeline, spoiled.timeline, strict=True):
+            of = before[2]
+            later = isinstance(of, Keyframe | FeatureTracks) and recording.number(of.keyframe_id) >= half
+            timeline.append(after if later else before)
+        return dataclasses.replace(recording, timeline=tuple(timeline))
+
+    return edited
+
+
+def smaller(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Track in images that are smaller by a factor."""
+    return recording.changed(FeatureTracks, lambda image: dataclasses.replace(image, uv=image.uv / amount))
+
+
+def rig_changes(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
+    """Send another rig in the middle, whose focal lengths are others; the images stay."""
+    half = len(recording.keyframes) // 2
+    rig = next(m for m in setup.focal_off(recording, amount, rng).measurements if isinstance(m, CameraRig))
+    timeline: list[Entry] = []
+    for topic, time_ns, measurement in recording.timeline:
+        if isinstance(measurement, Keyframe) and recording.number(measurement.keyframe_id) == half:
+            timeline.append(("camera_rig", time_ns, rig))
+        timeline.append((topic, time_ns, measurement))
+    return dataclasses.replace(recording, timeline=tuple(timeline))
+
+
+def odometry_freezes(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Let the front-end's pose stand for some keyframes, and go on from there."""
+    keyframes = recording.keyframes
+    first = len(keyframes) // 3
+    last = first + int(amount)
+    poses = [(geometry.matrix_from_quaternion(one.orientation), one.position) for one in keyframes]
+    # What is left out of the way: the pose at its beginning from that at its end.
+    lost = geometry.compose(*poses[first], *geometry.inverse(*poses[last]))
+
+    def change(keyframe: Keyframe) -> Keyframe:
+        number = recording.number(keyframe.keyframe_id)
+        if number <= first:
+            return keyframe
+        rotation, position = poses[first] if number <= last else geometry.compose(*lost, *poses[number])
+        return dataclasses.replace(keyframe, position=position, orientation=geometry.quaternion_from_matrix(rotation))
+
+    return recording.changed(Keyframe, change)
+
+
+def new_ids_twice(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Send every seventh keyframe and its tracks once more under a new id, some seconds later by its stamp."""
+    timeline: list[Entry] = []
+    renamed: dict[int, int] = {}
+    waiting: list[Entry] = []
+    for topic, time_ns, measurement in recording.timeline:
+        if isinstance(measurement, Keyframe):
+            timeline += waiting
+            waiting = []
+        timeline.append((topic, time_ns, measurement))
+        if isinstance(measurement, Keyframe | FeatureTracks) and recording.number(measurement.keyframe_id) % 7 == 6:
+            new = _NEW_IDS + measurement.keyframe_id
+            renamed[new] = measurement.keyframe_id
+            again = dataclasses.replace(measurement, keyframe_id=new)
+            if isinstance(again, Keyframe):
+                again = dataclasses.replace(again, stamp_ns=again.stamp_ns + round(amount * 1e9))
+            waiting.append((topic, time_ns, again))
+    return dataclasses.replace(recording, timeline=tuple(timeline + waiting), renamed=renamed)
+
+
+def numbered_anew(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Begin to count keyframes anew in the middle, from some id on, without another session."""
+    half = len(recording.keyframes) // 2
+    ids = [one.keyframe_id for one in recording.keyframes]
+    new = {old: int(amount) + i for i, old in enumerate(ids[half:])}
+    back = {number: old for old, number in new.items()}
+
+    def keyframe(one: Keyframe) -> Keyframe:
+        return dataclasses.replace(one, keyframe_id=new.get(one.keyframe_id, one.keyframe_id))
+
+    def tracks(one: FeatureTracks) -> FeatureTracks:
+        return dataclasses.replace(one, keyframe_id=new.get(one.keyframe_id, one.keyframe_id))
+
+    changed = recording.changed(Keyframe, keyframe).changed(FeatureTracks, tracks)
+    return dataclasses.replace(changed, renamed=back)
