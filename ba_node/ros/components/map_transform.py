@@ -10,7 +10,6 @@ from ba_node.messages.topics import TF, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.log import Severity, log
-from ba_node.ros.message_factory import RclpyFactory
 
 _DEPTH = 100
 _NS = 1e9
