@@ -127,6 +127,7 @@ def test_resumed_replays_are_not_done_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_recordings_and_results_may_be_urls(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec", reason="needs fsspec: pip install ba_node[fleet]")
     shutil.copy(MONO, tmp_path / "a.mcap")
     shutil.copy(MONO, tmp_path / "b.mcap")
     url = f"file://{tmp_path}"

@@ -74,15 +74,18 @@ back_end = rclpy.create_node("ba_node", namespace="/robot")
 localizer = rclpy.create_node("localizer", namespace="/robot")
 nodes = [(back_end, "{given}"), (localizer, "/robot/pose_prior"), (localizer, "/robot/localizer/pose_prior")]
 publishers = [node.create_publisher(PoseWithCovarianceStamped, topic, 10) for node, topic in nodes]
+print("ready", flush=True)
 while True:
     for publisher in publishers:
         publisher.publish(PoseWithCovarianceStamped())
     time.sleep(0.05)
 """
-    beside = subprocess.Popen([sys.executable, "-c", program])
+    beside = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert beside.stdout is not None
     try:
+        assert beside.stdout.readline() == "ready\n"
         for out, options in (("inputs.mcap", ()), ("named.mcap", ("--topics", given))):
-            process = recorder(tmp_path / out, "--duration", "3", *options)
+            process = recorder(tmp_path / out, "--duration", "6", *options)
             _, error = process.communicate(timeout=60)
             assert process.returncode == 0, error
             with BagReader(tmp_path / out) as reader:
@@ -91,4 +94,4 @@ while True:
             assert taken == (others | {given} if options else others)
     finally:
         beside.kill()
-        beside.wait()
+        beside.communicate()
