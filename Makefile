@@ -55,7 +55,7 @@ thesis: setup ## repeat experiments of the thesis (ARGS="3.8 5.1", ARGS="--all",
 robustness: setup ## replay recordings gone wrong, and see that no harm is done (ARGS="--only camera_turned")
 	@$(RUN) -m ba_node.cli.main robustness $(ARGS)
 
-consistency: setup ## compare errors with covariances in 200 runs of each of 27 cases (about 20 minutes; ARGS="--only stereo")
+consistency: setup ## compare errors with covariances in 200 runs of each of 28 cases (about 20 minutes; ARGS="--only stereo")
 	@OPENBLAS_NUM_THREADS=1 $(RUN) -m experiments.consistency $(ARGS)
 
 regress: setup ## replay the shipped recordings and see that no figure is worse than in bags/regress.yaml

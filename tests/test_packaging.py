@@ -155,7 +155,8 @@ def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
     with tarfile.open(next((source / "dist").glob("*.tar.gz"))) as archive:
         assert not [name for name in archive.getnames() if "experiments/" in name]
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", ".", "."]
-    built = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    few = {**os.environ, "BA_NODE_TARGETS": "baseline"}  # the others hold the same names, and take minutes
+    built = subprocess.run(command, cwd=source, env=few, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
     with zipfile.ZipFile(next(source.glob("*.whl"))) as wheel:
         names = wheel.namelist()

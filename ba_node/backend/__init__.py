@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
 
-from ba_node.backend.backend import Backend
+from ba_node.backend.backend import Backend, Work
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.check.diagnosis import Diagnosis, Row
@@ -25,5 +25,6 @@ __all__ = [
     "MapSummary",
     "Optimization",
     "Row",
+    "Work",
     "can_examine",
 ]

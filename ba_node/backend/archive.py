@@ -5,32 +5,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ba_node.config import SceneConfig
-from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status, Transform
+from ba_node.estimate import SolveReport, Status, Transform
 from ba_node.scene import snapshot
-from ba_node.scene.map_content import MapContent, prefixed, require, require_all, require_rotations, within
+from ba_node.scene.map_content import MapContent, require, require_all, require_rotations, within
 from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column
 from ba_node.window.correction import MapCorrection
 
-_POSES = {
-    "keyframe_id": Column(np.uint64),
-    "stamp_ns": Column(np.int64),
-    "position": Column(np.float64, (3,)),
-    "orientation": Column(np.float64, (4,)),
-}
-_CLOUD = {
-    "track_id": Column(np.uint64),
-    "position": Column(np.float64, (3,)),
-    "rms_px": Column(np.float32),
-    "views": Column(np.int32),
-}
 _CORRECTION = {"rotation": Column(np.float64, (3, 3)), "translation": Column(np.float64, (3,))}
 
 
@@ -39,7 +26,6 @@ class MapState:
     """All that a back-end knows, parameters apart."""
 
     scene: Scene  # the current map
-    finished: list[tuple[int, Estimate]]  # session id and last estimate of the sessions before
     report: SolveReport  # of the last solve
     correction: MapCorrection  # map from odom
     current: int | None  # row of the newest keyframe that came, None before the first
@@ -64,7 +50,6 @@ def pack(known: MapState) -> MapContent:
     for name, column in _CORRECTION.items():
         values = [getattr(transform, name) for transform in transforms]
         content.arrays[f"correction/{name}"] = np.array(values, column.dtype).reshape(-1, *column.shape)
-    finished = _finished_content(known.finished)
     facts = {
         "current": known.current,
         "settled": known.settled,
@@ -73,7 +58,7 @@ def pack(known: MapState) -> MapContent:
         "report": _report_facts(known.report),
         "correction": {"agreeing": agreeing, "stamp_ns": stamp_ns},
     }
-    return MapContent(content.arrays | finished.arrays, content.facts | finished.facts | facts)
+    return MapContent(content.arrays, content.facts | facts)
 
 
 def unpack(content: MapContent, config: SceneConfig) -> MapState:
@@ -90,7 +75,6 @@ def unpack(content: MapContent, config: SceneConfig) -> MapState:
     require(0 <= solve_count < 2**62, f"solve_count = {solve_count}, expected a count")
     return MapState(
         scene,
-        [_estimate(content, i, head) for i, head in enumerate(content.fact("finished", list))],
         _report_from(content),
         _correction_from(content),
         current,
@@ -141,34 +125,3 @@ def _report_from(content: MapContent) -> SolveReport:
             default = field.default
             values[field.name] = facts.fact(field.name, (int, float) if type(default) is float else type(default))
     return SolveReport(**values)
-
-
-def _finished_content(finished: Sequence[tuple[int, Estimate]]) -> MapContent:
-    """Return finished sessions as the fact ``finished`` and arrays ``finished/<number>/...``."""
-    content = MapContent(facts={"finished": []})
-    for i, (session_id, estimate) in enumerate(finished):
-        for group, columns in (("poses", estimate.trajectory), ("points", estimate.cloud)):
-            fields = ((field.name, getattr(columns, field.name)) for field in dataclasses.fields(columns))
-            content.arrays.update(prefixed(f"finished/{i}/{group}", fields))
-        head = {"session_id": session_id, "stamp_ns": estimate.stamp_ns, "frame_id": estimate.frame_id}
-        content.facts["finished"].append(head | {"report": _report_facts(estimate.report)})
-    return content
-
-
-def _estimate(content: MapContent, i: int, head: Mapping[str, Any]) -> tuple[int, Estimate]:
-    require(isinstance(head, dict), f"finished: {head!r} is no session")
-    facts = MapContent(facts=dict(head))
-    group = f"finished/{i}"
-    poses, points = content.columns(f"{group}/poses", _POSES), content.columns(f"{group}/points", _CLOUD)
-    for name, values in ((f"{group}/poses/{key}", poses[key]) for key in ("position", "orientation")):
-        require_all(within(values, np.finfo(float).max), name, values, "finite numbers")
-    trajectory = Poses(**{name: np.array(values) for name, values in poses.items()})
-    estimate = Estimate(
-        stamp_ns=facts.fact("stamp_ns", int),
-        frame_id=facts.fact("frame_id", str),
-        refined=trajectory,
-        trajectory=trajectory,
-        cloud=Cloud(**{name: np.array(values) for name, values in points.items()}),
-        report=_report_from(facts),
-    )
-    return facts.fact("session_id", int), estimate

@@ -18,10 +18,9 @@ A replay solves once for every keyframe, however the messages are spaced, just b
 
 When more keyframes came at once than a window holds, a solve takes the oldest half a window of them, and ``ready``
 stays True until the newest is reached. Tracks that come late take part from the next solve on; they make their keyframe
-due again if it was not refined without them. A higher session id begins a new map with the same rig; the last estimate
-of the one before is kept in ``finished``. So do keyframes far older than the newest, as when a recording is played
-again; their session id stays as the front-end has it. A keyframe that is odd is held until others tell what it was, see
-``scene/sessions.py``; then several are taken in at once.
+due again if it was not refined without them. A higher session id begins a new map with the same rig, and so do
+keyframes far older than the newest, as when a recording is played again; their session id stays as the front-end has
+it. One that is odd is held until others tell what it was, see ``scene/sessions.py``; then several are taken in at once.
 
 Nothing here reads a clock: the caller passes one, for the report alone.
 """
@@ -46,11 +45,9 @@ from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
 from ba_node.scene.map_content import MapContent
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
-from ba_node.window import adjustment, full, guard, quality
-from ba_node.window.adjustment import Adjustment
-from ba_node.window.joining import Earlier
+from ba_node.window import adjustment, full, guard, joining, precision, quality
 
-FINISHED_KEPT = 8
+Work = adjustment.Adjustment | precision.Study  # what may run beside solves
 _REFUSED_KEPT = 1000
 
 
@@ -60,19 +57,17 @@ class Backend:
     def __init__(self, config: Config, *, clock: Callable[[], float] = lambda: 0.0) -> None:
         """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
         self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
-        # session id and last estimate of the sessions before, oldest first, the last few
-        self.finished: list[tuple[int, Estimate]] = []
         self.solve_count = 0  # solves since the beginning
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)  # the last keyframes that were turned away
         self.extras = Extras()  # what the next solve is to work out beside the estimate
         self.setup = SetUpWatch()  # the check of the set-up; while it gives a reason, every solve is held
         self.refusal = ""  # why the last solve of everything was held, in words; empty if it was not
-        # runs an adjustment on another thread, which then goes to :meth:`take_adjustment`; None: at once
-        self.adjust_elsewhere: Callable[[Adjustment], None] | None = None
-        self._adjusting: Adjustment | None = None
+        # runs what takes long on another thread, and then gives it to :meth:`take_work`; None: at once
+        self.elsewhere: Callable[[Work], None] | None = None
+        self._adjusting: adjustment.Adjustment | None = None
         self._clock = clock
         self._sessions = Sessions()
-        self._earlier = Earlier()
+        self._earlier = joining.Earlier()
 
     @property
     def config(self) -> Config:
@@ -96,11 +91,6 @@ class Backend:
     def rejection_notes(self) -> deque[str]:
         """Return the last rejections in words, oldest first."""
         return self.scene.log.notes
-
-    @property
-    def rejection_cause(self) -> str:
-        """Return the first case of what was turned away by itself, in words; empty if nothing was."""
-        return self.scene.log.cause()
 
     @property
     def ready(self) -> bool:
@@ -189,6 +179,8 @@ class Backend:
         wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
         estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
+        if (study := self.map.begun_study()) is not None:
+            self._work(study)
         return estimate if wrong else self.take_check(departed(self.scene)) or self.adjust() or estimate
 
     def adjust(self, *, final: bool = False) -> Estimate | None:
@@ -201,20 +193,25 @@ class Backend:
             return None
         joined = self._earlier.join(self.scene, self.config, final=final)
         if joined is not None:
-            self.finished = [one for one in self.finished if one[0] != joined[0]]
             self.map.correct(int(self.scene.order[-1]))
-        what = joined[1] if joined else adjustment.due(self.scene, self.config, final=final)
+        what = joined or adjustment.due(self.scene, self.config, final=final)
         if what is None:
             return None
-        begun = self._adjusting = Adjustment(self.scene, what, self.config, self.extras)
-        if self.adjust_elsewhere is not None and not final:
-            self.adjust_elsewhere(begun)
+        begun = self._adjusting = adjustment.Adjustment(self.scene, what, self.config, self.extras)
+        return self._work(begun, at_once=final)
+
+    def _work(self, begun: Work, *, at_once: bool = False) -> Estimate | None:
+        if self.elsewhere is not None and not at_once:
+            self.elsewhere(begun)
             return None
         begun.run()
-        return self.take_adjustment(begun)
+        return self.take_work(begun)
 
-    def take_adjustment(self, done: Adjustment) -> Estimate | None:
-        """Take in an adjustment that was run; return what is known then, None if the map stays as it is."""
+    def take_work(self, done: Work) -> Estimate | None:
+        """Take in what was run; return what is known then, None if the map stays as it is."""
+        if isinstance(done, precision.Study):
+            self.map.learn(done)
+            return None
         if done is not self._adjusting or done.scene is not self.scene:
             return None
         self._adjusting = None
@@ -330,7 +327,7 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
-        self.finished, self._earlier = [], Earlier()
+        self._earlier = joining.Earlier()
         self._sessions.reset()
         self._renew(None, self.scene.next_cameras or self.scene.cameras)
         self.map.report = SolveReport(reason="reset: the map is empty")
@@ -339,10 +336,7 @@ class Backend:
         """Return a copy of all that is known, for a file; see docs/map_format.md."""
         known, done = self.map, self.map.completion
         of_newest = done.row(self.scene), done.closed, tuple(done.delivered)
-        state = archive.MapState(
-            self.scene, self.finished, known.report, known.correction, *of_newest, self.solve_count
-        )
-        return archive.pack(state)
+        return archive.pack(archive.MapState(self.scene, known.report, known.correction, *of_newest, self.solve_count))
 
     def take_over(self, known: archive.MapState) -> None:
         """Put what a file held in the place of all that is known; parameters stay, and ``solve_count`` if it is higher.
@@ -352,9 +346,8 @@ class Backend:
         known.scene.config = self.config.scene
         self.map = CurrentMap(self.config, known.scene, self.map.index + 1)
         self.map.report, self.map.correction = known.report, known.correction
-        self._earlier = Earlier()
+        self._earlier = joining.Earlier()
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
-        self.finished = known.finished[-FINISHED_KEPT:]
         newest = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
         self.map.completion = Completion(newest, known.settled, known.delivered)
         self.solve_count = max(self.solve_count, known.solve_count)
@@ -383,9 +376,6 @@ class Backend:
         if len(before.keyframes) and not begin.replaces:
             assert before.session_id is not None
             before.end_pending()
-            self.map.report = dataclasses.replace(self.map.report, rejected=dict(sorted(self.map.rejected.items())))
-            self.finished.append((before.session_id, self.map.estimate()))
-            del self.finished[:-FINISHED_KEPT]
             self._earlier.keep(before, self.config)
         self._renew(session_id, before.next_cameras or before.cameras)
         self.scene.pending = waiting.pending

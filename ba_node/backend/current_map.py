@@ -103,7 +103,10 @@ class CurrentMap:
         self.calibration: Calibration | None = None
         self.adjustments = 0
         self._trust = Trust()
-        self._precision: precision.Precision | None = None
+        self._precision = precision.Precision()
+        # What is being asked of the front-end's steps, and whether the last solve has asked it.
+        self._study: precision.Study | None = None
+        self._asks = False
 
     @property
     def session_id(self) -> int:
@@ -243,12 +246,25 @@ class CurrentMap:
             self.scene.moved(np.array(tried.without, np.intp))
             rows = selection.keyframes, selection.landmarks, selection.origin
             old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
-            self._precision = precision.learn(self.scene, self.config, self._precision, selection, state)
+            if self._study is None:
+                self._study = self._precision.study(self.scene, self.config, selection, state)
+                self._asks = self._study is not None
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}
         self.report = dataclasses.replace(self.base_report(*which), **statistics, solve_time_s=tried.solve_time_s)
         return selection, state
+
+    def begun_study(self) -> precision.Study | None:
+        """Return what the last solve asks of the front-end's steps; None if nothing, or if it was returned before."""
+        asks, self._asks = self._asks, False
+        return self._study if asks else None
+
+    def learn(self, study: precision.Study) -> None:
+        """Take in what was asked of the front-end's steps, if it was of this map."""
+        if study is self._study:
+            self._study = None
+            self._precision.learn(study, self.config)
 
     def hold(self, reason: str) -> None:
         """Say that a solution is held; give up what was taken of a young map if many are."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
@@ -31,8 +32,10 @@ class MapSummary:
     rejected: dict[str, int]  # what was turned away, by reason
     notices: dict[str, int]  # what was unusual but used, by kind
     rejection_notes: list[str]  # the last rejections in words, oldest first
+    rejection_cause: str  # the first case of what was turned away by itself, in words; empty if nothing was
     warnings: dict[str, str]  # what somebody has to know or mend, by kind
     observed: quality.Residuals  # of each observation, by what is refined
+    body_from_camera: FloatArray  # (3, 3) axes of the first camera on the body; those of the body before a rig came
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ def summary_of(scene: Scene, config: Config) -> MapSummary:
         rejected=dict(sorted(scene.log.rejected.items())),
         notices=dict(sorted(scene.log.notices.items())),
         rejection_notes=list(scene.log.notes),
+        rejection_cause=scene.log.cause(),
         warnings=dict(scene.log.warnings),
         observed=quality.residuals(scene, config, "refined"),
+        body_from_camera=np.eye(3) if scene.cameras is None else scene.cameras.rotation[0].T,
     )

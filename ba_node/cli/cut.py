@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Cut."""
-    from ba_node.offline.recordings import Span, cut  # noqa: PLC0415
+    from ba_node.offline.bag_tools import Span, cut  # noqa: PLC0415
 
     require_mcap(args.out)
     with progress_bar("cut", "messages") as progress:

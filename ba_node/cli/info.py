@@ -22,7 +22,7 @@ from ba_node.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from ba_node.offline.recordings import RecordingFacts
+    from ba_node.offline.bag_tools import RecordingFacts
 
 EXAMPLE = "ba info bags/stereo_loop.mcap"
 ATTENTION = 3
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Tell."""
-    from ba_node.offline.recordings import examine  # noqa: PLC0415
+    from ba_node.offline.bag_tools import examine  # noqa: PLC0415
 
     with progress_bar("info", "messages") as progress:
         found = examine(args.bag, topic_choice(args), progress)

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Merge."""
-    from ba_node.offline.recordings import merge  # noqa: PLC0415
+    from ba_node.offline.bag_tools import merge  # noqa: PLC0415
 
     require_mcap(args.out)
     with progress_bar("merge", "messages") as progress:

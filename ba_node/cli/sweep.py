@@ -3,7 +3,9 @@
 """Try every combination of some values of parameters on recordings.
 
 The error is that of `ba tune`: of the trajectory where a recording has a truth, else of tracks that are held out of it.
-Writes into DIR: sweep.csv, sweep.json, and index.html.
+Writes into DIR: sweep.csv and sweep.json with each combination that is through, and index.html in the end.
+
+Exit code: 3 if a recording or a combination cannot be used, which is named and stops no other.
 """
 
 from __future__ import annotations
@@ -51,7 +53,12 @@ def run(args: argparse.Namespace) -> int:
     )
     args.out.mkdir(parents=True, exist_ok=True)
     with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("sweep", "replays") as progress:
-        found, left_out = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), progress)
+
+        def keep(done: int, total: int, found: tuning.Swept) -> None:
+            progress(done, total)
+            tuning_page.keep_sweep(args.out, found)
+
+        found, left_out = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), keep)
     print(table(*tuning_page.sweep_rows(found)))
     print(f"written to {args.out}: {tuning_page.write_sweep(args.out, found)}")
     write_result(args.json, tuning_page.sweep_as_dict(found))

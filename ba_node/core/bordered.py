@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from ba_node.arrays import FloatArray, IntArray
+from ba_node.arrays import FloatArray
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import cameras, columns, linear_costs, parameterisation, scaling
 from ba_node.core.inner_iterations import iterate_points
@@ -31,6 +31,7 @@ from ba_node.core.numpy_kernels import NumpyKernels, NumpySystem
 from ba_node.core.objective import Linearisation, Objective
 from ba_node.core.problem import Cameras, Problem, State
 from ba_node.core.result import Iteration, Result
+from ba_node.core.rows import sparse_blocks
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, block_diagonal, inverse_cholesky3
 from ba_node.core.solver import solve
 
@@ -213,21 +214,13 @@ def border(problem: Problem, lin: Linearisation, d_z: scipy.sparse.csr_matrix, p
     """Return the border of the normal equations; ``prior`` (n_z,) is z_0 + z, None without one."""
     obs = problem.observations
     column = np.where(problem.fixed, -1, np.cumsum(~problem.fixed) - 1)[obs.keyframe]
-    d_c = _blocks(lin.d_keyframe, column, int(np.count_nonzero(~problem.fixed)))
-    d_p = _blocks(lin.d_point, obs.point, problem.n_points)
+    d_c = sparse_blocks(lin.d_keyframe, column, int(np.count_nonzero(~problem.fixed)))
+    d_p = sparse_blocks(lin.d_point, obs.point, problem.n_points)
     turned = d_z.T.tocsr()
     gradient, v, precision = np.asarray(turned @ lin.residual.ravel()), turned @ d_z, 0.0
     if prior is not None:
         gradient, v, precision = gradient + prior, v + scipy.sparse.identity(len(prior)), 1.0
     return Border(d_z, gradient, v, d_c.T @ d_z, d_p.T @ d_z, precision)
-
-
-def _blocks(blocks: FloatArray, column: IntArray, n: int) -> scipy.sparse.csr_matrix:
-    """Return rows of blocks (n_obs, m, d), each in its block column of n, none where that is -1, as a sparse matrix."""
-    rows, (_, m, d) = np.flatnonzero(column >= 0), blocks.shape
-    data = np.ascontiguousarray(blocks[rows])
-    bounds = np.searchsorted(rows, np.arange(len(blocks) + 1))
-    return scipy.sparse.bsr_matrix((data, column[rows], bounds), shape=(m * len(blocks), d * n)).tocsr()
 
 
 class BorderedReduction(ReducedSystem):

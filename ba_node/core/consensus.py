@@ -32,6 +32,9 @@ def triangulate(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -
 
     Args: as of :func:`agreeing`.
     """
+    if kernels != "numpy" and native.kernels is not None:
+        *columns, agrees = native.kernels.consensus(rays, n_points, gate)
+        return Triangulation(*columns), agrees
     agrees = agreeing(rays, n_points, gate, kernels)
     found = triangulation.triangulate(rays.part(agrees), n_points, kernels)
     near = triangulation.errors(rays, found.points) <= gate

@@ -78,26 +78,14 @@ _LEAST = 0.1
 _CHUNK = 2000
 
 
-def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
-    """Return the covariance of the step of every free pose at a solution, by the options that it was solved with.
-
-    Conditions g (n_free, 6, n_conditions) hold what no fixed pose holds; poses are stepped locally.
-
-    Returns:
-        (n_free, 6, 6) in the local tangent, ``R <- R Exp(dphi), t <- t + R dt``: rotation (rad), then translation (m),
-        row-major. NaN where unknown: nothing determines the pose, there are no more residuals than unknowns, or S is
-        too large to be inverted (DENSE_LIMIT).
-    """
-    uncertainty = uncertainty_of(problem, state, options, conditions)
-    if uncertainty is None:
-        return np.full((int(np.count_nonzero(~problem.fixed)), 6, 6), np.nan)
-    return uncertainty.poses()
-
-
 def uncertainty_of(
     problem: Problem, state: State, options: SolverOptions, conditions: FloatArray
 ) -> Uncertainty | None:
-    """Return the uncertainty of a solution, None where it is unknown; arguments as of :func:`pose_covariances`."""
+    """Return the uncertainty of a solution, by the options that it was solved with; poses are stepped locally.
+
+    Conditions g (n_free, 6, n_conditions) hold what no fixed pose holds. None where it is unknown: there are no more
+    residuals than unknowns, or S is too large to be inverted (DENSE_LIMIT).
+    """
     n = 6 * int(np.count_nonzero(~problem.fixed))
     if n == 0 or n > DENSE_LIMIT or problem.free_intrinsics:
         return None
@@ -243,7 +231,11 @@ class Uncertainty:
         return out
 
     def poses(self) -> FloatArray:
-        """Return the covariances (n_free, 6, 6) of the poses, which are all unknowns beside the points."""
+        """Return the covariances (n_free, 6, 6) of the poses, which are all unknowns beside the points.
+
+        In the local tangent, ``R <- R Exp(dphi), t <- t + R dt``: rotation (rad), then translation (m). NaN for those
+        that nothing determines.
+        """
         blocks = self.roots.reshape(-1, 6, self.roots.shape[1])
         # Not by matrix products of the blocks: they are too small for the threads of BLAS, which wait for each other.
         out = np.asarray(np.einsum("kim,kjm->kij", blocks @ self._meat(self.variance), blocks))

@@ -63,17 +63,19 @@ class RelativePoses:
             root_information=self.root_information[rows],
         )
 
-    def residuals(self, state: State) -> FloatArray:
-        """Return the whitened residuals, (n, 6)."""
-        return (self.root_information @ self._errors(state)[:, :, None])[..., 0]
+    def residuals(self, state: State, errors: FloatArray | None = None) -> FloatArray:
+        """Return the whitened residuals, (n, 6); ``errors`` if they are known."""
+        errors = self.errors(state) if errors is None else errors
+        return np.asarray((self.root_information @ errors[:, :, None])[..., 0])
 
-    def jacobians(self, state: State) -> FloatArray:
+    def jacobians(self, state: State, errors: FloatArray | None = None) -> FloatArray:
         """Return the derivatives of the residuals by the local steps of both keyframes, (n, 2, 6, 6)."""
+        errors = self.errors(state) if errors is None else errors
         first, second = self.keyframes.T
         rotation_i, rotation_j = state.rotation[first], state.rotation[second]
         centre = (np.swapaxes(rotation_j, 1, 2) @ state.translation[second][:, :, None])[..., 0]
         a = np.zeros((len(self), 6, 6))
-        a[:, :3, :3] = geometry.inverse_right_jacobian(self._errors(state)[:, :3]) @ rotation_j
+        a[:, :3, :3] = geometry.inverse_right_jacobian(errors[:, :3]) @ rotation_j
         a[:, 3:, :3] = rotation_i @ geometry.hat(centre)
         a[:, 3:, 3:] = rotation_i
         a = self.root_information @ a
@@ -101,7 +103,7 @@ class RelativePoses:
             raise ProblemError(f"relative pose {row} is of keyframe {self.keyframes[row, 0]} in itself")
         check_common(self, n_keyframes)
 
-    def _errors(self, state: State) -> FloatArray:
+    def errors(self, state: State) -> FloatArray:
         """Return e, (n, 6), not whitened."""
         first, second = self.keyframes.T
         rotation = state.rotation[first] @ np.swapaxes(state.rotation[second], 1, 2)
@@ -174,7 +176,8 @@ class FactorSum:
 
     def value(self, state: State) -> float:
         """Return 1/2 sum Psi."""
-        return sum(self._value(kind, state) for kind in self._factors)
+        known: Known = {}
+        return sum(self._value(kind, state, known) for kind in self._factors)
 
     def linearise(self, state: State) -> FactorTerms:
         """Return what the factors add at a state."""
@@ -182,16 +185,19 @@ class FactorSum:
         gradient, diagonal = np.zeros((n, 6)), np.zeros((n, 6, 6))
         between = np.zeros((len(self.rows), 6, 6))
         terms = FactorTerms(0.0, gradient, diagonal, Pairs(self.rows, self.columns, between))
-        value = sum(self._add(kind, number, state, terms) for number, kind in enumerate(self._factors))
+        known: Known = {}
+        value = sum(self._add(kind, number, state, terms, known) for number, kind in enumerate(self._factors))
         return self._stepped(state, replace(terms, value=value))
 
     @staticmethod
-    def _value(kind: KeyframeFactors, state: State) -> float:
-        return 0.5 * float(np.sum(_weigh(kind, kind.residuals(state))[0]))
+    def _value(kind: KeyframeFactors, state: State, known: Known) -> float:
+        residual = kind.residuals(state, *_errors(kind, state, known))
+        return 0.5 * float(np.sum(_weigh(kind, residual)[0]))
 
-    def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms) -> float:
+    def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms, known: Known) -> float:
         """Add what the factors of a kind, by its number, have at a state to terms; return their share of the value."""
-        residual, jacobian = kind.residuals(state), kind.jacobians(state)
+        errors = _errors(kind, state, known)
+        residual, jacobian = kind.residuals(state, *errors), kind.jacobians(state, *errors)
         cost, weight = _weigh(kind, residual)
         turned = np.swapaxes(jacobian * weight[:, None, None, None], -1, -2)
         column, pair = self._column[kind.keyframes], self._pair[number]
@@ -230,6 +236,20 @@ class FactorSum:
             back @ terms.diagonal @ turn,
             replace(terms.pairs, blocks=back[self.rows] @ terms.pairs.blocks @ turn[self.columns]),
         )
+
+
+# Errors at a state by the arrays of what was measured: rotation and translation of the same steps are two kinds.
+Known = dict[tuple[int, ...], tuple[FloatArray]]
+
+
+def _errors(kind: KeyframeFactors, state: State, known: Known) -> tuple[FloatArray, ...]:
+    """Return the errors of relative poses, found once for kinds that share their measurements; nothing of others."""
+    if not isinstance(kind, RelativePoses):
+        return ()
+    key = id(kind.keyframes), id(kind.rotation), id(kind.translation)
+    if key not in known:
+        known[key] = (kind.errors(state),)
+    return known[key]
 
 
 def check_common(kind: KeyframeFactors, n_keyframes: int) -> None:

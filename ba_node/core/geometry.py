@@ -47,7 +47,7 @@ def so3_log(rotation: FloatArray) -> FloatArray:
     """
     q = quaternion_from_matrix(rotation)
     vector, w = q[..., :3], q[..., 3]
-    norm = np.linalg.norm(vector, axis=-1)
+    norm = np.sqrt(np.add.reduce(vector * vector, axis=-1))
     angle = 2.0 * np.arctan2(norm, w)
     small = norm < _SMALL
     # 2 atan2(n, w) / n = 2/w (1 - (n/w)^2 / 3 + ...) near the identity, where w is near 1.
@@ -114,23 +114,27 @@ def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
     r = rotation
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
-    candidates = np.empty((*r.shape[:-2], 4, 4))
-    rows = (
-        (1 + xx - yy - zz, d, e, a),
-        (d, 1 - xx + yy - zz, f, b),
-        (e, f, 1 - xx - yy + zz, c),
-        (a, b, c, 1 + xx + yy + zz),
-    )
-    for i, row in enumerate(rows):
-        for j, entry in enumerate(row):
-            candidates[..., i, j] = entry
-    squares = np.diagonal(candidates, axis1=-2, axis2=-1)
-    best = np.argmax(squares, axis=-1)
-    q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    squares = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz
+    last = a, b, c, squares[3]
+    if (np.maximum(np.maximum(squares[0], squares[1]), squares[2]) < squares[3]).all():  # as of most rotations
+        q = _side_by_side(last)
+    else:
+        d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
+        rows = (squares[0], d, e, a), (d, squares[1], f, b), (e, f, squares[2], c), last
+        best = np.argmax(_side_by_side(squares), axis=-1)
+        candidates = np.stack([_side_by_side(row) for row in rows], axis=-2)
+        q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.sqrt(np.add.reduce(q * q, axis=-1, keepdims=True))
     result: FloatArray = np.where(q[..., 3:] < 0, -q, q)
     return result
+
+
+def _side_by_side(columns: tuple[FloatArray, ...]) -> FloatArray:
+    """Return arrays of one shape as the last axis of another: np.stack without its overhead."""
+    out = np.empty((*columns[0].shape, len(columns)))
+    for i, column in enumerate(columns):
+        out[..., i] = column
+    return out
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

@@ -98,8 +98,8 @@ class Kernels(Protocol):
     def gradient(self) -> FloatArray:
         """Return the keyframes' part of the gradient, (n_free, d)."""
 
-    def diagonals(self) -> tuple[FloatArray, FloatArray]:
-        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
+    def diagonals(self, *, of_points: bool = True) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3) unless that is wanted too."""
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> System:
         """Add damping to the diagonals and eliminate."""

@@ -14,7 +14,7 @@ from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
-from ba_node.core.factors import FactorSum, FactorTerms, RelativePoses
+from ba_node.core.factors import FactorSum, FactorTerms, Known, RelativePoses
 from ba_node.core.kernels import DENSE_LIMIT, Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
@@ -106,9 +106,9 @@ class NativeKernels:
         """Return the keyframes' part of the gradient, (n_free, d)."""
         return self._kernel.gradient()
 
-    def diagonals(self) -> tuple[FloatArray, FloatArray]:
-        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
-        d_c, d_p = self._kernel.diagonals()
+    def diagonals(self, *, of_points: bool = True) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3) unless that is wanted too."""
+        d_c, d_p = self._kernel.diagonals(of_points)
         return d_c, d_p
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NativeSystem:
@@ -280,14 +280,15 @@ class NativeFactorSum(FactorSum):
     def value(self, state: State) -> float:
         """Return 1/2 sum Psi."""
         total = 0.0
+        known: Known = {}
         for kind, kernel in zip(self._factors, self._kernels, strict=True):
-            total += self._value(kind, state) if kernel is None else kernel.value(state)
+            total += self._value(kind, state, known) if kernel is None else kernel.value(state)
         return total
 
-    def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms) -> float:
+    def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms, known: Known) -> float:
         kernel = self._kernels[number]
         if kernel is None:
-            return super()._add(kind, number, state, terms)
+            return super()._add(kind, number, state, terms, known)
         return kernel.linearise(state, terms.gradient, terms.diagonal, terms.pairs.blocks)
 
     def _kernel(self, kind: KeyframeFactors, number: int) -> CompiledPoses | None:

@@ -68,9 +68,10 @@ class NumpyKernels:
         """Return the keyframes' part of the gradient, (n_free, d)."""
         return self._equations.gradient_c
 
-    def diagonals(self) -> tuple[FloatArray, FloatArray]:
-        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
-        return self._equations.diagonals()
+    def diagonals(self, *, of_points: bool = True) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3) unless that is wanted too."""
+        d_c, d_p = self._equations.diagonals()
+        return d_c, d_p if of_points else d_p[:0]
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NumpySystem:
         """Add damping to the diagonals and eliminate."""

@@ -114,9 +114,10 @@ class RankKernels:
         """Return the keyframes' part of the gradient, (n_free, d)."""
         return self._gradient
 
-    def diagonals(self) -> tuple[FloatArray, FloatArray]:
-        """Return diag(B) (n_free, d) of all, and diag(C) (n_points, 3) of this rank's points."""
-        return self._diagonals
+    def diagonals(self, *, of_points: bool = True) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) (n_free, d) of all, and diag(C) (n_points, 3) of this rank's points, or (0, 3)."""
+        d_c, d_p = self._diagonals
+        return d_c, d_p if of_points else d_p[:0]
 
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> RankSystem:
         """Add damping to the diagonals and eliminate the points."""

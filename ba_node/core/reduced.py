@@ -15,7 +15,7 @@ Where a step of PCG costs next to nothing beside an exact solution, PCG is tried
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
@@ -24,7 +24,13 @@ from ba_node.config import SolverOptions
 from ba_node.core import linear, scaling
 from ba_node.core.kernels import DENSE_LIMIT, System
 
-Hessian = Callable[[], tuple[FloatArray, FloatArray]]
+
+class Hessian(Protocol):
+    """What returns the diagonal of H."""
+
+    def __call__(self, *, of_points: bool) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) and diag(C), not damped; see Kernels.diagonals."""
+
 
 # Where steps of PCG cost next to nothing beside the rest of an iteration, they go nearly as far as an exact solution.
 _NEARLY = 0.01
@@ -44,7 +50,7 @@ class ReducedSolver:
     def solve(self, system: System, hessian: Hessian, radius: float) -> linear.Solution:
         """Return the solution of ``S x = rhs`` in the space that is not scaled.
 
-        ``hessian`` returns diag(B) and diag(C), not damped; the radius is in the scaled space, infinite for none.
+        The radius is in the scaled space, infinite for none.
         """
         if len(system.rhs) == 0:
             return linear.Solution(np.zeros(0))
@@ -74,10 +80,7 @@ class ReducedSolver:
         """Return the share of a step that lies inside the region, 1 if all of it does."""
         if not np.isfinite(radius):
             return 1.0
-        d_c, d_p = hessian()
-        # Points have no part in S where they were eliminated; most maps have many.
-        d_p = d_p[:0] if system.side == "points" else d_p
-        scaled = system.gather(*scaling.scaled_space(self._options.scaled_space, (d_c, d_p))) * x
+        scaled = self._scale(system, hessian) * x
         length2 = float(np.einsum("i,i", scaled, scaled))
         return 1.0 if length2 <= radius * radius else radius / float(np.sqrt(length2))
 
@@ -101,9 +104,14 @@ class ReducedSolver:
         self, system: System, hessian: Hessian, limits: linear.PcgLimits, kind: str, *, formed: bool
     ) -> linear.Solution:
         """Solve by PCG with a preconditioner, in the scaled space."""
-        d = scaling.scaled_space(self._options.scaled_space, hessian(), literal=kind == "b_literal")
-        scale = 1.0 / system.gather(*d)
+        scale = 1.0 / self._scale(system, hessian, literal=kind == "b_literal")
         return system.solve_pcg(kind, scale, limits, formed=formed)
+
+    def _scale(self, system: System, hessian: Hessian, *, literal: bool = False) -> FloatArray:
+        """Return D of the scaled space for the unknowns of S."""
+        # Points have no part in S where they were eliminated; most maps have many.
+        diagonals = hessian(of_points=system.side != "points")
+        return system.gather(*scaling.scaled_space(self._options.scaled_space, diagonals, literal=literal))
 
     def _choose(self, system: System) -> None:
         """Settle on a linear solver."""

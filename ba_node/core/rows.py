@@ -72,8 +72,8 @@ def rows_of(problem: Problem, state: State, options: SolverOptions) -> Rows:
     index = np.arange(len(obs))
     found = Rows(
         at.residual.ravel(),
-        _blocks(at.d_keyframe, column[obs.keyframe], int(np.count_nonzero(~problem.fixed))),
-        _blocks(at.d_point, obs.point, problem.n_points),
+        sparse_blocks(at.d_keyframe, column[obs.keyframe], int(np.count_nonzero(~problem.fixed))),
+        sparse_blocks(at.d_point, obs.point, problem.n_points),
         weights[0].ravel(),
         weights[1].ravel(),
         np.tile(np.array([PIXELS, PIXELS, DEPTHS][:n]), len(obs)),
@@ -99,7 +99,7 @@ def _prior_rows(problem: Problem, priors: PointPriors, state: State, beside: Row
     return Rows(
         residual.ravel(),
         scipy.sparse.csr_matrix((3 * n, beside.keyframes.shape[1])),
-        _blocks(root, priors.point, problem.n_points),
+        sparse_blocks(root, priors.point, problem.n_points),
         np.ones(3 * n),
         np.ones(3 * n),
         np.full(3 * n, GIVEN),
@@ -115,7 +115,8 @@ def _factor_rows(kind: KeyframeFactors, group: int, state: State, column: IntArr
     counts = np.any(jacobian != 0.0, axis=(1, 3))
     weights = _weighed(kind.loss, kind.loss_scale, residual, np.maximum(np.count_nonzero(counts, axis=1), 1))
     blocks = [
-        _blocks(jacobian[:, place], column[kind.keyframes[:, place]], n_free) for place in range(jacobian.shape[1])
+        sparse_blocks(jacobian[:, place], column[kind.keyframes[:, place]], n_free)
+        for place in range(jacobian.shape[1])
     ]
     rows = Rows(
         residual.ravel(),
@@ -149,13 +150,9 @@ def _weighed(name: str, scale: float, residual: FloatArray, size: IntArray | int
     return np.stack([weight, ((m - 1) * weight + (ahead - behind) / (2.0 * h)) / m])
 
 
-def _blocks(jacobian: FloatArray, column: IntArray, n_blocks: int) -> scipy.sparse.csr_matrix:
-    """Return (n, d, k) blocks as (n d, k n_blocks), each in its column of blocks; those at -1 are left out."""
-    n, d, k = jacobian.shape
-    held = np.flatnonzero(column >= 0)
-    counts = np.zeros(n, np.intp)
-    counts[held] = k
-    bounds = np.concatenate([[0], np.cumsum(np.repeat(counts, d))])
-    place = (k * column[held])[:, None, None] + np.zeros((1, d, 1), np.intp) + np.arange(k)
-    values = np.ascontiguousarray(jacobian[held]).ravel()
-    return scipy.sparse.csr_matrix((values, place.ravel(), bounds), shape=(n * d, k * n_blocks))
+def sparse_blocks(blocks: FloatArray, column: IntArray, n: int) -> scipy.sparse.csr_matrix:
+    """Return rows of blocks (n_obs, m, d), each in its block column of n, none where that is -1, as a sparse matrix."""
+    rows, (_, m, d) = np.flatnonzero(column >= 0), blocks.shape
+    data = np.ascontiguousarray(blocks[rows])
+    bounds = np.searchsorted(rows, np.arange(len(blocks) + 1))
+    return scipy.sparse.bsr_matrix((data, column[rows], bounds), shape=(m * len(blocks), d * n)).tocsr()

@@ -101,12 +101,13 @@ def _columns(problem: Problem, centres: FloatArray, rows: slice) -> tuple[FloatA
     ray = cameras.rays(obs.uv[rows], cams.model.take(camera), params)
     in_body = np.swapaxes(cams.rotation[camera], -1, -2) @ ray[:, :, None]
     direction = (np.swapaxes(problem.start.rotation[keyframe], -1, -2) @ in_body)[..., 0]
+    px_per_rad = np.sqrt(params[:, cameras.FX] * params[:, cameras.FY]) / obs.sigma_px[rows]
+    if not len(obs.depth_m):
+        unknown = np.full(len(camera), np.nan)
+        return centre, direction, px_per_rad, unknown, unknown
     # A depth is along the axis: of a ray that is across it, or points back, it tells no distance.
     length = 1.0 / np.where(ray[:, 2] > _LEAST_COSINE, ray[:, 2], np.nan)
-    focal = np.sqrt(params[:, cameras.FX] * params[:, cameras.FY])
-    unknown = np.full(len(camera), np.nan)
-    depth, sigma = (obs.depth_m[rows], obs.depth_sigma_m[rows]) if len(obs.depth_m) else (unknown, unknown)
-    return centre, direction, focal / obs.sigma_px[rows], depth * length, sigma * length
+    return centre, direction, px_per_rad, obs.depth_m[rows] * length, obs.depth_sigma_m[rows] * length
 
 
 def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulation:

@@ -70,7 +70,7 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class TrajectoryError(Errors):
+class AbsoluteError(Errors):
     """Absolute error of a trajectory after alignment (Sturm et al., IROS 2012), of each pose to its partner."""
 
     alignment: Alignment  # from the estimate to the reference
@@ -146,7 +146,7 @@ def pair(estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s
 
 def absolute_error(
     estimate: Poses, reference: Poses, kind: Kind = "se3", max_difference_s: float = 0.01
-) -> TrajectoryError:
+) -> AbsoluteError:
     """Return how far an estimated trajectory is from the reference, paired by stamp, aligned by the pairs' positions.
 
     Raises:
@@ -155,12 +155,12 @@ def absolute_error(
     return absolute_error_of(pair(estimate, reference, kind, max_difference_s))
 
 
-def absolute_error_of(paired: Paired) -> TrajectoryError:
+def absolute_error_of(paired: Paired) -> AbsoluteError:
     """Return the same of poses that are paired already."""
     translation = np.linalg.norm(paired.position[0] - paired.position[1], axis=1)
     difference = np.swapaxes(paired.rotation[1], -1, -2) @ paired.rotation[0]
     rotation = np.degrees(np.linalg.norm(so3_log(difference), axis=1))
-    return TrajectoryError(translation, rotation, paired.alignment, paired.stamp_ns)
+    return AbsoluteError(translation, rotation, paired.alignment, paired.stamp_ns)
 
 
 def _span(name: str, poses: Poses) -> str:

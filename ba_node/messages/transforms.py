@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make messages of the correction map -> odom, of poses with their covariance and odometry, and read /tf_static."""
+"""Make messages of poses with their covariance and of odometry, and read /tf_static."""
 
 from __future__ import annotations
 
@@ -11,27 +11,14 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
-from ba_node.estimate import Correction, Estimate, Transform
+from ba_node.estimate import Estimate, Transform
 from ba_node.measurements import CameraRig
 from ba_node.messages.factory import MessageFactory, header_message, numbers_message, uncertain_pose_message
-from ba_node.messages.topics import TF, TOPICS
+from ba_node.messages.topics import TOPICS
 
 # Variance of what is not known, m^2 and rad^2.
 _UNKNOWN = 1e6
 _VECTOR = "geometry_msgs/msg/Vector3"
-
-
-def tf_message(factory: MessageFactory, correction: Correction, map_frame: str, stamp_ns: int) -> Any:
-    """Return a ``tf2_msgs/TFMessage`` with map -> odom."""
-    translation = numbers_message(factory, _VECTOR, correction.position)
-    rotation = numbers_message(factory, "geometry_msgs/msg/Quaternion", correction.orientation)
-    stamped = factory.make(
-        "geometry_msgs/msg/TransformStamped",
-        header=header_message(factory, stamp_ns, map_frame),
-        child_frame_id=correction.odom_frame,
-        transform=factory.make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation),
-    )
-    return factory.make(TOPICS[TF].type_name, transforms=[stamped])
 
 
 def covariance_messages(factory: MessageFactory, estimate: Estimate) -> list[Any]:

@@ -96,8 +96,8 @@ class Kernel:
     def gradient(self) -> Doubles:
         """Return the keyframes' part of the gradient, (n_free, d)."""
 
-    def diagonals(self) -> tuple[Doubles, Doubles]:
-        """Return diag(B) (n_free, d) and diag(C) (n_points, 3)."""
+    def diagonals(self, of_points: bool) -> tuple[Doubles, Doubles]:
+        """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3)."""
 
     def step(self, state: State, step_c: Doubles, steps: int, out: State) -> tuple[float, float, float, float]:
         """Return predicted reduction, 1/2 p'Dp, and the objective before and after the inner iterations."""
@@ -156,3 +156,6 @@ def allocations() -> int:
 def residual_norms(problem: Problem, state: State) -> Doubles: ...
 def triangulate(rays: Rays, n_points: int) -> tuple[Doubles, Doubles, NDArray[np.bool_]]: ...
 def agreeing(rays: Rays, n_points: int, gate: float) -> NDArray[np.bool_]: ...
+def consensus(
+    rays: Rays, n_points: int, gate: float
+) -> tuple[Doubles, Doubles, NDArray[np.bool_], NDArray[np.bool_]]: ...

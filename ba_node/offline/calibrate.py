@@ -66,7 +66,7 @@ def calibrate_recording(
 
         for _ in backend.replay(map(listened, placed(reader.measurements(), reader, config.frames))):
             pass
-        path, reason = reader.path, backend.rejection_cause
+        path = reader.path
     rms_px: list[float] = []
     found: Calibration | None = None
     for _ in range(_ROUNDS):
@@ -77,6 +77,7 @@ def calibrate_recording(
         if before is not None and found is not None and _moved(before, found) < _SETTLED:
             break
     if found is None:
+        reason = backend.map.summary().rejection_cause
         raise CalibrateError(f"{path}: no map could be made of it{': ' + reason if reason else ''}")
     return Refined(rig_of(rigs[-1], found), found, backend.map.keyframe_count, (rms_px[0], rms_px[-1]))
 

@@ -54,9 +54,10 @@ def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
                 maps.append(backend.map)
         backend.flush(final=True)
         maps += [backend.map] if backend.map is not maps[-1] else []
-        reason = reader.rejection_notes[-1] if reader.rejection_notes else backend.rejection_cause
+        notes = reader.rejection_notes
     found = [checked for one in maps if (checked := _checked(one)) is not None]
     if not found:
+        reason = notes[-1] if notes else backend.map.summary().rejection_cause
         raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + reason if reason else ''}")
     return found
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ba_node.estimate import Cloud, Poses
-from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+from ba_node.evaluation.metrics import AbsoluteError, absolute_error
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.ply import write_ply
 from ba_node.io.trajectory import write_tum
@@ -106,7 +106,7 @@ def run(bag: Path, out: Path, say: Callable[[str], None]) -> Outcome:
     return Outcome(Poses.of(inputs), after, truth, cloud, listener.reports, frame_id, time.monotonic() - began)
 
 
-def write(outcome: Outcome, out: Path) -> dict[str, TrajectoryError]:
+def write(outcome: Outcome, out: Path) -> dict[str, AbsoluteError]:
     """Write trajectories, cloud and picture; return the errors before and after.
 
     Raises:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from ba_node.arrays import FloatArray
 from ba_node.estimate import Poses
 from ba_node.evaluation.alignment import EvaluationError
-from ba_node.evaluation.metrics import TrajectoryError, absolute_error
+from ba_node.evaluation.metrics import AbsoluteError, absolute_error
+from ba_node.offline import viewpoint
 from ba_node.offline.page import Figure
 from ba_node.offline.run_folder import BINS, PARALLAX_DEG, Comparison, Run
 
@@ -55,11 +56,13 @@ def trajectory_figures(comparison: Comparison) -> tuple[list[Figure], str]:
 class _Shown:
     """Trajectories and cloud in their colour, with their errors."""
 
+    body_from_camera: FloatArray | None = None
+
     def __init__(self, comparison: Comparison, colour: str, *, several: bool = False) -> None:
         self.poses, self.colour, self.several = comparison, colour, several
         self.before, self.after = (self._error(poses) for poses in (comparison.before, comparison.after))
 
-    def _error(self, poses: Poses | None) -> TrajectoryError | None:
+    def _error(self, poses: Poses | None) -> AbsoluteError | None:
         if poses is None or self.poses.truth is None:
             return None
         try:
@@ -83,6 +86,12 @@ class _Shown:
         return np.asarray(cloud[((cloud >= low) & (cloud <= high)).all(axis=1)])
 
     @property
+    def up(self) -> FloatArray:
+        """Return which way is up in the picture, (3,)."""
+        up = viewpoint.upwards(self.poses.after, self.body_from_camera)
+        return up if self.after is None else np.asarray(self.after.alignment.rotation @ up)
+
+    @property
     def paths(self) -> list[tuple[str, FloatArray, str, str]]:
         """Return name, positions, colour and dash of the trajectories, in the frame of the truth if there is one."""
         of = self.poses
@@ -101,19 +110,12 @@ class _ShownRun(_Shown):
     def __init__(self, run: Run, colour: str, *, several: bool) -> None:
         super().__init__(run, colour, several=several)
         self.run, self.details = run, run.details
+        self.body_from_camera = run.details.get("body_from_camera")
         self.solve_s = self.seconds(run.details["solve_stamp_ns"])
 
 
-def _aligned(points: FloatArray, error: TrajectoryError | None) -> FloatArray:
+def _aligned(points: FloatArray, error: AbsoluteError | None) -> FloatArray:
     return points if error is None else error.alignment.apply(points)
-
-
-def ground_axes(path: FloatArray) -> tuple[int, int]:
-    """Return the two axes along which a path (n, 3) goes most: those of the ground, whatever the frame is."""
-    spread = np.ptp(path, axis=0) if len(path) else np.zeros(3)
-    # Of equal ones the first: z is up in most frames.
-    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    return first, second
 
 
 def line(x: Any, y: Any, name: str, colour: str, **more: Any) -> dict[str, Any]:
@@ -128,7 +130,7 @@ def line(x: Any, y: Any, name: str, colour: str, **more: Any) -> dict[str, Any]:
 
 def _above(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
-    across, up = ground_axes(shown[0].paths[-1][1])
+    across, up, _ = viewpoint.seen_from(shown[0].up)
     for number, one in enumerate(shown):
         cloud = _few(one.cloud, _ABOVE)
         if len(cloud) and number == 0:
@@ -154,10 +156,10 @@ def _space(shown: Sequence[_Shown]) -> Figure:
         if len(cloud):
             marker = {"color": CLOUD if number == 0 else one.colour, "size": 1.5, "opacity": 0.6}
             data.append(_in_space(cloud, one.name("map")) | {"mode": "markers", "marker": marker, "hoverinfo": "skip"})
-    # Upwards is the axis along which nothing goes; cameras look along z, with y downwards.
-    vertical = "xyz"[3 - sum(ground_axes(shown[0].paths[-1][1]))]
-    camera: dict[str, Any] = {"up": dict.fromkeys("xyz", 0) | {vertical: -1 if vertical == "y" else 1}}
-    camera["eye"] = {axis: -1.3 if axis == "y" else 1.3 for axis in "xyz"}
+    vertical = viewpoint.seen_from(shown[0].up)[2]
+    sign, name = -1 if shown[0].up[vertical] < 0.0 else 1, "xyz"[vertical]
+    camera: dict[str, Any] = {"up": dict.fromkeys("xyz", 0) | {name: sign}}
+    camera["eye"] = {"x": 1.3, "y": -1.3, "z": 1.3} | {name: 1.3 * sign}
     axes = {f"{axis}axis": {"title": f"{axis} [m]"} for axis in "xyz"}
     note = f" {_POINTS} of its points are drawn." if any(len(one.poses.cloud) > _POINTS for one in shown) else ""
     text = f"Drag to turn. Strays of the map, one point in a hundred along each axis, are left out.{note}"

@@ -57,14 +57,23 @@ def write_results(
     Raises:
         OSError: a file cannot be written.
     """
-    write_json(out / f"{name}.json", content)
-    write_csv(out / f"{name}.csv", table)
-    names = f"{name}.json, {name}.csv"
+    names = write_tables(out, name, content, table)
     try:
         write_page(out / "index.html", page)
     except PageError as error:
         return f"{names}; {error}"
     return f"{names}, index.html"
+
+
+def write_tables(out: Path, name: str, content: Mapping[str, Any], table: Sequence[Sequence[object]]) -> str:
+    """Write NAME.json and NAME.csv; return their names.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    write_json(out / f"{name}.json", content)
+    write_csv(out / f"{name}.csv", table)
+    return f"{name}.json, {name}.csv"
 
 
 def write_page(path: Path, page: Page) -> None:

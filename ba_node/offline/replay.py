@@ -312,5 +312,5 @@ def _nothing_to_use(run: _Run) -> str:
 
 
 def _why(reader: BagReader, run: _Run) -> str:
-    reason = reader.rejection_notes[-1] if reader.rejection_notes else run.backend.rejection_cause
+    reason = reader.rejection_notes[-1] if reader.rejection_notes else run.backend.map.summary().rejection_cause
     return f": {reason}" if reason else ""

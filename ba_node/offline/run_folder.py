@@ -87,6 +87,7 @@ def write_details(folder: Path, record: SessionRecord, images: Mapping[int, NDAr
     shown = rows[seen.keyframe[rows] == shown_keyframe(record)]
     rows = rows[np.linspace(0, max(len(rows) - 1, 0), min(len(rows), _SAMPLE)).astype(np.intp)]
     rows = np.union1d(rows, shown)
+    columns["body_from_camera"] = record.summary.body_from_camera
     columns["shown_keyframe"] = np.array(shown_keyframe(record))
     columns |= {f"image_{camera}": image for camera, image in images.items()}
     for name in ("error", "uv", "camera", "keyframe", "outlier"):

@@ -33,7 +33,7 @@ def facts(backend: Backend) -> list[tuple[str, str]]:
     report, poses = estimate.report, estimate.trajectory
     span = (poses.stamp_ns[-1] - poses.stamp_ns[0]) / _NS_PER_S if len(poses) else 0.0
     way = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())
-    rows = [
+    return [
         ("session", "none yet" if summary.session_id is None else str(summary.session_id)),
         ("frame of the map", estimate.frame_id),
         ("frame of the input", summary.frame_id or "not named"),
@@ -45,6 +45,3 @@ def facts(backend: Backend) -> list[tuple[str, str]]:
         ("solves", f"{backend.solve_count}, the last: {report.status.name.lower()}, {report.reason}"),
         ("rejected", ", ".join(f"{n} {reason}" for reason, n in backend.map.rejected.items()) or "nothing"),
     ]
-    if backend.finished:
-        rows.append(("older sessions", ", ".join(str(key) for key, _ in backend.finished)))
-    return rows

@@ -49,21 +49,79 @@ def totals(
     return Totals((rms_px(sums[:2]), rms_px(sums[2:4])), (int(sums[4]), int(sums[5])))
 
 
-@dataclass(frozen=True)
-class Solution:
-    """A solved file."""
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """What a solve of a file gave, whatever its format."""
 
-    source: str  # the file
-    bal: BalProblem  # its content, moved by minus the origin
-    problem: Problem  # the same in our terms
+    source: str  # the file or folder
     # (3,) of the coordinates in which it was solved, in those of the file; zeros if they are the same
     origin: FloatArray
+    problem: Problem  # in our terms, moved by minus the origin
     result: Result  # state and trace
     options: SolverOptions  # with which it was solved
-    setup_s: float  # time to read and prepare it, s
-    solve_s: float  # time in the solver, s
-    bundler: BundlerScene | None = None  # what else a file of Bundler holds
+    setup_s: float = 0.0  # time to read and prepare it, s
+    solve_s: float = 0.0  # time in the solver, s
 
+    def told(self, behind: tuple[int, int], meaning: str) -> tuple[list[str], bool]:
+        """Return what a user has to know, one sentence each, and whether the result has to be looked at for it.
+
+        ``behind`` are the observations of points behind their cameras at the start and at the end, ``meaning`` what
+        becomes of them.
+        """
+        count, result, lines = len(self.problem.observations), self.result, []
+        grave = max(behind) > _MANY_BEHIND * count
+        if any(behind):
+            lines.append(
+                f"{behind[0]} of {count} observations are of points behind their camera at the start, {behind[1]} at"
+                f" the end: {meaning}"
+            )
+        if result.status.usable and not result.objective_after <= result.objective_before:
+            grave = True
+            lines.append(
+                f"the objective at the end, {result.objective_after:.8g}, is worse than at the start,"
+                f" {result.objective_before:.8g}"
+            )
+        return lines, grave
+
+    def statistics(
+        self, sizes: tuple[int, int, int], rms_px: tuple[float, float], attention: list[str]
+    ) -> dict[str, Any]:
+        """Return statistics, options and trace for JSON; an infinite radius becomes null there.
+
+        ``sizes`` are cameras, points, observations; ``rms_px`` is that at the start and at the end.
+        """
+        result = self.result
+        return {
+            "problem": {
+                "file": Path(self.source).name,
+                **dict(zip(("cameras", "points", "observations"), sizes, strict=True)),
+            },
+            "method": result.method,
+            "linear_solver": result.linear_solver,
+            "options": dataclasses.asdict(self.options),
+            "status": result.status.name,
+            "reason": result.reason,
+            "objective_before": result.objective_before,
+            "objective_after": result.objective_after,
+            "rms_px_before": rms_px[0],
+            "rms_px_after": rms_px[1],
+            "iterations": max(0, len(result.trace) - 1),
+            "accepted_iterations": result.accepted_iterations,
+            "linear_iterations": result.linear_iterations,
+            "trace": [dataclasses.asdict(row) for row in result.trace],
+            "origin": self.origin.tolist(),
+            "attention": attention,
+            "setup_s": self.setup_s,
+            "solve_s": self.solve_s,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution(Solved):
+    """A solved file of BAL or Bundler."""
+
+    bal: BalProblem  # its content, moved by minus the origin
+    bundler: BundlerScene | None = None  # what else a file of Bundler holds
     # for ``totals`` where several ranks have found them, each for its part
     summed: Totals | None = None
 
@@ -89,68 +147,23 @@ class Solution:
 
     def attention(self) -> tuple[list[str], bool]:
         """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
-        lines, grave = [], False
-        count, focal = len(self.bal.observations), self.bal.cameras[:, 6]
-        before, after = self.totals.behind
+        lines, grave = self.told(self.totals.behind, "they are not in the rms")
+        focal = self.bal.cameras[:, 6]
         bad = np.flatnonzero(focal <= 0.0)
         if len(bad):
             grave = True
-            lines.append(
+            lines.insert(
+                0,
                 f"{len(bad)} of {len(focal)} cameras have a focal length that is not positive (camera {bad[0]}:"
                 f" f = {focal[bad[0]]:g} px): a BAL camera looks along -z and has f > 0; turn one that looks along +z"
-                " by 180 degrees about its x axis, and give f and the signs of the pixels as the format has them"
-            )
-        if before or after:
-            grave = grave or max(before, after) > _MANY_BEHIND * count
-            lines.append(
-                f"{before} of {count} observations are of points behind their camera at the start, {after} at the end:"
-                " they are not in the rms"
-            )
-        result = self.result
-        if result.status.usable and not result.objective_after <= result.objective_before:
-            grave = True
-            lines.append(
-                f"the objective at the end, {result.objective_after:.8g}, is worse than at the start,"
-                f" {result.objective_before:.8g}"
+                " by 180 degrees about its x axis, and give f and the signs of the pixels as the format has them",
             )
         return lines, grave
 
     def as_dict(self) -> dict[str, Any]:
-        """Return statistics, options and trace for JSON; an infinite radius becomes null there."""
-        lines = self.attention()[0]
+        """Return statistics, options and trace for JSON."""
         sizes = (len(self.bal.cameras), len(self.bal.points), len(self.bal.observations))
-        return statistics(self.source, sizes, self.totals.rms_px, self.result, self.options) | {
-            "origin": self.origin.tolist(),
-            "attention": lines,
-            "setup_s": self.setup_s,
-            "solve_s": self.solve_s,
-        }
-
-
-def statistics(
-    source: str, sizes: tuple[int, int, int], rms: tuple[float, float], result: Result, options: SolverOptions
-) -> dict[str, Any]:
-    """Return what every solve of a file tells; sizes: cameras, points, observations; rms: at the start and the end."""
-    before, after = rms
-    return {
-        "problem": {
-            "file": Path(source).name,
-            **dict(zip(("cameras", "points", "observations"), sizes, strict=True)),
-        },
-        "method": result.method,
-        "linear_solver": result.linear_solver,
-        "options": dataclasses.asdict(options),
-        "status": result.status.name,
-        "reason": result.reason,
-        "objective_before": result.objective_before,
-        "objective_after": result.objective_after,
-        "rms_px_before": before,
-        "rms_px_after": after,
-        "iterations": max(0, len(result.trace) - 1),
-        "accepted_iterations": result.accepted_iterations,
-        "linear_iterations": result.linear_iterations,
-        "trace": [dataclasses.asdict(row) for row in result.trace],
-    }
+        return self.statistics(sizes, self.totals.rms_px, self.attention()[0])
 
 
 def solve_file(
@@ -186,7 +199,9 @@ def read(path: Path | str, options: SolverOptions) -> Solution:
     bal = translated(bal, -origin) if origin.any() else bal
     problem = to_problem(bal)
     unsolved = Result(problem.start, Status.SKIPPED, "not solved yet", options.method, ())
-    return Solution(str(path), bal, problem, origin, unsolved, options, 0.0, 0.0, scene)
+    return Solution(
+        source=str(path), origin=origin, problem=problem, result=unsolved, options=options, bal=bal, bundler=scene
+    )
 
 
 def middle_if_far(points: FloatArray) -> FloatArray:

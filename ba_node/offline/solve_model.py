@@ -19,14 +19,13 @@ from ba_node.config import SolverOptions
 from ba_node.core.bordered import Shared, Unknown, place_of
 from ba_node.core.objective import reprojection_errors, rms_px, squared_errors
 from ba_node.core.problem import Cameras, Problem, State
-from ba_node.core.result import Result
 from ba_node.core.shared_focal import solve_cameras
 from ba_node.core.solver import solve
 from ba_node.estimate import Iteration, Poses
 from ba_node.io.colmap import ColmapModel, read_colmap, write_colmap
 from ba_node.io.g2o import read_g2o, write_g2o
 from ba_node.io.model import LENSES, ModelError, Reconstruction
-from ba_node.offline.solve_bal import middle_if_far, statistics
+from ba_node.offline.solve_bal import Solved, middle_if_far
 
 # What of the cameras can be refined: columns of their parameters, and their places in a rig.
 FOCAL, PRINCIPAL_POINT, DISTORTION, RIG = "focal", "principal_point", "distortion", "rig"
@@ -34,25 +33,16 @@ _COLUMNS = {FOCAL: (0, 1), PRINCIPAL_POINT: (2, 3), DISTORTION: tuple(range(4, 1
 GROUPS = (FOCAL, PRINCIPAL_POINT, DISTORTION, RIG)
 # What COLMAP's own adjuster refines unless it is told otherwise.
 DEFAULT_GROUPS = (FOCAL, DISTORTION, RIG)
-# Observations behind their cameras from which on somebody has to look at the model.
-_MANY_BEHIND = 0.01
 
 
-@dataclass(frozen=True)
-class ModelSolution:
+@dataclass(frozen=True, kw_only=True)
+class ModelSolution(Solved):
     """A solved model."""
 
-    source: str  # the folder or file
     model: Reconstruction  # as it was read
     colmap: ColmapModel | None  # the same as COLMAP has it; None for g2o
-    problem: Problem  # in our terms, moved by minus the origin
-    origin: FloatArray  # (3,) of the coordinates in which it was solved, in those of the model
-    result: Result  # state and trace
     cameras: Cameras  # at the end
     unknowns: tuple[Unknown, ...]  # of the cameras
-    options: SolverOptions  # with which it was solved
-    setup_s: float  # time to read and prepare it, s
-    solve_s: float  # time in the solver, s
 
     def refined(self) -> Reconstruction:
         """Return the solution, in the coordinates of the model."""
@@ -76,19 +66,9 @@ class ModelSolution:
 
     def attention(self) -> tuple[list[str], bool]:
         """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
-        count = len(self.problem.observations)
         before, after = (int(np.isnan(reprojection_errors(*end)[:, 0]).sum()) for end in self._ends())
-        lines = []
-        if before or after:
-            lines.append(
-                f"{before} of {count} observations are of points behind their camera at the start, {after} at the end:"
-                f" those at the start {'are left out' if self.options.cheirality == 'drop' else 'count'}"
-            )
-        result, grave = self.result, max(before, after) > _MANY_BEHIND * count
-        if result.status.usable and not result.objective_after <= result.objective_before:
-            grave = True
-            lines.append(f"the objective at the end, {result.objective_after:.8g}, is worse than at the start")
-        return lines, grave
+        dropped = self.options.cheirality == "drop"
+        return self.told((before, after), f"those at the start {'are left out' if dropped else 'count'}")
 
     def as_dict(self) -> dict[str, Any]:
         """Return statistics, options and trace for JSON."""
@@ -97,13 +77,9 @@ class ModelSolution:
         sizes = problem.n_keyframes, problem.n_points, len(problem.observations)
         with np.errstate(all="ignore"):  # infinite where the solve failed
             before, after = (rms_px(squared_errors(*end)) for end in self._ends())
-        return statistics(self.source, sizes, (before, after), self.result, self.options) | {
-            "origin": self.origin.tolist(),
-            "attention": self.attention()[0],
+        return self.statistics(sizes, (before, after), self.attention()[0]) | {
             "camera_unknowns": len(self.unknowns),
             "camera_models": dict(zip(map(str, ids), self.model.lens, strict=True)),
-            "setup_s": self.setup_s,
-            "solve_s": self.solve_s,
         }
 
     def _ends(self) -> list[tuple[Problem, State]]:
@@ -144,7 +120,17 @@ def solve_model(
     else:
         result, cameras = solve(problem, options, clock=clock, on_iteration=on_iteration), problem.cameras
     return ModelSolution(
-        str(path), model, colmap, problem, origin, result, cameras, unknowns, options, ready - began, clock() - ready
+        source=str(path),
+        origin=origin,
+        problem=problem,
+        result=result,
+        options=options,
+        setup_s=ready - began,
+        solve_s=clock() - ready,
+        model=model,
+        colmap=colmap,
+        cameras=cameras,
+        unknowns=unknowns,
     )
 
 

@@ -116,8 +116,18 @@ def solve_on_ranks(
     if state is None or bal is None:
         return None
     result = dataclasses.replace(result, state=state)
-    times = ready - began, solved - ready
-    return Solution(str(path), bal, problem, own.origin, result, options, *times, own.bundler, summed)
+    return Solution(
+        source=str(path),
+        origin=own.origin,
+        problem=problem,
+        result=result,
+        options=options,
+        setup_s=ready - began,
+        solve_s=solved - ready,
+        bal=bal,
+        bundler=own.bundler,
+        summed=summed,
+    )
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,10 @@ def _truth(path: Path, source: ImageSource, run: _Run) -> Poses | None:
         return None
     values = np.array(file.read_text().split(), dtype=np.float64)
     if len(values) != 12 * source.total or source.total != len(run.stamps):
-        run.notes.append(f"{file}: {len(values)} numbers, expected 12 for each of {source.total} images: left aside")
+        why = f"{len(values)} numbers, expected 12 for each of {source.total} images"
+        if len(values) == 12 * source.total:
+            why = f"a line for each of {source.total} images, of which {len(run.stamps)} were taken"
+        run.notes.append(f"{file}: {why}: left aside")
         return None
     matrix = values.reshape(-1, 3, 4)
     stamps: Sequence[int] = run.stamps

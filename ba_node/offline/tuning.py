@@ -28,6 +28,9 @@ from ba_node.offline.measure import Measured, MeasureError, Question, measure
 from ba_node.offline.page import Figure
 from ba_node.offline.study import MAX_LOSS, MAX_SCORE, MIN_GAIN, Goal, Plan, Study, Trial, TuneError
 
+# Parameters and what they give on each recording.
+Swept = Sequence[tuple[dict[str, Value], dict[str, Measured]]]
+
 
 @dataclass(frozen=True)
 class Tuned:
@@ -214,34 +217,52 @@ def sweep(
     base: Config,
     fleet: Fleet,
     combinations: Sequence[dict[str, Value]],
-    progress: Callable[[int, int], None],
-) -> tuple[list[tuple[dict[str, Value], dict[str, Measured]]], dict[str, str]]:
+    keep: Callable[[int, int, Swept], None],
+) -> tuple[Swept, dict[str, str]]:
     """Measure every combination of parameters on every recording.
 
+    ``keep`` is called with the number of replays done, that of all, and the combinations that are through.
+
     Returns:
-        The combinations in their order, and which recordings cannot be used, and why.
+        The combinations in their order, and what cannot be used, recordings and combinations, and why.
 
     Raises:
         ConfigError: parameters contradict each other.
-        MeasureError, BagError, FleetError: a recording cannot be used.
+        TuneError: no combination can be used.
+        MeasureError, BagError, FleetError: no recording can be used.
     """
     start, left_out = usable(plan, base, fleet)
-    plan = replace(plan, recordings=tuple(place for place in plan.recordings if place[0] in start))
+    places = tuple(place for place in plan.recordings if place[0] in start)
     configs = [base.with_values(values) for values in combinations]
-    questions = [
-        Question(place, config, plan.topics, plan.objective) for config in configs for place in plan.recordings
-    ]
-    found: dict[int, Measured] = {}
-    for number, measured in fleet.each(measure, questions, _lost):
-        found[number] = measured
-        progress(len(found), len(questions))
-    n = len(plan.recordings)
-    table = [
-        (values, {place[0]: found[row * n + column] for column, place in enumerate(plan.recordings)})
-        for row, values in enumerate(combinations)
-    ]
-    return table, left_out
+    questions = [Question(place, config, plan.topics, plan.objective) for config in configs for place in places]
+    rows: list[dict[str, Measured]] = [{} for _ in configs]
+    for done, (number, result) in enumerate(fleet.each(_measured_or_words, questions, lambda _, words: words), 1):
+        row, column = divmod(number, len(places))
+        if isinstance(result, Measured):
+            rows[row][places[column][0]] = result
+        else:
+            values = ", ".join(f"{name}={value}" for name, value in combinations[row].items())
+            left_out[f"{values}, {places[column][0]}"] = result
+        keep(done, len(questions), _through(combinations, rows, places))
+    found = _through(combinations, rows, places)
+    if not found:
+        raise TuneError(next(f"{name}: {words}" for name, words in left_out.items()))
+    return found, left_out
 
 
-def _lost(question: Question, words: str) -> Measured:
-    raise TuneError(f"{question.recording[0]}: {words}")
+def _through(
+    combinations: Sequence[dict[str, Value]], rows: Sequence[dict[str, Measured]], places: Sequence[tuple[str, ...]]
+) -> Swept:
+    """Return the combinations that have been measured on all recordings."""
+    return [
+        (values, {place[0]: row[place[0]] for place in places})
+        for values, row in zip(combinations, rows, strict=True)
+        if len(row) == len(places)
+    ]
+
+
+def _measured_or_words(question: Question) -> Measured | str:
+    try:
+        return measure(question)
+    except MeasureError as error:
+        return words_of(error)

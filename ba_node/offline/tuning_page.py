@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
@@ -17,15 +17,12 @@ from ba_node.io.files import whole_file
 from ba_node.io.parameters import changes_yaml
 from ba_node.offline.figures import BEFORE, CLOUD, COLOURS, line
 from ba_node.offline.fleet import name_of
-from ba_node.offline.measure import Measured
-from ba_node.offline.page import Figure, Page, html_table, write_results
-from ba_node.offline.tuning import Tuned
+from ba_node.offline.page import Figure, Page, html_table, write_results, write_tables
+from ba_node.offline.tuning import Swept, Tuned
 
 _TUNED = "tuned.yaml"
 ERRORS = ("recording", "error at the start", "tuned", "change", "solve p95 at the start", "tuned")
 PARAMETERS = ("parameter", "start", "tuned", "importance")
-# Parameters and what they give on each recording.
-Swept = Sequence[tuple[dict[str, Value], dict[str, Measured]]]
 
 
 def write_parameters(out: Path, base: Config, values: Mapping[str, Value]) -> None:
@@ -154,6 +151,17 @@ def sweep_as_dict(found: Swept) -> dict[str, Any]:
             for values, of in found
         ]
     }
+
+
+def keep_sweep(out: Path, found: Swept) -> None:
+    """Write sweep.csv and sweep.json with what is through, so that a sweep that is interrupted leaves it.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    if found:
+        head, rows = sweep_rows(found)
+        write_tables(out, "sweep", sweep_as_dict(found), [head, *rows])
 
 
 def write_sweep(out: Path, found: Swept) -> str:

@@ -129,7 +129,7 @@ class BaNode(ManagedNode):
         deferred = DeferredAnswers(self, lambda: worker.alive)
         worker = Worker(backend, inbox, config.node.settle_time_s, lambda: deferred.call(self._distribute))
         backend.setup.elsewhere = worker.check_elsewhere
-        backend.adjust_elsewhere = worker.adjust_elsewhere
+        backend.elsewhere = worker.work_elsewhere
         self._host = host = Host(self, config, inbox, worker, deferred, self._log)
         host.at_cleanup.callback(deferred.close)
         worker.start()
@@ -195,10 +195,8 @@ class BaNode(ManagedNode):
         host = self._host
         if host is None:
             return
-        before, host.config = host.config, config
+        host.config = config
         host.inbox.post(lambda backend: backend.configure(config))
-        for component in self._components:
-            component.reconfigure(before)
 
     def _distribute(self) -> None:
         """Give the components what the worker has made."""

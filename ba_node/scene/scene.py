@@ -166,6 +166,8 @@ class Scene(MapTables):
 
     def sessions_of(self, keyframes: IntArray) -> IntArray:
         """Return how many sessions of a map that was joined had begun before each of some keyframes (rows)."""
+        if not self.constraints.seams:
+            return np.zeros(len(keyframes), np.intp)
         rows = [row for row in map(self.find_keyframe, self.constraints.seams) if row is not None]
         begun = np.sort(self.places()[np.array(rows, np.intp)])
         return np.asarray(np.searchsorted(begun, self.places()[keyframes], side="right"))

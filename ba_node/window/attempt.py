@@ -60,7 +60,7 @@ def attempt(
     clock: Callable[[], float],
     on_iteration: Callable[[Iteration], bool] | None,
 ) -> Attempt | str:
-    """Solve the newest window among the first ``end`` keyframes, or return why there is none.
+    """Solve the newest window among the first ``end`` keyframes, or return why it cannot be solved yet.
 
     The scene is not changed, but for where keyframes begin that were not refined yet.
     """
@@ -79,6 +79,8 @@ def attempt(
         if found.state is None:
             return Attempt(selection, result, found, {}, "", without, solve_time_s)
         verdict = guard.decide(config, selection, found, trust)
+        if verdict.waits:
+            return f"waits for parallax: {verdict.reason}"
         if without or not verdict.keyframes:
             held = trust.hear(verdict.reason, verdict.odd, without, config)
             return Attempt(selection, result, found, verdict.health, held, without, solve_time_s)

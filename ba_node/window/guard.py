@@ -61,6 +61,7 @@ class Verdict:
     keyframes: tuple[int, ...] = ()
     odd: Odd | None = None  # steps that need another solve to agree
     systematic: bool = False  # a window that is wrong as a whole, not a part of it
+    waits: bool = False  # nothing is wrong but that there is no parallax yet
 
 
 def decide(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> Verdict:
@@ -83,9 +84,12 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     }
     if not config.guard.enabled:
         return Verdict(health=health)
+    reason = _without_parallax(selection.problem, found.explained, sigma, config)
+    if reason:
+        return Verdict(reason, health, systematic=True, waits=True)
     compared = _Compared.of(config, selection, found.state, found.norms)
     reason = _misfit(selection, found.state, agrees, config) or compared.systematic()
-    reason = reason or _unexplained(selection.whole, found.explained, sigma, config)
+    reason = reason or _unexplained(found.explained, config)
     if reason:
         return Verdict(reason, health, systematic=True)
     return compared.verdict(health, trust.confirmed(config.frames.gate_confirmations))
@@ -141,16 +145,23 @@ def _depth_errors(problem: Problem, state: State) -> FloatArray:
     return np.asarray(np.abs(depth - obs.depth_m[rows]) / obs.depth_sigma_m[rows])
 
 
-def _unexplained(problem: Problem, found: Explained, sigma_px: float, config: Config) -> str:
-    """Return in words whether tracks tell no distances, or are explained worse than by the front-end's poses."""
+def _without_parallax(problem: Problem, found: Explained, sigma_px: float, config: Config) -> str:
+    """Return in words whether rays tell no distances; empty where they do, or depths are measured."""
+    noise = sigma_px / float(np.mean(problem.cameras.params[0, :2]))
+    if not config.guard.held_out_tracks or len(problem.observations.depth_m):
+        return ""
+    if found.parallax_rad >= MIN_PARALLAX * noise:
+        return ""
+    return (
+        f"the rays to its points meet at {np.degrees(found.parallax_rad):.3f} deg, with a noise of"
+        f" {np.degrees(noise):.3f} deg: that does not tell how far away they are, nor how far keyframes are apart"
+    )
+
+
+def _unexplained(found: Explained, config: Config) -> str:
+    """Return in words whether tracks are explained worse than by the front-end's poses."""
     if not config.guard.held_out_tracks:
         return ""
-    noise = sigma_px / float(np.mean(problem.cameras.params[0, :2]))
-    if not len(problem.observations.depth_m) and found.parallax_rad < MIN_PARALLAX * noise:
-        return (
-            f"the rays to its points meet at {np.degrees(found.parallax_rad):.3f} deg, with a noise of"
-            f" {np.degrees(noise):.3f} deg: that does not tell how far away they are, nor how far keyframes are apart"
-        )
     bad = found.worse(config.guard.max_worse_share)
     if not len(bad):
         return ""

@@ -116,11 +116,11 @@ def agreed_points(problem: Problem, config: TracksConfig, gate: float, kernels: 
 
 def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float, kernels: str) -> Agreed:
     found, agrees = consensus.triangulate(rays, n, gate, kernels)
-    of = rays.part(agrees)
-    views, support = np.bincount(rays.point, minlength=n), np.bincount(of.point, minlength=n)
+    point = rays.point[agrees]
+    views, support = np.bincount(rays.point, minlength=n), np.bincount(point, minlength=n)
     sharpness, worst = np.zeros(n), np.zeros(n)
-    np.maximum.at(sharpness, of.point, of.px_per_rad)
-    np.maximum.at(worst, of.point, triangulation.errors(of, found.points))
+    np.maximum.at(sharpness, point, rays.px_per_rad[agrees])
+    np.maximum.at(worst, point, triangulation.errors(rays, found.points)[agrees])
     wide = found.parallax_rad >= np.deg2rad(config.min_parallax_deg)
     wide &= found.parallax_rad * sharpness >= _LEAST_PARALLAX
     fits = worst <= gate * np.where(support > 2, 1.0, _TWO_VIEWS)

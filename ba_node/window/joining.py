@@ -44,13 +44,13 @@ class Earlier:
             while len(self.scenes) > 1 and sum(len(one.keyframes) for one in self.scenes) > config.scene.max_keyframes:
                 del self.scenes[0]
 
-    def join(self, scene: Scene, config: Config, *, final: bool = False) -> tuple[int, Due] | None:
+    def join(self, scene: Scene, config: Config, *, final: bool = False) -> Due | None:
         """Join the current session with one that its newest keyframe sees again.
 
         ``final``: nothing more will come, and sessions that stay apart are counted.
 
         Returns:
-            The session that it was joined with, and what is to be solved then; None if there is none.
+            What is to be solved then; None if it was joined with none.
         """
         for before in reversed(self.scenes if len(scene.keyframes) and scene.cameras is not None else []):
             rows, known = _shared(scene, before)
@@ -65,8 +65,7 @@ class Earlier:
             if found is not None:
                 _put_before(scene, before, found)
                 self.scenes.remove(before)
-                assert before.session_id is not None
-                return before.session_id, Due(f"{len(rows)} tracks connect it with session {before.session_id}")
+                return Due(f"{len(rows)} tracks connect it with session {before.session_id}")
         scene.log.notice("apart", len(self.scenes) if final else 0)
         return None
 

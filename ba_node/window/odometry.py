@@ -59,7 +59,7 @@ _MEDIAN_NORM = 1.538
 
 
 @dataclass(frozen=True)
-class _Steps:
+class Steps:
     """Steps of the front-end between keyframes of a problem and the next ones."""
 
     first: IntArray  # (n,) the earlier keyframe of each
@@ -123,7 +123,7 @@ def _sees_scale(problem: Problem) -> bool:
     return len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
 
 
-def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first: IntArray) -> _Steps:
+def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first: IntArray) -> Steps:
     """Return the front-end's steps as the parameters have them."""
     table, place = scene.keyframes, scene.places()[keyframes]
     poses = table.input_rotation, table.input_position
@@ -131,7 +131,7 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
     length, turn = _travelled(scene, place[first], place[first + 1] - place[first])
     sigma_rad = config.sigma_rad + config.sigma_rad_per_m * length + config.sigma_rad_per_rad * turn
     sigma_m = config.sigma_m + config.sigma_m_per_m * length
-    return _Steps(
+    return Steps(
         first,
         rotation,
         translation,
@@ -140,14 +140,14 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
     )
 
 
-def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> _Steps:
+def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> Steps:
     """Return the front-end's steps between keyframes of a problem that are tied, as the parameters have them."""
     return _front_end(scene, config, keyframes, np.flatnonzero(ties(scene, config, keyframes)))
 
 
 def _as_learned(
-    scene: Scene, config: OdometryConfig, keyframes: IntArray, many: BoolArray, steps: _Steps
-) -> _Steps | None:
+    scene: Scene, config: OdometryConfig, keyframes: IntArray, many: BoolArray, steps: Steps
+) -> Steps | None:
     """Return steps with standard deviations as well-determined keyframes show them to be.
 
     Smaller ones where precision.py has learned that. None where too few are known.

@@ -21,12 +21,13 @@ Only where images have a scale of their own: several cameras, or depths.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
-from ba_node.config import Config
+from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import Config, SolverOptions
 from ba_node.core import covariance, methods, solver
 from ba_node.core.factors import RelativePoses
 from ba_node.core.problem import Problem, State
@@ -48,9 +49,11 @@ _LEAST_STEPS = 5
 class Precision:
     """What was learned in a map."""
 
-    likelihood: FloatArray  # (2, n_shares) of rotation and translation, logarithms
-    fit: FloatArray  # (2,) sum over windows of e' C^-1 e / 3
-    coarse: FloatArray  # (2,) likewise of the standard deviation by images, in stated ones
+    # (2, n_shares) of rotation and translation, logarithms
+    likelihood: FloatArray = field(default_factory=lambda: np.zeros((2, len(_SHARES))))
+    fit: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,) sum over windows of e' C^-1 e / 3
+    # (2,) likewise of the standard deviation by images, in stated ones
+    coarse: FloatArray = field(default_factory=lambda: np.zeros(2))
     windows: int = 0
     seen: int = 0  # keyframes of the map at the last of them
 
@@ -64,68 +67,77 @@ class Precision:
         rotation, translation = np.where(gain > _TELLING, _SHARES[best], 1.0).tolist()
         return rotation, translation
 
+    def study(self, scene: Scene, config: Config, selection: Selection, state: State) -> Study | None:
+        """Return what is to be asked of a window that was taken, with its solution; None if nothing is."""
+        n, whole = len(scene.keyframes), selection.problem
+        told_little = self.windows >= _ENOUGH and scene.step_shares == (1.0, 1.0)
+        has_scale = len(whole.cameras.model) > 1 or len(whole.observations.depth_m) > 0
+        due = n - self.seen >= config.window.max_keyframes and config.window.old_keyframes == "fix"
+        if told_little or not (due and has_scale and config.odometry.enabled) or selection.much_moves:
+            return None
+        steps = odometry.stated(scene, config.odometry, selection.keyframes)
+        many = np.bincount(whole.observations.keyframe, minlength=whole.n_keyframes) >= odometry.MANY_OBSERVATIONS
+        sure = many & ~whole.fixed
+        kept = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
+        if len(kept) < _LEAST_STEPS:
+            return None
+        problem = Problem(state, whole.fixed, whole.cameras, whole.observations, selection.beside)
+        return Study(scene, n, problem, methods.from_config(config.solver), steps, kept)
 
-def learn(scene: Scene, config: Config, known: Precision | None, selection: Selection, state: State) -> Precision:
-    """Return what is known after a window that was taken, with its solution; the scene's steps count accordingly."""
-    known = known or Precision(np.zeros((2, len(_SHARES))), np.zeros(2), np.zeros(2))
-    n, problem = len(scene.keyframes), selection.problem
-    told_little = known.windows >= _ENOUGH and scene.step_shares == (1.0, 1.0)
-    has_scale = len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
-    due = n - known.seen >= config.window.max_keyframes and config.window.old_keyframes == "fix"
-    if told_little or not (due and has_scale and config.odometry.enabled) or selection.much_moves:
-        return known
-    found = _steps_without(scene, config, selection, state)
-    if found is not None:
-        likelihood = _FADES * known.likelihood + np.stack([_likelihood(*part) for part in found])
-        fit = known.fit + [_fit(*part[:2]) for part in found]
-        coarse = known.coarse + [float(np.median(_spread(part[1]) / part[2])) for part in found]
-        known = Precision(likelihood, fit, coarse, known.windows + 1, n)
-        before, scene.step_shares = scene.step_shares, known.shares()
+    def learn(self, done: Study, config: Config) -> None:
+        """Take in what a window has told; the steps of its scene count accordingly from now on."""
+        self.seen = done.seen
+        if done.found is None:
+            return
+        scene = done.scene
+        self.likelihood = _FADES * self.likelihood + np.stack([_likelihood(*part) for part in done.found])
+        self.fit = self.fit + [_fit(*part[:2]) for part in done.found]
+        self.coarse = self.coarse + [float(np.median(_spread(part[1]) / part[2])) for part in done.found]
+        self.windows += 1
+        before, scene.step_shares = scene.step_shares, self.shares()
         newly = any(then == 1.0 and now < 1.0 for then, now in zip(before, scene.step_shares, strict=True))
-        scene.constraints.steps_precise |= newly and n > config.window.max_keyframes
-    return known
+        scene.constraints.steps_precise |= newly and done.seen > config.window.max_keyframes
 
 
-def _steps_without(
-    scene: Scene, config: Config, selection: Selection, state: State
-) -> list[tuple[FloatArray, FloatArray, FloatArray]] | None:
-    """Return errors (n, 3), their covariance by images (n, 3, 3), stated sigmas (n,), of rotation and translation."""
-    options = methods.from_config(config.solver)
-    problem = Problem(
-        state, selection.problem.fixed, selection.problem.cameras, selection.problem.observations, selection.beside
-    )
-    result = solver.solve(problem, options)
-    if not result.status.usable or not result.state.is_finite():
-        return None
-    free = np.flatnonzero(~problem.fixed)
-    uncertainty = covariance.uncertainty_of(problem, result.state, options, np.empty((len(free), 6, 0)))
-    steps = odometry.stated(scene, config.odometry, selection.keyframes)
-    column = np.full(problem.n_keyframes, -1)
-    column[free] = np.arange(len(free))
-    many = np.bincount(problem.observations.keyframe, minlength=problem.n_keyframes) >= odometry.MANY_OBSERVATIONS
-    sure = many & ~problem.fixed
-    kept = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
-    if uncertainty is None or len(kept) < _LEAST_STEPS:
-        return None
-    pairs = np.stack([steps.first, steps.first + 1], axis=1)[kept]
-    unit = np.tile(np.eye(6), (len(kept), 1, 1))
-    factors = RelativePoses(pairs, steps.rotation[kept], steps.translation[kept], unit)
-    error, by_pose = factors.residuals(result.state), factors.jacobians(result.state)
-    whole = uncertainty.of(np.arange(6 * len(free))).reshape(len(free), 6, len(free), 6)
-    ends = column[pairs]
-    covariances = sum(
-        by_pose[:, a] @ whole[ends[:, a], :, ends[:, b], :] @ np.swapaxes(by_pose[:, b], 1, 2)
-        for a in (0, 1)
-        for b in (0, 1)
-    )
-    assert isinstance(covariances, np.ndarray)
-    if not np.isfinite(covariances).all():
-        return None
-    rotation, translation = slice(0, 3), slice(3, 6)
-    return [
-        (error[:, rotation], covariances[:, rotation, rotation], steps.sigma_rad[kept]),
-        (error[:, translation], covariances[:, translation, translation], steps.sigma_m[kept]),
-    ]
+@dataclass
+class Study:
+    """A window that was taken, to be solved once more without the front-end's steps; that may run on any thread."""
+
+    scene: Scene  # that it is of; only :meth:`Precision.learn` looks at it
+    seen: int  # keyframes of the map
+    problem: Problem  # without the steps, at the solution of the window
+    options: SolverOptions
+    steps: odometry.Steps  # as stated
+    kept: IntArray  # those between keyframes that see much
+    # errors (n, 3), their covariance by images (n, 3, 3), stated sigmas (n,), of rotation and translation; None before
+    # :meth:`run`, and where images do not tell
+    found: list[tuple[FloatArray, FloatArray, FloatArray]] | None = None
+
+    def run(self) -> None:
+        """Solve, and compare."""
+        problem, options, steps, kept = self.problem, self.options, self.steps, self.kept
+        result = solver.solve(problem, options)
+        if not result.status.usable or not result.state.is_finite():
+            return
+        free = np.flatnonzero(~problem.fixed)
+        uncertainty = covariance.uncertainty_of(problem, result.state, options, np.empty((len(free), 6, 0)))
+        if uncertainty is None:
+            return
+        column = np.full(problem.n_keyframes, -1)
+        column[free] = np.arange(len(free))
+        pairs = np.stack([steps.first, steps.first + 1], axis=1)[kept]
+        unit = np.tile(np.eye(6), (len(kept), 1, 1))
+        factors = RelativePoses(pairs, steps.rotation[kept], steps.translation[kept], unit)
+        error, by_pose = factors.residuals(result.state), factors.jacobians(result.state)
+        whole = uncertainty.of(np.arange(6 * len(free))).reshape(len(free), 6, len(free), 6)
+        ends = column[pairs]
+        covariances = np.zeros((len(kept), 6, 6))
+        for a, b in itertools.product((0, 1), (0, 1)):
+            between = whole[ends[:, a], :, ends[:, b], :]
+            covariances += by_pose[:, a] @ between @ np.swapaxes(by_pose[:, b], 1, 2)
+        if np.isfinite(covariances).all():
+            parts = ((slice(0, 3), steps.sigma_rad), (slice(3, 6), steps.sigma_m))
+            self.found = [(error[:, of], covariances[:, of, of], sigma[kept]) for of, sigma in parts]
 
 
 def _fit(error: FloatArray, covariances: FloatArray) -> float:

@@ -111,12 +111,12 @@ _LEAST_PLACED = 0.15
 
 
 def determined(
-    problem: Problem, usable: BoolArray, moves: BoolArray, max_landmarks: int, min_points: int
+    problem: Problem, usable: BoolArray, moves: BoolArray, max_landmarks: int, min_points: IntArray
 ) -> tuple[IntArray, BoolArray, BoolArray]:
     """Return which observations, keyframes and points are left without all that does not determine anything.
 
     ``usable`` (n_obs,) observations may take part; points that ``moves`` (n_pt,) marks do not count, as they move;
-    points without a place are NaN. ``max_landmarks`` are kept, and a keyframe has to see ``min_points``.
+    points without a place are NaN. ``max_landmarks`` are kept, and a keyframe has to see ``min_points`` (n_kf,).
 
     Returns:
         Rows of the observations, (n_kf,) and (n_pt,) True for what is kept.

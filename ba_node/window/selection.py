@@ -118,12 +118,13 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         return reason
     scene.propagate_corrections()
     known = old_keyframes.memory(scene, config, window)
+    told = () if known is None else known.keyframe_id
     part, norms, strays = _arrived(scene, window, config, without)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     moves = _moving(scene, part, norms, config)
     much_moves = moving.much(part.problem, moves)
-    least = _least_points(part.problem, config)
+    least = _least_points(part.problem, config, np.isin(scene.keyframes.keyframe_id[part.keyframes], told))
     kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]
@@ -287,11 +288,12 @@ def _older(scene: Scene, window: IntArray, keyframe: NDArray[np.int32]) -> IntAr
     ``keyframe`` is that of each inlier observation of its points. A keyframe that was never refined would only hold the
     others to the front-end's drift.
     """
-    seeing = scene.by_time(scene.distinct(keyframe))
-    shared = np.bincount(scene.numbers(keyframe, seeing), minlength=len(seeing))
-    first = int(scene.places()[window[0]]) if len(window) else 0
+    place = scene.places().take(keyframe)
+    before = keyframe[place < (int(scene.places()[window[0]]) if len(window) else 0)]
+    seeing = scene.by_time(scene.distinct(before))
+    shared = np.bincount(scene.numbers(before, seeing), minlength=len(seeing))
     # Newest first, so that of those that share equally many the newest are taken.
-    older = np.flatnonzero((scene.places()[seeing] < first) & scene.keyframes.refined[seeing])[::-1]
+    older = np.flatnonzero(scene.keyframes.refined[seeing])[::-1]
     return seeing[older[np.argsort(-shared[older], kind="stable")]]
 
 
@@ -349,12 +351,15 @@ def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> 
     return usable & ~far
 
 
-def _least_points(problem: Problem, config: Config) -> int:
-    """Return how many points a keyframe has to see: more where images have no scale of their own."""
-    if not config.guard.enabled:
-        return 2
+def _least_points(problem: Problem, config: Config, told: BoolArray) -> IntArray:
+    """Return how many points each keyframe has to see, (n_kf,): more where images have no scale of their own.
+
+    Not more where a prior has ``told`` of a keyframe (n_kf,): window by window, what it still sees would be lost.
+    """
     has_scale = len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
-    return config.guard.min_points * (1 if has_scale else _WITHOUT_SCALE)
+    least = config.guard.min_points if config.guard.enabled else 2
+    more = _WITHOUT_SCALE if config.guard.enabled and not has_scale else 1
+    return np.where(told, least, more * least)
 
 
 def _moving(scene: Scene, part: _Part, norms: FloatArray, config: Config) -> BoolArray:

@@ -60,7 +60,8 @@ def _table(cases: Sequence[Case], results: dict[tuple[str, int], Nees], runs: in
     for case in cases:
         of = np.array([dataclasses.astuple(results[case.name, seed]) for seed in range(runs)])
         means = " | ".join(f"{mean:.2f}" for mean in np.nanmean(of, axis=0))
-        lines.append(f"| {case.sensor} | {case.loss} | {case.claim:g} x | {means} |")
+        slides = "" if case.old_keyframes == "fix" else f", {case.old_keyframes}"
+        lines.append(f"| {case.sensor}{slides} | {case.loss} | {case.claim:g} x | {means} |")
     return "\n".join(lines) + "\n"
 
 

@@ -10,8 +10,8 @@ first keyframe, which is held: the errors of the others are against it, and so i
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.stats
@@ -41,6 +41,16 @@ _COMMON = {
     "drift_rotation_deg": 0.2,
     "drift_translation": 0.008,
 }
+# Four windows of ten.
+_SLIDING = {
+    "keyframes": 40,
+    "length_m": 30.0,
+    "landmarks": 800,
+    "tracks": 60,
+    "track_loss": 0.05,
+    "drift_rotation_deg": 0.3,
+    "drift_translation": 0.01,
+}
 _OF_SENSOR: dict[str, dict[str, float]] = {
     "stereo": {"baseline_m": 0.2},
     "rgbd": {"baseline_m": 0.0, "depth_share": 1.0, "depth_noise": 0.02},
@@ -50,19 +60,27 @@ _OF_SENSOR: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """A sensor, the robust loss of the solver, and how many times the true noise ``sigma_px`` claims to be."""
+    """A sensor, the robust loss of the solver, and how many times the true noise ``sigma_px`` claims to be.
+
+    With ``old_keyframes`` marginalised a window of ten slides over a longer way: see what is told of the last window.
+    """
 
     sensor: str
     loss: str
     claim: float
+    old_keyframes: str = "fix"
 
     @property
     def name(self) -> str:
         """Return its name in files."""
-        return f"{self.sensor}_{self.loss}_{self.claim:g}"
+        slides = "" if self.old_keyframes == "fix" else f"_{self.old_keyframes}"
+        return f"{self.sensor}_{self.loss}_{self.claim:g}{slides}"
 
 
-CASES = tuple(Case(sensor, loss, claim) for sensor in SENSORS for loss in LOSSES for claim in CLAIMS)
+CASES = (
+    *(Case(sensor, loss, claim) for sensor in SENSORS for loss in LOSSES for claim in CLAIMS),
+    Case("mono", "cauchy", 1.0, "marginalise"),
+)
 
 
 @dataclass(frozen=True)
@@ -77,8 +95,13 @@ class Nees:
 
 def run(case: Case, seed: int) -> Nees:
     """Replay one recording, refine everything and return the NEES."""
-    data = generate(SyntheticOptions(seed=seed, **_COMMON, **_OF_SENSOR[case.sensor]))  # type: ignore[arg-type]
-    backend = Backend(Config().with_values({"solver.loss": case.loss, "guard.check_setup": False}))
+    options: dict[str, Any] = _COMMON | _OF_SENSOR[case.sensor]
+    chosen: dict[str, Any] = {"solver.loss": case.loss, "guard.check_setup": False}
+    if case.old_keyframes != "fix":
+        options |= _SLIDING
+        chosen |= {"window.max_keyframes": 10, "window.old_keyframes": case.old_keyframes}
+    data = generate(SyntheticOptions(seed=seed, **options))
+    backend = Backend(Config().with_values(chosen))
     last = None
     for event in backend.replay(_claimed(measurement, case.claim) for _, _, measurement in data.timeline()):
         last = event if isinstance(event, Estimate) else last
@@ -128,39 +151,3 @@ def _nees(error: FloatArray, covariance: FloatArray) -> float:
     if not np.isfinite(covariance).all() or not covariance.any():
         return np.nan
     return float(error @ np.linalg.solve(covariance, error))
-
-
-OLD_KEYFRAMES = ("fix", "marginalise", "drop")
-# Three windows of ten on a way that comes back to nothing.
-_SLIDING = {**_COMMON, "keyframes": 40, "length_m": 30.0, "landmarks": 1500, "outlier_share": 0.02}
-
-
-@dataclass(frozen=True)
-class Slid:
-    """What a window that slides to the end gives, with each choice for keyframes that leave it."""
-
-    rmse_m: float  # of the path
-    batch_m: float  # of the path after a solve of everything
-    nees: float  # of the newest keyframe, against the first one of the map
-    solver_s: float  # time in the solver, for all windows, s
-
-
-def slide(sensor: str, old_keyframes: str, seed: int, clock: Callable[[], float]) -> Slid:
-    """Replay one recording with a window of ten keyframes; ``clock`` returns seconds."""
-    data = generate(SyntheticOptions(seed=seed, **{**_SLIDING, **_OF_SENSOR[sensor]}))  # type: ignore[arg-type]
-    window = {"window.max_keyframes": 10, "window.old_keyframes": old_keyframes}
-    backend = Backend(Config().with_values({**window, "guard.check_setup": False}), clock=clock)
-    last, spent = None, 0.0
-    for event in backend.replay(measurement for _, _, measurement in data.timeline()):
-        if isinstance(event, Estimate):
-            last, spent = event, spent + event.report.solve_time_s
-        if isinstance(event, Keyframe) and event.keyframe_id == data.keyframes[-1].keyframe_id:
-            backend.extras = Extras(covariance=True)
-    assert last is not None
-    path = backend.estimate().trajectory.position
-    backend.extras = Extras()
-    batch = backend.optimize()
-    assert batch is not None and last.covariance is not None
-    off = [np.sum((found - data.truth.position) ** 2, axis=1) for found in (path, batch.trajectory.position)]
-    rmse = [float(np.sqrt(np.mean(squares))) for squares in off]
-    return Slid(rmse[0], rmse[1], _of_poses(last, data)[-1], spent)

@@ -72,7 +72,6 @@ BESIDE = (
                     f"{name}, mu {mu}",
                     ladybug(_NAMES[name], f"initial_damping={mu}", *extra),
                     {"solves": SOLVES[name]},
-                    seeds=1,
                 )
                 for mu in _GRID
                 for name, extra in (("DINM", (CAP, RADIUS)), ("TNM", (CAP,)), ("LMA-CD", ()))

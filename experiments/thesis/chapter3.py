@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from experiments.thesis.data_sets import LADYBUG
-from experiments.thesis.experiments import SEEDS, Case, Experiment
+from experiments.thesis.experiments import Case, Experiment
 from experiments.thesis.problems import LADYBUG_PART
 from experiments.thesis.starts import MU, RADIUS, START
 from experiments.thesis.tasks import Measure, Run
@@ -46,11 +46,6 @@ def dinm(*settings: str) -> Run:
 def lma_cd(*settings: str, iterations: int = 50) -> Run:
     """Return LMA-CD."""
     return ladybug("lma_cd", MU, *settings, iterations=iterations)
-
-
-def _seeds(side: str) -> int:
-    """Return from how many starts: those that keep H or S_B whole take 1000 products with it a solve."""
-    return SEEDS if side == "C" else 1
 
 
 _CHOLESKY_TIMES: dict[str, dict[str, float | str]] = {
@@ -156,7 +151,6 @@ CHAPTER_3 = (
                 lma_cd("schur=H", iterations=2),
                 {"seconds_per_solve": 5.88, "seconds": 709.0},
                 "2 steps, for time",
-                seeds=1,
             ),
             *(
                 Case(
@@ -164,7 +158,6 @@ CHAPTER_3 = (
                     Run(LADYBUG_PART, "lma_cd", (NUMPY, MU, f"schur={side}"), 5),
                     _CHOLESKY_TIMES[label],
                     versus="SC of C, 10 frames",
-                    seeds=SEEDS if side == "C" else 1,
                 )
                 for label, side in (("SC of C", "C"), ("no SC", "H"), ("SC of B", "B"))
             ),
@@ -215,7 +208,7 @@ CHAPTER_3 = (
         "3.5",
         "INM with each Schur complement and scaling",
         tuple(
-            Case(f"{side}-{scaling}", inm(side, scaling), _INM_TIMES.get(f"{side}-{scaling}", {}), seeds=_seeds(side))
+            Case(f"{side}-{scaling}", inm(side, scaling), _INM_TIMES.get(f"{side}-{scaling}", {}))
             for side, scaling in _VARIANTS
         ),
         (*SOLVE_COLUMNS[:6], *STEPPED, "end"),
@@ -227,7 +220,7 @@ CHAPTER_3 = (
         "3.6",
         "TNM with each Schur complement and damping",
         tuple(
-            Case(f"{side}-{damping}", tnm(side, damping), _TNM_TIMES.get(f"{side}-{damping}", {}), seeds=_seeds(side))
+            Case(f"{side}-{damping}", tnm(side, damping), _TNM_TIMES.get(f"{side}-{damping}", {}))
             for side, damping in _VARIANTS
         ),
         (*SOLVE_COLUMNS[:6], *STEPPED, "end"),
@@ -239,7 +232,7 @@ CHAPTER_3 = (
         "inm-tnm",
         "INM and TNM",
         tuple(
-            Case(f"{name}:{side}-{scaling}", make(side, scaling), seeds=_seeds(side))
+            Case(f"{name}:{side}-{scaling}", make(side, scaling))
             for side, scaling in (("H", "I"), ("C", "inc"), ("B", "diag"))
             for name, make in (("INM", inm), ("TNM", tnm))
         ),

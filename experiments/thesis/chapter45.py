@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from experiments.thesis.chapter3 import CAP, CURVES, NUMPY, SOLVE_COLUMNS, STEPPED, ladybug, lma_cd
 from experiments.thesis.data_sets import LADYBUG
-from experiments.thesis.experiments import SEEDS, Case, Experiment
+from experiments.thesis.experiments import Case, Experiment
 from experiments.thesis.problems import CLEAN, NOISY
 from experiments.thesis.sphere_options import PRESETS, PRINTED_OBSERVATIONS
 from experiments.thesis.starts import LARGE, MILD, MU, START
@@ -58,10 +58,8 @@ _RMSE = {
     ),
 }
 _STEPS = {"10-289": 100, "50-1000": 40, "100-4000": 4, "500-5000": 2}
-_SPHERE_SEEDS = {"10-289": SEEDS, "50-1000": 2, "100-4000": 1, "500-5000": 1}
 # With the C++ kernels, to an end: the large ones are too large for the others. These step locally, LMA-CD and BAL too.
 _MORE_STEPS = {"100-4000": 40, "500-5000": 15}
-_NATIVE_SEEDS = {"100-4000": 2, "500-5000": 1}
 # ADINM to the letter compares B and C as PCG sees them.
 SCALED = "schur=adaptive_scaled"
 _BLOCKS = "preconditioner=schur_block"
@@ -108,7 +106,6 @@ def _sphere(number: str, problem: str) -> Experiment:
                 _method(problem, label, steps),
                 {"rmse_cameras": cameras, "rmse_points": points},
                 versus="LMA-CD, C++" if large else "LMA-CD",
-                seeds=_SPHERE_SEEDS[problem],
             )
         )
     cases += _to_the_end(problem, printed) if large else []
@@ -151,7 +148,6 @@ def _to_the_end(problem: str, printed: dict[str, tuple[float, float]]) -> list[C
                 figures if label != "BAL, scaled" else {},
                 f"{few} steps" if few < steps else "",
                 "LMA-CD, C++",
-                seeds=_NATIVE_SEEDS[problem] if few == steps else 1,
             )
         )
     return cases
@@ -167,7 +163,7 @@ CHAPTER_4 = (
         "4.1",
         "ADINM and DINM",
         tuple(
-            Case(label, task, figures, seeds=1 if label.startswith("ADINM:inc-I") else SEEDS)
+            Case(label, task, figures)
             for label, task, figures in (
                 (
                     "DINM:inc-I",
@@ -230,7 +226,7 @@ CHAPTER_4 = (
     Experiment(
         "outliers",
         "reprojection errors and gradient after 50 steps of ADINM",
-        (Case("ADINM", _adinm("none"), {"outside_two_px": 1.60, "gaussian_outside": 0.2}, seeds=1),),
+        (Case("ADINM", _adinm("none"), {"outside_two_px": 1.60, "gaussian_outside": 0.2}),),
         ("outside_two_px", "gaussian_outside", "kurtosis"),
         ("4.5", "4.6"),
         ("histograms",),
@@ -270,7 +266,7 @@ CHAPTER_5 = (
     Experiment(
         "fig-5.4",
         "reprojection in two images of Ladybug-49 before and after DINM",
-        (Case("DINM", ladybug("dinm", CAP, *START, images=(10, 35)), seeds=1),),
+        (Case("DINM", ladybug("dinm", CAP, *START, images=(10, 35))),),
         ("objective_before", "objective", "gradient"),
         ("5.4",),
         ("reprojection",),
@@ -297,7 +293,7 @@ CHAPTER_5 = (
             Case("LMA-CD", lma_cd()),
             Case("BAL", ladybug("bal", CAP)),
             Case("DINM", ladybug("dinm", _CAP_3000, *MILD)),
-            Case("ADINM", _adinm("none"), {"gradient": 1.0}, seeds=1),
+            Case("ADINM", _adinm("none"), {"gradient": 1.0}),
             Case("local DINM", ladybug("local_dinm", _CAP_3000, *MILD)),
             Case("IRLS", ladybug("irls_huber", _CAP_3000, *MILD)),
             Case("DINM, mu 1e-4", ladybug("dinm", _CAP_3000, *START)),

@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from experiments.thesis.catalogue import EXPERIMENTS, PRINTED, REPEATED
+from experiments.thesis.catalogue import EXPERIMENTS, PRINTED
 from experiments.thesis.claims import CLAIMS
 from experiments.thesis.problems import DATA, Library
 from experiments.thesis.tables import Table, escaped
-from experiments.thesis.tasks import Run, key
+from experiments.thesis.tasks import key
 from experiments.thesis.verdicts import HOLDS, HOLDS_NOT, PARTLY, Found, Results, Verdict, verdict_on
 
 SecondRun = Mapping[str, Any]
@@ -37,7 +37,7 @@ _HOW = """\
   of two, or of ten where its curves lie orders of magnitude apart (`experiments/thesis/margins.py`). Depth is the value
   at the end of a run.
 - `ba thesis` makes every solve from three starts, the file's and two that differ from it by 1e-13 of the points'
-  coordinates, what takes minutes from fewer; figures are medians, the least and the largest in brackets. {starts}
+  coordinates; figures are medians, the least and the largest in brackets.
   Each comparison is made again with the worst and the best that seeds and another machine may make of it (another tenth
   of a time, half of a gradient, 1e-4 of an objective): a verdict that would change says so.
 - The second run has its start points, seeds and order of work from the first, and other machine code: the kernels for
@@ -141,8 +141,7 @@ def claims_page(results: Results, second: SecondRun | None = None) -> str:
         )
     summary += _second(verdicts, second) if second else ""
     table = verdict_table(verdicts, old).markdown()
-    how = _HOW.replace("{starts}", _starts(results))
-    return f"{_INTRO}{summary}\n\n{table}\n{how}\n## What the verdicts rest on\n\n{grounds(verdicts)}"
+    return f"{_INTRO}{summary}\n\n{table}\n{_HOW}\n## What the verdicts rest on\n\n{grounds(verdicts)}"
 
 
 def _second(verdicts: Sequence[Verdict], second: SecondRun) -> str:
@@ -152,15 +151,3 @@ def _second(verdicts: Sequence[Verdict], second: SecondRun) -> str:
     said = f" A second run ({second['kernels']}) gives the same verdict on {len(verdicts) - len(other)} of them"
     parts = [f"{n} ({word}{', as it warns' * (not verdict.steady)})" for n, verdict, word in other]
     return f"{said}; another one on {', '.join(parts)}." if parts else f"{said}."
-
-
-def _starts(results: Results) -> str:
-    """Return in words from how many starts the recorded solves of the thesis were made."""
-    counts = Counter(
-        results[experiment.name][case.label].get("seeds", 1)
-        for experiment in REPEATED
-        for case in experiment.cases
-        if isinstance(case.task, Run) and case.label in results.get(experiment.name, {})
-    )
-    parts = [f"{counts[number]} from {number}" for number in sorted(counts, reverse=True)]
-    return f"Of the {sum(counts.values())} solves recorded here {', '.join(parts)}."

@@ -15,6 +15,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import Keyframe, Measurement
+from ba_node.scene.candidates import Admitted
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 
 S = 1_000_000_000
@@ -65,13 +66,28 @@ def changed(group: Iterable[Measurement], **changes: Any) -> list[Measurement]:
     return [other(m) for m in group]
 
 
-class Played(Backend):
+class Remembering(Backend):
+    """A back-end of which the maps that ended are kept."""
+
+    def __init__(self, settings: dict[str, Any] | None = None) -> None:
+        super().__init__(Config().with_values(settings or {}))
+        self.finished: list[tuple[int | None, Estimate]] = []  # session and last estimate of the maps before
+
+    def take(self, admitted: Admitted) -> None:
+        before = self.map
+        super().take(admitted)
+        begins = admitted.begins
+        if self.map is not before and before.keyframe_count and not (begins is not None and begins.replaces):
+            self.finished.append((before.session_id, before.estimate()))
+
+
+class Played(Remembering):
     """A back-end and what it gave for each keyframe of a stream."""
 
     def __init__(
         self, stream: Iterable[Measurement], final: bool = True, settings: dict[str, Any] | None = None
     ) -> None:
-        super().__init__(Config().with_values(settings or {}))
+        super().__init__(settings)
         self.estimates: list[Estimate | None] = []
         self.play(stream, final)
 

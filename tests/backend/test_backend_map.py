@@ -91,7 +91,6 @@ def test_a_copy_goes_on_as_the_first_does(drawn: tuple[list[Measurement], int]) 
     rest = [[*feed(each, measurements[cut:]), each.solve()] for each in (first, second)]
     assert [estimate_bits(e) for e in rest[0] if e] == [estimate_bits(e) for e in rest[1] if e]
     assert bits(first.snapshot()) == bits(second.snapshot())
-    assert [key for key, _ in first.finished] == [key for key, _ in second.finished]
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +126,6 @@ def _knowing() -> Backend:
 def test_it_knows_all_of_that(known: Backend) -> None:
     content = known.snapshot()
     assert len(content.arrays["pending/keyframe_id"]) == 1
-    assert [head["session_id"] for head in content.facts["finished"]] == [0]
     assert content.facts["session_id"] == 1
     assert len(content.arrays["sightings/uv"]) > 100
 
@@ -146,7 +144,7 @@ def test_reset_forgets_all_but_the_cameras(known: Backend) -> None:
     assert {name: len(array) for name, array in content.arrays.items() if len(array)}.keys() == {
         f"cameras/{name}" for name in ("rotation", "translation", "model", "params")
     }
-    assert (content.facts["finished"], content.facts["session_id"], content.facts["rejected"]) == ([], None, {})
+    assert (content.facts["session_id"], content.facts["rejected"]) == (None, {})
     assert known.scene.cameras is cameras
     assert known.solve_count == count
     # A session that is not higher than the last is taken, too: the front-end need not know of the reset.
@@ -177,7 +175,6 @@ def put(at: int, value: Any) -> Callable[[np.ndarray], None]:
         (lambda c: c.arrays.pop("landmarks/guess"), "landmarks/guess is missing"),
         (lambda c: c.arrays.pop("blocks/end"), "blocks/end is missing"),
         (lambda c: c.arrays.pop("cameras/params"), "cameras/params is missing"),
-        (lambda c: c.arrays.pop("finished/0/poses/position"), "finished/0/poses/position is missing"),
         (spoil("keyframes/position", lambda a: a[:, :2]), r"keyframes/position is \(5, 2\) float64, expected \(n, 3\)"),
         (spoil("keyframes/stamp_ns", lambda a: a.astype(float)), "keyframes/stamp_ns is .* expected .* int64"),
         (spoil("keyframes/refined", lambda a: a[1:]), "keyframes/refined has 4 rows, the first of keyframes 5"),
@@ -209,7 +206,6 @@ def put(at: int, value: Any) -> Callable[[np.ndarray], None]:
         (lambda c: c.facts.update(delivered=[None]), "delivered"),
         (lambda c: c.facts["report"].update(status="FINE"), "status = 'FINE', expected one of CONVERGED"),
         (lambda c: c.facts["report"].update(iterations="3"), "iterations = '3', expected int"),
-        (lambda c: c.facts.update(finished=[3]), "finished: 3 is no session"),
     ],
 )
 def test_what_is_not_sound_is_refused(

@@ -21,6 +21,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from tests.backend.session_streams import Remembering
 
 LENGTH = 12
 S = 10**9
@@ -118,7 +119,7 @@ def useless(draw: st.DrawFn, session_id: int) -> Measurement:
 @given(recordings())
 def test_there_is_one_map_for_each_real_session(drawn: tuple[list[Measurement], list[int], int]) -> None:
     stream, lengths, spoiled = drawn
-    backend = Backend(Config().with_values(SETTINGS))
+    backend = Remembering(SETTINGS)
     for measurement in stream:
         known, scene = len(backend.scene.keyframes), backend.scene
         backend.add(measurement)

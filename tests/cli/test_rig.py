@@ -18,7 +18,7 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.io.rig_file import read_rig
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.tools.domain import free_domain, isolation
 from tests.io.test_rig_file import CAMCHAIN
 from tests.messages.adapters import layouts

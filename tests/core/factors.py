@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from ba_node import native
+from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
-from ba_node.core import geometry, native_kernels, parameterisation
+from ba_node.core import covariance, geometry, native_kernels, parameterisation
 from ba_node.core.factors import RelativePoses
 from ba_node.core.kernels import Kernels
 from ba_node.core.priors import CustomFactors, Directions, PosePriors
@@ -99,3 +100,9 @@ def linearised(problem: Problem, options: SolverOptions, backend: str) -> Kernel
     kernels = native_kernels.make(problem, dataclasses.replace(options, kernels=backend))
     kernels.linearise(problem.start)
     return kernels
+
+
+def pose_covariances(problem: Problem, state: State, options: SolverOptions, conditions: FloatArray) -> FloatArray:
+    """Return the covariances (n_free, 6, 6) of the free poses; NaN where they are unknown."""
+    found = covariance.uncertainty_of(problem, state, options, conditions)
+    return np.full((int(np.count_nonzero(~problem.fixed)), 6, 6), np.nan) if found is None else found.poses()

@@ -58,6 +58,10 @@ def test_kernels_agree(views: int) -> None:
         each = dataclasses.replace(rays, distance_m=measured, distance_sigma_m=0.1 * measured)
         numpy, compiled = (consensus.agreeing(each, 50, GATE, name) for name in ("numpy", "native"))
         np.testing.assert_array_equal(numpy, compiled)
+        (found, of_found), (ours, of_ours) = (consensus.triangulate(each, 50, GATE, n) for n in ("numpy", "native"))
+        np.testing.assert_array_equal(of_found, of_ours)
+        np.testing.assert_array_equal(found.measured, ours.measured)
+        np.testing.assert_allclose(ours.points, found.points, rtol=1e-6)
 
 
 @both

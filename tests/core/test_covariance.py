@@ -14,6 +14,7 @@ from ba_node.core import covariance, geometry, methods, solver
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Observations, Problem, State
 from experiments.thesis import matrix_forms
+from tests.core.factors import pose_covariances
 
 MakeProblem = Callable[..., tuple[Problem, State]]
 
@@ -125,7 +126,7 @@ def test_it_is_what_repeated_measurements_scatter_by(make_problem: MakeProblem) 
         noisy = with_noise(problem, problem.observations, rng)
         state = solved(noisy, chosen)
         errors.append(local_errors(truth, state, free))
-        told.append(covariance.pose_covariances(noisy, state, chosen, none(problem)))
+        told.append(pose_covariances(noisy, state, chosen, none(problem)))
     # The standard error of a standard deviation from n samples is 1 / sqrt(2 n): 3.5 %.
     measured = np.std(np.array(errors), axis=0)
     ratio = measured / np.sqrt(np.diagonal(np.mean(told, axis=0), axis1=1, axis2=2))
@@ -142,8 +143,8 @@ def test_sigma_follows_the_residuals_not_what_was_claimed(make_problem: MakeProb
     claimed = dataclasses.replace(problem, observations=dataclasses.replace(obs, sigma_px=10.0 * obs.sigma_px))
     chosen = options()
     state = solved(problem, chosen)
-    a = covariance.pose_covariances(problem, state, chosen, none(problem))
-    b = covariance.pose_covariances(claimed, state, chosen, none(problem))
+    a = pose_covariances(problem, state, chosen, none(problem))
+    b = pose_covariances(claimed, state, chosen, none(problem))
     np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
 
 
@@ -153,9 +154,9 @@ def test_a_condition_holds_a_scale_that_floats(make_problem: MakeProblem) -> Non
     chosen = options()
     state = solved(problem, chosen)
     n = int(np.count_nonzero(~problem.fixed))
-    assert np.isnan(covariance.pose_covariances(problem, state, chosen, none(problem))).any(), "nothing holds the scale"
+    assert np.isnan(pose_covariances(problem, state, chosen, none(problem))).any(), "nothing holds the scale"
     g = np.random.default_rng(0).normal(size=(n, 6, 1))
-    got = covariance.pose_covariances(problem, state, chosen, g)
+    got = pose_covariances(problem, state, chosen, g)
     lin = Objective(problem, chosen).linearise(state)
     h, _ = matrix_forms.explicit_dense(problem, lin)
     border = np.zeros((len(h), 1))
@@ -186,7 +187,7 @@ def _without(problem: Problem, kept: np.ndarray) -> Problem:
 )
 def test_unknown_is_nan(make_problem: MakeProblem, spoil: Callable[[Problem], Problem]) -> None:
     problem = spoil(make_problem(stereo=True)[0])
-    got = covariance.pose_covariances(problem, problem.start, options(), none(problem))
+    got = pose_covariances(problem, problem.start, options(), none(problem))
     assert got.shape == (4, 6, 6) and np.isnan(got).all()
 
 
@@ -197,7 +198,7 @@ def test_only_the_keyframe_that_hangs_loose_is_unknown(make_problem: MakeProblem
     few = last & (np.cumsum(last) > 2)
     loose = _without(problem, ~few)
     state = solved(loose, options())
-    got = covariance.pose_covariances(loose, state, options(), none(loose))
+    got = pose_covariances(loose, state, options(), none(loose))
     assert np.isnan(got[-1]).all()
     assert np.isfinite(got[:-1]).all()
 
@@ -237,7 +238,7 @@ def test_the_weakest_pose_is_that_of_the_whole_of_h(make_problem: MakeProblem, f
 def test_the_weakest_pose_is_a_lower_bound(make_problem: MakeProblem) -> None:
     problem, _ = make_problem(stereo=True, noise_px=1.0)
     result = solver.solve(problem, options(), weakest=True)
-    every = covariance.pose_covariances(problem, result.state, options(), none(problem))
+    every = pose_covariances(problem, result.state, options(), none(problem))
     rotation = np.sqrt(np.linalg.eigvalsh(every[:, :3, :3]).max())
     assert 0.0 < result.weakest[1] < rotation
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from ba_node.config import SolverOptions
-from ba_node.core import covariance, geometry, solver
+from ba_node.core import geometry, solver
 from ba_node.core.problem import Observations, PointPriors, ProblemError
 from ba_node.core.result import Status
 from tests.core.factors import (
     BACKENDS,
     Make,
     near,
+    pose_covariances,
     relative_poses,
     single_keyframe_factors,
     stepped,
@@ -94,7 +95,7 @@ def test_covariance_counts_factors(make_problem: Make) -> None:
     for factors in ((), (tight,)):
         posed = dataclasses.replace(problem, factors=factors)
         state = solver.solve(posed, options).state
-        found.append(covariance.pose_covariances(posed, state, options, np.empty((4, 6, 0))))
+        found.append(pose_covariances(posed, state, options, np.empty((4, 6, 0))))
     plain, precise = (np.sqrt(np.trace(one[3])) for one in found)
     assert precise < 1e-3 * plain
 

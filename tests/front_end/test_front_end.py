@@ -18,6 +18,8 @@ from ba_node.front_end import FrontEnd, Images, State, Tracked
 from ba_node.measurements import Keyframe
 from tests.front_end import world
 
+pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
+
 OPTIONS = FrontEndOptions(max_features=300)
 PLAIN = dataclasses.replace(OPTIONS, stereo_align=False)
 

@@ -23,6 +23,7 @@ from tests.front_end import world
     ],
 )
 def test_rigs_that_cannot_be_used(changes: dict[str, object], words: str) -> None:
+    pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
     broken: CameraRig = dataclasses.replace(world.rig(), **changes)  # type: ignore[arg-type]
     with pytest.raises(FrontEndError, match=words):
         FrontEnd(broken)

@@ -8,6 +8,7 @@ import bz2
 import dataclasses
 import functools
 import gzip
+import importlib.util
 import io
 import struct
 import warnings
@@ -45,6 +46,8 @@ from tests.front_end import world
 from tests.messages.adapters import layouts
 
 COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
+# Forms of COLMAP's models, and whether they are text; none where pycolmap is missing.
+FORMS_OF_COLMAP = {"": False, "_text": True} if importlib.util.find_spec("pycolmap") else {}
 # Images of a recording, and left, top, width and height of the part of each that is in it, px.
 _IMAGE, _IMAGES, _CUT = "sensor_msgs/msg/Image", 3, (80, 60, 160, 120)
 Reader = Callable[[Path], object]
@@ -138,8 +141,7 @@ READERS: dict[str, Reader] = {
     "ply": read_ply,
     "poses": read_poses,
     "rig": read_rig,
-    **{f"colmap_{part}": _colmap(part) for part in COLMAP},
-    **{f"colmap_text_{part}": _colmap(part, "_text") for part in COLMAP},
+    **{f"colmap{form}_{part}": _colmap(part, form) for form in FORMS_OF_COLMAP for part in COLMAP},
     **{f"adapt_{source}": _adapted(source) for source in SOURCES},
     "images": read_images,
     "yaml": lambda path: configure(path, {}),
@@ -175,8 +177,8 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
     pinhole = dataclasses.replace(bal, cameras=bal.cameras * (np.arange(9) < 7))
     write_g2o(folder / "b.g2o", model.from_bal(pinhole))
     write_ply(folder / "a.ply", estimate.cloud, "map")
-    for name, text in (("model", False), ("text", True)):
-        write_colmap(folder / name, to_colmap(model.from_bal(bal)), text=text)
+    for form, text in FORMS_OF_COLMAP.items():
+        write_colmap(folder / f"model{form}", to_colmap(model.from_bal(bal)), text=text)
     write_kitti(folder / "a.kitti", estimate.trajectory)
     read = {suffix: (folder / f"a.{suffix}").read_bytes() for suffix in ("mcap", "tum", "npz", "txt")}
     yaml = parameters_yaml(Config()).encode()
@@ -196,8 +198,11 @@ def _seeds(folder: Path) -> dict[str, list[bytes]]:
         "ply": [(folder / "a.ply").read_bytes()],
         "poses": [(folder / "a.kitti").read_bytes(), read["tum"], read["tum"].replace(b" ", b",")],
         "rig": [rig_yaml(world.rig(), form)[0].encode() for form in FORMS],
-        **{f"colmap_{part}": [(folder / "model" / f"{part}.bin").read_bytes()] for part in COLMAP},
-        **{f"colmap_text_{part}": [(folder / "text" / f"{part}.txt").read_bytes()] for part in COLMAP},
+        **{
+            f"colmap{form}_{part}": [(folder / f"model{form}" / f"{part}{'.txt' if text else '.bin'}").read_bytes()]
+            for form, text in FORMS_OF_COLMAP.items()
+            for part in COLMAP
+        },
         **{f"adapt_{source}": [_of_front_end(folder, source)] for source in SOURCES},
         "images": [_of_images(folder)],
         "yaml": [yaml, b"a: &a [1, 2]\nb: *a\nsolver: {max_iterations: 3}\n"],

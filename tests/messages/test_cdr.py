@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ba_node.estimate import Poses
+from ba_node.estimate import Correction, Poses
 from ba_node.io.ros_types import ROSBAGS_FACTORY as F
 from ba_node.io.ros_types import encode
-from ba_node.messages.cdr import cloud_message, path_message, pose_messages
+from ba_node.messages.cdr import cloud_message, path_message, pose_messages, tf_message
 from ba_node.messages.factory import ConversionError, header_message, pose_message
 from ba_node.messages.outputs import POINT_DTYPE
 
@@ -52,6 +52,23 @@ def test_path(stamps: list[int], stamp_ns: int, frame_id: str) -> None:
     poses = poses_of(stamps)
     message = F.make("nav_msgs/msg/Path", header=header_message(F, stamp_ns, frame_id), poses=stamped(poses, frame_id))
     assert path_message(poses, stamp_ns, frame_id) == encode("nav_msgs/msg/Path", message)
+
+
+@given(STAMPS, FRAMES, FRAMES)
+def test_where_odom_stands_in_the_map(stamp_ns: int, parent: str, child: str) -> None:
+    transform = Correction(child, np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.5, -0.5, 0.5]))
+    stamped = F.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header_message(F, stamp_ns, parent),
+        child_frame_id=child,
+        transform=F.make(
+            "geometry_msgs/msg/Transform",
+            translation=F.make("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0),
+            rotation=F.make("geometry_msgs/msg/Quaternion", x=0.5, y=0.5, z=-0.5, w=0.5),
+        ),
+    )
+    message = F.make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+    assert tf_message(transform, parent, stamp_ns) == encode("tf2_msgs/msg/TFMessage", message)
 
 
 @given(st.integers(0, 4), STAMPS, FRAMES, st.booleans())

@@ -13,17 +13,9 @@ from hypothesis import strategies as st
 
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
-from ba_node.estimate import Cloud, Correction, Estimate, Poses, SolveReport, Transform
+from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Transform
 from ba_node.io.ros_types import ROSBAGS_FACTORY as FACTORY
-from ba_node.messages.transforms import StaticTree, covariance_messages, odometry_message, tf_message
-
-
-def test_tf_says_where_odom_stands_in_the_map() -> None:
-    orientation = np.array([0.5, 0.5, -0.5, 0.5])
-    (stamped,) = tf_message(FACTORY, Correction("odom", np.array([1.0, 2.0, 3.0]), orientation), "map", 5).transforms
-    assert (stamped.header.frame_id, stamped.child_frame_id, stamped.header.stamp.nanosec) == ("map", "odom", 5)
-    t, q = stamped.transform.translation, stamped.transform.rotation
-    assert [t.x, t.y, t.z, q.x, q.y, q.z, q.w] == [1.0, 2.0, 3.0, *orientation]
+from ba_node.messages.transforms import StaticTree, covariance_messages, odometry_message
 
 
 def test_covariances_are_row_major_and_zero_where_unknown(estimate: Estimate) -> None:

@@ -22,6 +22,8 @@ from ba_node.measurements import Keyframe
 from tests.front_end import world
 from tests.messages.adapters import layouts
 
+pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
+
 IMAGE = "sensor_msgs/msg/Image"
 BEGIN_NS, STEP_NS, COUNT = 10**9, 10**8, 12
 SIDES = ("left", "right")

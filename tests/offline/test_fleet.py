@@ -98,6 +98,7 @@ def test_one_process_tells_of_each_recording_as_it_is_done() -> None:
 
 
 def test_results_are_one_table_and_page(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     out = tmp_path / "out"
     assert main(["replay", str(MONO), str(broken), str(STEREO), "--out", str(out), "--no-report"]) == 3
     shown = capsys.readouterr()
@@ -126,6 +127,7 @@ def test_resumed_replays_are_not_done_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_recordings_and_results_may_be_urls(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec", reason="needs fsspec: pip install ba_node[fleet]")
     shutil.copy(MONO, tmp_path / "a.mcap")
     shutil.copy(MONO, tmp_path / "b.mcap")
     url = f"file://{tmp_path}"
@@ -139,6 +141,7 @@ def test_recordings_and_results_may_be_urls(tmp_path: Path) -> None:
 
 
 def test_what_a_store_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fsspec", reason="needs fsspec: pip install ba_node[fleet]")
     for missing, words in (("s3fs", "^s3://a/[*]: Install s3fs to access S3$"), ("fsspec", "pip install ba_node")):
         monkeypatch.setitem(sys.modules, missing, None)
         monkeypatch.setitem(sys.modules, f"{missing}.core", None)
@@ -147,6 +150,7 @@ def test_what_a_store_needs_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_all_bad_is_two(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("fsspec", reason="needs fsspec: pip install ba_node[fleet]")
     nothing = f"file://{tmp_path}/nothing.mcap"
     assert main(["replay", str(broken), nothing, "--out", str(tmp_path / "out"), "--no-report"]) == 2
     assert f"ba: error: {nothing}: FileNotFoundError" in capsys.readouterr().err

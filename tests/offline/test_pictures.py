@@ -8,11 +8,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import matplotlib.image
-import numpy as np
 import pytest
 
 from ba_node.estimate import Poses
-from ba_node.offline.figures import ground_axes, trajectory_figures
+from ba_node.offline.figures import trajectory_figures
 from ba_node.offline.pictures import draw_trajectory
 from ba_node.offline.run_folder import Comparison
 from ba_node.synthetic import SyntheticOptions, generate
@@ -58,11 +57,3 @@ def test_the_error_is_told_where_there_is_a_reference_of_the_same_time() -> None
 def test_matplotlib_is_imported_only_to_draw() -> None:
     code = "import sys, ba_node.offline.pictures; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
-
-
-def test_from_above_is_across_the_axis_along_which_nothing_goes() -> None:
-    way = np.linspace(0.0, 9.0, 20)
-    still = np.zeros(20)
-    assert ground_axes(np.stack([way, still, 2.0 * way], axis=1)) == (0, 2)
-    assert ground_axes(np.stack([still, way, still], axis=1)) == (0, 1)
-    assert ground_axes(np.empty((0, 3))) == (0, 1)

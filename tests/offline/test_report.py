@@ -67,6 +67,7 @@ def unpacked(page: Path, part: str) -> str:
 
 
 def test_the_page_has_all_figures_and_facts(folder: Path) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     text = (folder / REPORT).read_text()
     data = json.loads(unpacked(folder / REPORT, "data"))
     assert [figure["key"] for figure in data] == KEYS
@@ -94,6 +95,7 @@ def test_figures_show_what_is_in_the_files(folder: Path) -> None:
 @needs_browser
 @pytest.mark.slow
 def test_a_browser_draws_every_figure_and_reports_no_error(folder: Path) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     dom = browse(folder / REPORT)
     assert f'data-drawn="{len(KEYS)}"' in dom
     counts = drawn(dom)
@@ -113,6 +115,7 @@ def test_each_figure_is_a_picture_too(folder: Path) -> None:
 @needs_browser
 @pytest.mark.slow
 def test_an_error_in_the_page_is_found(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     page = tmp_path / "page.html"
     page.write_text((folder / REPORT).read_text().replace('id="data">', 'id="data">!'))
     with pytest.raises(BrowserError, match="the browser reports: "):
@@ -122,6 +125,7 @@ def test_an_error_in_the_page_is_found(folder: Path, tmp_path: Path) -> None:
 @needs_browser
 @pytest.mark.slow
 def test_a_long_recording_fits_into_five_megabytes(tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     large(tmp_path, keyframes=1000, points=100_000)
     write_report([tmp_path], tmp_path / REPORT)
     assert (tmp_path / REPORT).stat().st_size < LIMIT_BYTES
@@ -167,6 +171,7 @@ def large(folder: Path, keyframes: int, points: int) -> None:
 
 @pytest.mark.slow
 def test_several_runs_stand_side_by_side(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     other = tmp_path / "other"
     shutil.copytree(folder, other)
     path = tmp_path / "compare.html"
@@ -181,6 +186,7 @@ def test_several_runs_stand_side_by_side(folder: Path, tmp_path: Path) -> None:
 def test_a_replay_leaves_a_page_and_a_picture_unless_told_not_to(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     assert main(["replay", str(BAG), "--out", str(tmp_path / "with")]) == 0
     assert "trajectory.png, report.html, each figure as PNG in report/" in capsys.readouterr().out
     assert (tmp_path / "with" / REPORT).stat().st_size > 1_000_000

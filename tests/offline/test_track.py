@@ -22,6 +22,8 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from tests.front_end import world
 from tests.messages.adapters import layouts
 
+pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
+
 IMAGE = "sensor_msgs/msg/Image"
 
 

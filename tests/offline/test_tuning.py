@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,7 +20,8 @@ from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.parameters import read_parameters
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
-from ba_node.offline.measure import Measured, Question, is_held_out, measure
+from ba_node.offline import tuning
+from ba_node.offline.measure import Measured, MeasureError, Question, is_held_out, measure
 from ba_node.offline.recording import record
 from ba_node.offline.study import score_of
 from ba_node.offline.tuning import chosen, grid, preset
@@ -233,3 +238,36 @@ def test_a_recording_that_cannot_be_used_is_left_out_and_named(
     assert f"ba: error: {broken}: no message can be read" in shown.err
     assert "mono_loop [m]" in shown.out
     assert main(["sweep", str(broken), *arguments]) == 2
+
+
+def test_an_interrupted_sweep_keeps_what_is_through(tmp_path: Path) -> None:
+    values = ",".join(str(n) for n in range(4, 40))
+    command = [sys.executable, "-m", "ba_node.cli.main", "sweep", str(MONO), "--out", str(tmp_path)]
+    process = subprocess.Popen([*command, "--values", f"window.max_keyframes={values}"], stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 60.0
+    while not (tmp_path / "sweep.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 130, error
+    lines = (tmp_path / "sweep.csv").read_text().splitlines()
+    assert 2 <= len(lines) < 37
+    assert len(json.loads((tmp_path / "sweep.json").read_text())["combinations"]) in {len(lines) - 1, len(lines)}
+
+
+def test_a_combination_that_gives_nothing_is_named_and_stops_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def choosy(question: Question) -> Measured:
+        if question.config.window.max_keyframes == 5:
+            raise MeasureError("nothing came of it")
+        return measure(question)
+
+    monkeypatch.setattr(tuning, "measure", choosy)
+    arguments = ["sweep", str(MONO), "--out", str(tmp_path), "--values"]
+    assert main([*arguments, "window.max_keyframes=5,20"]) == 3
+    shown = capsys.readouterr()
+    assert f"ba: error: window.max_keyframes=5, {MONO}: nothing came of it" in shown.err
+    assert [line.split(",")[0] for line in (tmp_path / "sweep.csv").read_text().splitlines()[1:]] == ["20"]
+    assert main([*arguments, "window.max_keyframes=5"]) == 2
+    assert "nothing came of it" in capsys.readouterr().err

@@ -27,7 +27,7 @@ from ba_node.measurements import CameraRig, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import OUTPUT_TYPES
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory, message_class
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.ros.harness import NodeProcess, Peer, solve_until_stopped
 

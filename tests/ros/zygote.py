@@ -97,7 +97,7 @@ if __name__ == "__main__":
         importlib.import_module(module)
     # All else that is imported when the node is configured.
     from ba_node.messages.topics import TOPICS
-    from ba_node.ros.convert import message_class
+    from ba_node.ros.message_factory import message_class
 
     for topic in TOPICS.values():
         message_class(topic.type_name)

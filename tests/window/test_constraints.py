@@ -267,7 +267,7 @@ def test_a_loop_is_closed_while_windows_go_on() -> None:
     """The solve of everything runs elsewhere; keyframes that come meanwhile are solved, and follow."""
     data = first(round_trip(0.5), 46)
     backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
-    backend.adjust_elsewhere = handed.append
+    backend.elsewhere = lambda work: handed.append(work) if isinstance(work, Adjustment) else None
     for _ in backend.replay(stream(data, lambda k, _: [loop_of(data, 40)] if k == 39 else [])):
         if handed and len(backend.scene.keyframes) == 44:
             break
@@ -281,24 +281,24 @@ def test_a_loop_is_closed_while_windows_go_on() -> None:
     before = [error(k) for k in (39, len(ids) - 2)]
     handed[0].run()
     assert [error(k) for k in (39, len(ids) - 2)] == before, "nothing moves before it is taken in"
-    assert backend.take_adjustment(handed[0]) is not None
+    assert backend.take_work(handed[0]) is not None
     assert backend.report.adjustments == 1 and backend.solve_count == solves + 1
     assert max(error(39), error(len(ids) - 2)) < 0.3 * min(before), (before, error(39), error(len(ids) - 2))
-    assert backend.take_adjustment(handed[0]) is None, "it is taken in once"
+    assert backend.take_work(handed[0]) is None, "it is taken in once"
 
 
 def test_why_no_solve_of_everything_begins_is_said() -> None:
     """Points have a place, and no keyframe sees enough of them: the map is not bent behind their back."""
     data = first(round_trip(0.5), 40)
     backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
-    backend.adjust_elsewhere = handed.append
+    backend.elsewhere = lambda work: handed.append(work) if isinstance(work, Adjustment) else None
     list(backend.replay(stream(data, lambda k, _: [loop_of(data, 36)] if k == 35 else [])))
     copy = handed[0]._copy
     handed[0].config = handed[0].config.with_values({"guard.min_points": 1000})
     before = backend.scene.keyframes.position.copy()
     handed[0].run()
     assert handed[0].why.startswith("no solve of everything can begin: no keyframe of the window sees enough points")
-    assert backend.take_adjustment(handed[0]) is None
+    assert backend.take_work(handed[0]) is None
     np.testing.assert_array_equal(backend.scene.keyframes.position, before)
     assert handed[0].why in " ".join(backend.report.warnings)
     copy.landmarks.has_position[:] = False

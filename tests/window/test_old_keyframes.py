@@ -92,7 +92,7 @@ def test_the_memory_does_not_grow() -> None:
     assert len(memory.left) <= N and len(memory.tracks) < 400 and len(memory.keyframe_id) < N
 
 
-@pytest.mark.parametrize(("baseline_m", "most"), [(0.2, 1.5), pytest.param(0.0, 2.6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("baseline_m", "most"), [(0.2, 1.5), pytest.param(0.0, 2.2, marks=pytest.mark.slow)])
 def test_tracks_that_last_do_not_unglue_the_window(baseline_m: float, most: float) -> None:
     """Every keyframe that leaves sees tracks that go on alone: what it told of them is not lost."""
     fields: dict[str, object] = {"path": "line", "track_loss": 0.0, "landmarks": 800, "tracks": 60, "keyframes": 50}
@@ -103,7 +103,7 @@ def test_tracks_that_last_do_not_unglue_the_window(baseline_m: float, most: floa
 
 @pytest.mark.slow
 def test_one_camera_drifts_no_more_and_tells_how_much() -> None:
-    """A straight road of 30 m: the error is that of fixed keyframes or less, and the covariance no smaller than it."""
+    """A straight road of 30 m: the error is that of fixed keyframes or less, and the covariance is as large as it."""
     fields: dict[str, object] = {"path": "line", "baseline_m": 0.0, "keyframes": 40, "length_m": 30.0}
     fields |= {"landmarks": 800, "tracks": 60}
     squared: dict[str, list[float]] = {"fix": [], "marginalise": []}
@@ -116,6 +116,5 @@ def test_one_camera_drifts_no_more_and_tells_how_much() -> None:
         off = last.refined.position[-1] - data.truth.position[-1]
         nees.append(float(off @ np.linalg.solve(last.covariance[-1][:3, :3], off)))
     assert np.mean(squared["marginalise"]) < 1.1 * np.mean(squared["fix"]), squared
-    # Of twelve numbers the mean square lies between 0.37 and 1.94 in 95 of 100 cases; here by three. Below, the
-    # covariance is larger than the error: keyframes of few points are left as they came, and count as uncertain.
-    assert 0.3 < np.mean(nees) < 6.0, nees
+    # Of twelve numbers the mean square lies between 0.37 and 1.94 in 95 of 100 cases; here by three.
+    assert 0.8 < np.mean(nees) < 6.0, nees

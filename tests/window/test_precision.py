@@ -9,6 +9,7 @@ import pytest
 
 from ba_node.backend import Backend
 from ba_node.config import Config
+from ba_node.estimate import Estimate
 from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window import precision
 
@@ -43,6 +44,22 @@ def test_steps_as_stated_or_worse_stay_as_they_are() -> None:
     assert backend.scene.step_shares == (1.0, 1.0)
     assert backend.report.adjustments == 0
     assert found < given
+
+
+def test_windows_go_on_while_it_is_asked_what_steps_are_worth() -> None:
+    """One study at a time; what it finds counts once it is taken in, and once."""
+    data = generate(SyntheticOptions(seed=3, keyframes=45, length_m=22.0, landmarks=1000, tracks=60, path="line"))
+    backend, handed = Backend(Config()), list[precision.Study]()
+    backend.elsewhere = lambda work: handed.append(work) if isinstance(work, precision.Study) else None
+    estimates = [one for one in backend.replay(m for _, _, m in data.timeline()) if isinstance(one, Estimate)]
+    assert len(estimates) == 45 and len(handed) == 1
+    known = backend.map._precision
+    assert known.windows == known.seen == 0
+    handed[0].run()
+    assert known.windows == 0
+    for _ in range(2):
+        assert backend.take_work(handed[0]) is None
+        assert (known.windows, known.seen) == (1, 20)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.25, 1.0 / 32.0])

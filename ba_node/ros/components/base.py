@@ -36,7 +36,7 @@ from ba_node.measurements import CameraRig
 from ba_node.messages.report import Report
 from ba_node.messages.topics import Topic
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.worker import Notice, Outcome, Worker
@@ -81,9 +81,6 @@ class Component:
 
     def deactivate(self) -> None:
         """Pause: nothing may be published until :meth:`activate`. ``host.active`` is False already."""
-
-    def reconfigure(self, before: Config) -> None:
-        """Follow a change of parameters: ``host.config`` is new already. The back-end is told by the node."""
 
     def take_report(self, outcome: Outcome) -> None:
         """Take what the worker reports, of every solve and on what was turned away; only while active."""

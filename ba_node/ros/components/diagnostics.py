@@ -13,7 +13,7 @@ from ba_node.messages.diagnostics import Health, diagnose, diagnostics_message
 from ba_node.messages.topics import DIAGNOSTICS, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory
+from ba_node.ros.message_factory import RclpyFactory
 
 _PERIOD_S = 1.0
 # Rates are those of so many seconds.

@@ -5,11 +5,10 @@
 from __future__ import annotations
 
 from ba_node.estimate import Estimate
+from ba_node.messages.cdr import tf_message
 from ba_node.messages.topics import TF, TOPICS
-from ba_node.messages.transforms import tf_message
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, log
 
 _DEPTH = 100
@@ -27,7 +26,6 @@ class MapTransform(Component):
     def __init__(self, host: Host) -> None:
         """Advertise /tf; without tf2_msgs say that there is none."""
         super().__init__(host)
-        self._factory = RclpyFactory()
         self._estimate: Estimate | None = None
         self._taken_ns = 0
         self._last_stamp_ns: int | None = None
@@ -81,7 +79,7 @@ class MapTransform(Component):
                 return
             stamp_ns = self._last_stamp_ns + 1
         self._last_stamp_ns = stamp_ns
-        self._publisher.publish(tf_message(self._factory, estimate.correction, estimate.frame_id, stamp_ns))
+        self._publisher.publish(tf_message(estimate.correction, estimate.frame_id, stamp_ns))
         self._say(f"{estimate.frame_id} -> {estimate.correction.odom_frame}")
 
     def _now_ns(self) -> int:

@@ -23,8 +23,8 @@ from ba_node.config import find
 from ba_node.estimate import Estimate, Iteration, Status
 from ba_node.messages.topics import ACTIONS
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import message_class
 from ba_node.ros.log import Severity, fault, log
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.rclpy_compat.actions import DeferredAction
 from ba_node.ros.rclpy_compat.deferred import CLEANED_UP, Answer
 

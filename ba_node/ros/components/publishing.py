@@ -13,8 +13,8 @@ from ba_node.messages.outputs import output_messages
 from ba_node.messages.report import LatencyReport, Report, report_message
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory
 from ba_node.ros.log import Severity, Throttle, log
+from ba_node.ros.message_factory import RclpyFactory
 from ba_node.ros.worker.latency import Sliding
 from ba_node.ros.worker.worker import Outcome
 

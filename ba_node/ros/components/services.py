@@ -17,7 +17,7 @@ from ba_node.io.map_file import MapFileError, load_map, write_map
 from ba_node.io.map_folder import MapPathError, path_in_folder
 from ba_node.messages.topics import SERVICES
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.rclpy_compat.deferred import Answer, DeferredService
 
 _PAUSED = "paused"

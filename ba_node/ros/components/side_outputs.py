@@ -12,7 +12,7 @@ from ba_node.messages.markers import marker_array, no_markers
 from ba_node.messages.topics import ON_DEMAND, TOPICS
 from ba_node.messages.transforms import covariance_messages, odometry_message
 from ba_node.ros.components.base import Component, Host
-from ba_node.ros.convert import RclpyFactory
+from ba_node.ros.message_factory import RclpyFactory
 
 
 class SideOutputs(Component):

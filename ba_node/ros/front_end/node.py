@@ -45,14 +45,15 @@ from ba_node.front_end.streams import (
 )
 from ba_node.io.rig_file import read_rig
 from ba_node.measurements import Keyframe, Measurement
+from ba_node.messages.cdr import tf_message
 from ba_node.messages.conversion import InputMessages
 from ba_node.messages.factory import ConversionError, header_message, pose_message, stamp_ns_from_message
 from ba_node.messages.rig import rig_from_infos
 from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
-from ba_node.messages.transforms import StaticTree, tf_message
+from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Severity, Throttle, log
+from ba_node.ros.message_factory import RclpyFactory, message_class
 from ba_node.ros.parameters import declare
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.tools.adapter import PUBLISHED
@@ -343,7 +344,7 @@ class FrontEndNode(ManagedNode):
         self._out["odometry"].publish(message)
         if self.options.publish_tf and self.options.odometry == "none":
             placed = Correction(self._rig.frame_id, position, orientation)
-            self._out[TF].publish(tf_message(self._factory, placed, fixed, tracked.stamp_ns))
+            self._out[TF].publish(tf_message(placed, fixed, tracked.stamp_ns))
 
     def _on_refined(self, message: Any) -> None:
         if self._front_end is None or message.session_id != self._front_end.session_id:

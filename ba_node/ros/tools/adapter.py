@@ -26,9 +26,9 @@ from ba_node.messages.adapters import SOURCES, Adapter, AdapterOptions, Input
 from ba_node.messages.conversion import InputMessages
 from ba_node.messages.topics import INPUT_TYPES, TOPICS
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
 from ba_node.ros.log import Severity, log
 from ba_node.ros.main import USAGE_ERROR, run
+from ba_node.ros.message_factory import RclpyFactory, message_class
 from ba_node.ros.rclpy_compat.lifecycle import answering
 
 NODE_NAME = "ba_adapter"

@@ -16,7 +16,7 @@ from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.outputs import POINT_DTYPE
 from ba_node.messages.topics import TOPICS, WHOLE_MAP
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.tools.node import node_apart
 
 _POLL_S = 0.05

@@ -31,7 +31,7 @@ from ba_node.measurements import CameraRig
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import CAMERA_TYPES, CLOCK, INPUT_TYPES, TOPICS
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory, message_class
 from ba_node.ros.rclpy_compat.private import ARGUMENT_ERRORS, RCLError
 from ba_node.ros.tools.node import node_apart
 

@@ -20,12 +20,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from ba_node.io import ros_types
 from ba_node.io.bag_writer import BagWriter
-from ba_node.messages.topics import INPUT_TYPES, TF_STATIC, TOPICS
-from ba_node.ros.convert import message_class
+from ba_node.messages.topics import INPUT_TYPES, ON_DEMAND, OUTPUT_TYPES, TF_STATIC, TOPICS
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.tools.node import node_apart
 
 _POLL_S, _LOOK_S = 0.05, 0.5
 _WANTED = frozenset(INPUT_TYPES.values())
+_OUTPUTS = frozenset((*OUTPUT_TYPES, *ON_DEMAND))
 # Messages that wait while one is written; cameras and static transforms come once from each publisher.
 _DEPTH, _LATCHED_DEPTH = 2000, 100
 
@@ -51,6 +52,7 @@ class Recorder:
         self._path, self._options, self._notice = path, options, notice
         self._subscriptions: dict[str, Any] = {}
         self._refused: set[str] = set()
+        self._named = {name if name.startswith("/") else f"/{name}" for name in options.topics}
         self._stopped = False
 
     def stop(self, *_: object) -> None:
@@ -87,7 +89,7 @@ class Recorder:
             if topic in self._subscriptions or topic in self._refused or not self._is_wanted(topic, kinds):
                 continue
             publishers = node.get_publishers_info_by_topic(topic)
-            if not publishers:
+            if not publishers or (_is_output(topic, publishers) and topic not in self._named):
                 continue
             try:
                 kind = message_class(kinds[0])
@@ -111,8 +113,7 @@ class Recorder:
         return receive
 
     def _is_wanted(self, topic: str, kinds: Collection[str]) -> bool:
-        names = {name if name.startswith("/") else f"/{name}" for name in self._options.topics}
-        if topic in names or topic == TF_STATIC:
+        if topic in self._named or topic == TF_STATIC:
             return True
         space = f"/{self._options.namespace.strip('/')}/".replace("//", "/")
         return bool(_WANTED & set(kinds)) and topic.startswith(space)
@@ -121,6 +122,13 @@ class Recorder:
         inputs = ", ".join(f"{TOPICS[name].type_name}" for name in INPUT_TYPES)
         there = ", ".join(sorted(topic for topic, _ in node.get_topic_names_and_types())) or "none"
         return f": expected topics of {inputs}; topics in this ROS domain: {there}"
+
+
+def _is_output(topic: str, publishers: Collection[Any]) -> bool:
+    """Return True if a back-end publishes it: of a type that is taken too, but what it works out is no input."""
+    nodes = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in publishers}
+    node, _, name = topic.rpartition("/")
+    return name in _OUTPUTS and nodes == {node}
 
 
 def _profile(publishers: Collection[Any], latched: bool) -> Any:

@@ -18,7 +18,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ba_node.backend import Adjustment, Backend, Check
+from ba_node.backend import Backend, Check, Work
 from ba_node.estimate import Estimate, Iteration, SolveReport, Status
 from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
@@ -123,9 +123,14 @@ class Worker:
         work = functools.partial(check.run, functools.partial(self._resting.wait, _GIVES_WAY_S))
         self._elsewhere("setup_check", work, lambda backend: backend.take_check(check))
 
-    def adjust_elsewhere(self, adjustment: Adjustment) -> None:
-        """Bend and refine a copy of the map likewise."""
-        self._elsewhere("adjustment", adjustment.run, lambda backend: backend.take_adjustment(adjustment))
+    def work_elsewhere(self, work: Work) -> None:
+        """Do what takes long likewise, once the solve that it came up in is over."""
+
+        def run() -> None:
+            self._resting.wait(_GIVES_WAY_S)
+            work.run()
+
+        self._elsewhere("work", run, lambda backend: backend.take_work(work))
 
     def _elsewhere(self, name: str, work: Callable[[], object], then: Command) -> None:
         """Do something on a thread of its own, and then something on the solver's."""

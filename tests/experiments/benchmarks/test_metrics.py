@@ -83,6 +83,7 @@ def test_medians_over_runs_count_a_failed_run_as_never() -> None:
 
 def test_the_end_is_a_ranking_of_its_own(tmp_path: Path) -> None:
     """Who stops early is told apart from who ends low; times to 1e-6 and memory are on the page too."""
+    pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     times = {f"gap {gap:.0e}": 1.0 for gap in metrics.GAPS}
     problems = [
         {

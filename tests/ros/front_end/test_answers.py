@@ -16,7 +16,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 
 from ba_node.messages.factory import header_message
 from ba_node.ros import qos
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory, message_class
 
 pytestmark = pytest.mark.dds
 StartNode = Callable[..., Any]
@@ -95,6 +95,7 @@ class Asker:
 
 
 def test_the_front_end_answers_while_it_tracks(start_node: StartNode, make_peer: MakePeer) -> None:
+    pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
     node, peer = start_node("--ros-args", "-p", "mode:=mono", program="ba_node.ros.front_end.main:main"), make_peer()
     asker = Asker(peer, "ba_front_end")
     images = peer.node.create_publisher(message_class("sensor_msgs/msg/Image"), "image_raw", qos.reliable(100))

@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message
 
 from ba_node.io.rig_file import rig_yaml
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from tests.messages.adapters import layouts
 from tests.messages.adapters.layouts import Sent
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from ba_node.ros.convert import RclpyFactory
+from ba_node.ros.message_factory import RclpyFactory
 
 pytestmark = pytest.mark.dds
 

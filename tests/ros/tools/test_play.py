@@ -29,7 +29,7 @@ from ba_node.offline.convert import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
 from ba_node.ros import qos
-from ba_node.ros.convert import message_class
+from ba_node.ros.message_factory import message_class
 from ba_node.ros.tools.play import Listener, PlayError, PlayOptions, PlaySummary, play
 from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 

@@ -62,3 +62,36 @@ def test_nothing_to_record_is_said(tmp_path: Path, domain: int) -> None:  # noqa
     assert process.returncode == 2
     assert "mine.mcap: File exists" in error
     assert (tmp_path / "mine.mcap").read_bytes() == b"mine"
+
+
+def test_what_a_back_end_publishes_is_left_out(tmp_path: Path, domain: int) -> None:  # noqa: ARG001
+    given, kind = "/robot/ba_node/pose_with_covariance", "geometry_msgs/msg/PoseWithCovarianceStamped"
+    program = f"""
+import time, rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+rclpy.init()
+back_end = rclpy.create_node("ba_node", namespace="/robot")
+localizer = rclpy.create_node("localizer", namespace="/robot")
+nodes = [(back_end, "{given}"), (localizer, "/robot/pose_prior"), (localizer, "/robot/localizer/pose_prior")]
+publishers = [node.create_publisher(PoseWithCovarianceStamped, topic, 10) for node, topic in nodes]
+print("ready", flush=True)
+while True:
+    for publisher in publishers:
+        publisher.publish(PoseWithCovarianceStamped())
+    time.sleep(0.05)
+"""
+    beside = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert beside.stdout is not None
+    try:
+        assert beside.stdout.readline() == "ready\n"
+        for out, options in (("inputs.mcap", ()), ("named.mcap", ("--topics", given))):
+            process = recorder(tmp_path / out, "--duration", "6", *options)
+            _, error = process.communicate(timeout=60)
+            assert process.returncode == 0, error
+            with BagReader(tmp_path / out) as reader:
+                taken = {topic for topic in reader.topics if reader.topics[topic] == kind}
+            others = {"/robot/pose_prior", "/robot/localizer/pose_prior"}
+            assert taken == (others | {given} if options else others)
+    finally:
+        beside.kill()
+        beside.communicate()

@@ -122,4 +122,34 @@ class Consensus {
   bool best_far_ = false;
 };
 
+// Whether each ray sees its point within the gate, sigmas, in front of it: (n_rays,).
+inline std::vector<char> sees(const RaysView& rays, double gate, const double* points) {
+  std::vector<char> near(rays.n_rays);
+  for (std::int64_t o = 0; o < rays.n_rays; ++o) {
+    const double *d = rays.direction + 3 * o, *c = rays.centre + 3 * o, *x = points + 3 * rays.point[o];
+    const double away[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]};
+    const double cross[3] = {d[1] * away[2] - d[2] * away[1], d[2] * away[0] - d[0] * away[2],
+                             d[0] * away[1] - d[1] * away[0]};
+    const double across = length3(cross) / std::max(length3(away), 1e-300);
+    const double dot = d[0] * away[0] + d[1] * away[1] + d[2] * away[2];
+    near[o] = dot > 0.0 && rays.px_per_rad[o] * across <= gate;
+  }
+  return near;
+}
+
+// The points as those of their rays see them that agree, and which these are; as Triangulator::run, and (n_rays,).
+inline void consensus(const RaysView& rays, std::int64_t n_points, double gate, double* points, double* parallax,
+                      bool* measured, bool* agrees) {
+  Consensus(rays, n_points, gate).run(agrees);
+  Triangulator(rays, n_points, agrees).run(points, parallax, measured);
+  const std::vector<char> near = sees(rays, gate, points);
+  if (std::equal(near.begin(), near.end(), agrees)) return;
+  // A point that lost views by it keeps those it had.
+  std::vector<std::int64_t> gained(n_points);
+  for (std::int64_t o = 0; o < rays.n_rays; ++o) gained[rays.point[o]] += near[o] - static_cast<int>(agrees[o]);
+  for (std::int64_t o = 0; o < rays.n_rays; ++o)
+    if (gained[rays.point[o]] >= 0) agrees[o] = near[o];
+  Triangulator(rays, n_points, agrees).run(points, parallax, measured);
+}
+
 }  // namespace ba::BA_TARGET

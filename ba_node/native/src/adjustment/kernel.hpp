@@ -97,11 +97,11 @@ class KernelOf final : public Kernel {
       for (int i = 0; i < D; ++i) out[k * D + i] = at(equations_.gradient_c[k], i);
   }
 
-  // diag(B) (n_free x D) and diag(C) (n_points x 3).
+  // diag(B) (n_free x D) and diag(C) (n_points x 3), null if it is not wanted.
   void diagonals(double* d_c, double* d_p) const override {
     for (std::int64_t k = 0; k < l_.n_free; ++k)
       for (int i = 0; i < D; ++i) d_c[k * D + i] = entry(equations_.b[k], i, i);
-    for (std::int64_t i = 0; i < l_.n_batches; ++i) {
+    for (std::int64_t i = 0; d_p != nullptr && i < l_.n_batches; ++i) {
       const V8* c = &equations_.c[6 * i];
       const V8 d[3] = {c[0], c[2], c[5]};
       rows_.store_points(i, d, d_p);

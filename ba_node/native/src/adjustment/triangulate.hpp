@@ -48,11 +48,15 @@ inline double length3(const double* v) { return std::sqrt(v[0] * v[0] + v[1] * v
 
 class Triangulator {
  public:
-  Triangulator(const RaysView& rays, std::int64_t n_points) : rays_(rays), begin_(n_points + 1), row_(rays.n_rays) {
-    for (std::int64_t o = 0; o < rays.n_rays; ++o) ++begin_[rays.point[o] + 1];
+  // which: the rays that count, (n_rays,); null for all.
+  Triangulator(const RaysView& rays, std::int64_t n_points, const bool* which = nullptr)
+      : rays_(rays), begin_(n_points + 1), row_(rays.n_rays) {
+    const auto counts = [which](std::int64_t o) { return which == nullptr || which[o]; };
+    for (std::int64_t o = 0; o < rays.n_rays; ++o) begin_[rays.point[o] + 1] += counts(o);
     for (std::int64_t p = 0; p < n_points; ++p) begin_[p + 1] += begin_[p];
     std::vector<std::int64_t> next(begin_.begin(), begin_.end() - 1);
-    for (std::int64_t o = 0; o < rays.n_rays; ++o) row_[next[rays.point[o]]++] = o;
+    for (std::int64_t o = 0; o < rays.n_rays; ++o)
+      if (counts(o)) row_[next[rays.point[o]]++] = o;
   }
 
   // points, m: (n_points, 3), NaN for neither two rays nor a measured distance; parallax, rad, and whether a distance

@@ -89,6 +89,16 @@ Array<bool> agreeing(const py::object& rays, py::ssize_t n_points, double gate) 
   return agrees;
 }
 
+py::tuple consensus(const py::object& rays, py::ssize_t n_points, double gate) {
+  const RaysArrays arrays(rays);
+  Doubles points = empty({n_points, 3}), parallax = empty({n_points});
+  Array<bool> measured({n_points}), agrees({arrays.point.size()});
+  double *x = points.mutable_data(), *angle = parallax.mutable_data();
+  bool *has_distance = measured.mutable_data(), *out = agrees.mutable_data();
+  without_gil([&] { target->consensus(arrays.view(), n_points, gate, x, angle, has_distance, out); });
+  return py::make_tuple(points, parallax, measured, agrees);
+}
+
 // cost: loss, its scale and cheirality.
 Kernel* make_kernel(const py::object& problem, const std::tuple<std::string, double, std::string>& cost,
                     const std::tuple<Ints, Ints>& factor_pairs, int threads) {
@@ -190,9 +200,9 @@ void bind_assembly(py::class_<Kernel>& kernel) {
              return out;
            })
       .def("diagonals",
-           [](const Kernel& k) {
-             Doubles d_c = empty({k.n_free(), k.size()}), d_p = empty({k.n_points(), 3});
-             k.diagonals(d_c.mutable_data(), d_p.mutable_data());
+           [](const Kernel& k, bool of_points) {
+             Doubles d_c = empty({k.n_free(), k.size()}), d_p = empty({of_points ? k.n_points() : 0, 3});
+             k.diagonals(d_c.mutable_data(), of_points ? d_p.mutable_data() : nullptr);
              return py::make_tuple(d_c, d_p);
            })
       .def("step", &step);
@@ -316,4 +326,5 @@ PYBIND11_MODULE(_kernels, m) {
   m.def("residual_norms", &ba::residual_norms);
   m.def("triangulate", &ba::triangulate);
   m.def("agreeing", &ba::agreeing);
+  m.def("consensus", &ba::consensus);
 }

@@ -28,6 +28,6 @@ void agreeing(const RaysView& rays, std::int64_t n_points, double gate, bool* ag
 }  // namespace
 
 const Target kTarget{BA_NAME(BA_TARGET),  make_kernel6,   make_kernel9, make_factor6, make_factor9,
-                     make_relative_poses, residual_norms, triangulate,  agreeing};
+                     make_relative_poses, residual_norms, triangulate,  agreeing,     consensus};
 
 }  // namespace ba::BA_TARGET

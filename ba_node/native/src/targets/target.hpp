@@ -110,6 +110,8 @@ struct Target {
   void (*residual_norms)(const ProblemView&, const StateView&, double* out);
   void (*triangulate)(const RaysView&, std::int64_t n_points, double* points, double* parallax, bool* measured);
   void (*agreeing)(const RaysView&, std::int64_t n_points, double gate, bool* agrees);
+  void (*consensus)(const RaysView&, std::int64_t n_points, double gate, double* points, double* parallax,
+                    bool* measured, bool* agrees);
 };
 
 #define BA_DECLARE_TARGET(name)                      \

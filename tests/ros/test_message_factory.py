@@ -15,7 +15,7 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGue
 from ba_node.messages.conversion import input_message, measurement_from_message
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import INPUT_TYPES
-from ba_node.ros.convert import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory, message_class
 
 FACTORY = RclpyFactory()
 
