@@ -96,7 +96,6 @@ class SolveReport:
     outliers: int = 0
     factors: int = 0
     outvoted_factors: int = 0
-    variance_factor: float = 0.0
     inlier_share: float = 0.0
     parallax_deg: float = 0.0
     held_out_px_before: float = 0.0

@@ -236,7 +236,6 @@ def report() -> SolveReport:
         outliers=17,
         factors=5021,
         outvoted_factors=5022,
-        variance_factor=1.75,
         rejected={"unknown_camera": 2, "malformed": 5},
         solve_time_s=0.025,
         correction_m=0.25,
