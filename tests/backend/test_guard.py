@@ -374,7 +374,8 @@ def test_one_camera_waits_for_parallax(at: FloatArray, turned_deg: FloatArray) -
     """A sound drive that begins with none is refined once there is some, and there is nothing to look at."""
     small = {"landmarks": 600, "tracks": 60, "path": "line", "length_m": 12.0, "outlier_share": 0.0, "guesses": True}
     drift = {"baseline_m": 0.0, "drift_rotation_deg": 0.3, "drift_translation": 0.02}
-    data = generate(SyntheticOptions(keyframes=len(at) + 14, **small, **drift), begun(at, turned_deg))  # type: ignore[arg-type]
+    options = SyntheticOptions(keyframes=len(at) + 14, **small, **drift)  # type: ignore[arg-type]
+    data = generate(options, begun(at, turned_deg))
     backend = Backend(Config())
     found = replay(backend, [one for _, _, one in data.timeline()])
     waited = [one.report.status is Status.SKIPPED for one in found]
