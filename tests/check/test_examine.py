@@ -148,6 +148,14 @@ def test_silent_on_every_seed(seed: int, mode: str) -> None:
             assert not found.findings, f"{path}, {keyframes} keyframes: {found.summary()}"
 
 
+@pytest.mark.parametrize("keyframes", [25, 40, 60])
+def test_a_wall_beside_the_way_is_no_contradiction(keyframes: int) -> None:
+    """Two relations explain the images of a plane; the steps of one of them are 50 degrees off."""
+    drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.01, "outlier_share": 0.01}
+    data = recording(2, mode="mono", path="line", length_m=52.0, look_deg=-60.0, **drift)  # type: ignore[arg-type]
+    assert not examine(seen(data, keyframes)).findings
+
+
 def test_same_tracks_give_the_same_numbers() -> None:
     tracks = seen(recording(wrong="turned 1 about y"))
     first, second = (json.dumps(examine(tracks).as_dict()) for _ in range(2))
