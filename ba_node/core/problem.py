@@ -132,6 +132,11 @@ class Problem:
         return len(self.start.points)
 
     @property
+    def has_scale(self) -> bool:
+        """Return True if images tell lengths: by several cameras, or by depths."""
+        return len(self.cameras.model) > 1 or len(self.observations.depth_m) > 0
+
+    @property
     def free_intrinsics(self) -> bool:
         """Return True if each keyframe has its own f, k1, k2 (9 parameters a keyframe instead of 6)."""
         return len(self.start.intrinsics) > 0

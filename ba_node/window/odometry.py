@@ -111,16 +111,11 @@ def factors(
         rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
-    few = not _sees_scale(problem) and len(keyframes) <= _WINDOW and 2 * np.count_nonzero(many) < len(many)
+    few = not problem.has_scale and len(keyframes) <= _WINDOW and 2 * np.count_nonzero(many) < len(many)
     width = _WIDE if few or inflated is not None else 1.0
     if inflated is None and (much_moves or many.all()):
         width = _WIDEST
     return steps.factors(free, width * config.loss_scale)
-
-
-def _sees_scale(problem: Problem) -> bool:
-    """Return True if images tell lengths: by several cameras, or by depths."""
-    return len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
 
 
 def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first: IntArray) -> Steps:

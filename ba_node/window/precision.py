@@ -71,9 +71,8 @@ class Precision:
         """Return what is to be asked of a window that was taken, with its solution; None if nothing is."""
         n, whole = len(scene.keyframes), selection.problem
         told_little = self.windows >= _ENOUGH and scene.step_shares == (1.0, 1.0)
-        has_scale = len(whole.cameras.model) > 1 or len(whole.observations.depth_m) > 0
         due = n - self.seen >= config.window.max_keyframes and config.window.old_keyframes == "fix"
-        if told_little or not (due and has_scale and config.odometry.enabled) or selection.much_moves:
+        if told_little or not (due and whole.has_scale and config.odometry.enabled) or selection.much_moves:
             return None
         steps = odometry.stated(scene, config.odometry, selection.keyframes)
         many = np.bincount(whole.observations.keyframe, minlength=whole.n_keyframes) >= odometry.MANY_OBSERVATIONS

@@ -356,9 +356,8 @@ def _least_points(problem: Problem, config: Config, told: BoolArray) -> IntArray
 
     Not more where a prior has ``told`` of a keyframe (n_kf,): window by window, what it still sees would be lost.
     """
-    has_scale = len(problem.cameras.model) > 1 or len(problem.observations.depth_m) > 0
     least = config.guard.min_points if config.guard.enabled else 2
-    more = _WITHOUT_SCALE if config.guard.enabled and not has_scale else 1
+    more = _WITHOUT_SCALE if config.guard.enabled and not problem.has_scale else 1
     return np.where(told, least, more * least)
 
 
