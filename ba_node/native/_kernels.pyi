@@ -159,3 +159,19 @@ def agreeing(rays: Rays, n_points: int, gate: float) -> NDArray[np.bool_]: ...
 def consensus(
     rays: Rays, n_points: int, gate: float
 ) -> tuple[Doubles, Doubles, NDArray[np.bool_], NDArray[np.bool_]]: ...
+def views_of(last: Ints, previous: Ints, landmarks: Ints, newest: int) -> Ints:
+    """Return the rows of all views of landmarks (-1), or of the newest of each, by landmark, in order of arrival."""
+
+def distinct_landmarks(table: object, begin: Ints, end: Ints, scratch: Ints) -> Ints:
+    """Return the different landmarks in the rows from each begin to its end of an ObservationTable, in no order.
+
+    Here and below scratch holds -1 for each row of keyframes or landmarks, and does again afterwards.
+    """
+
+def inliers_by_keyframe(table: object, rows: Ints, scratch: Ints) -> tuple[Ints, Ints]:
+    """Return the keyframes of those of some rows that are no outliers, in no order, and how many each has."""
+
+def gather(
+    table: object, rows: Ints, listed: tuple[Ints, Ints], scratch: tuple[Ints, Ints]
+) -> tuple[Ints, Ints, Ints, Ints, Doubles, Doubles, Doubles]:
+    """Return views of listed landmarks by listed keyframes; see scene.views.Views.gather."""

@@ -362,10 +362,9 @@ def _resected(
     """
     table, points = scene.keyframes, scene.landmarks
     views = scene.views_of(rows[:, 0])
-    views = views[scene.observations.keyframe[views] == new]
     origin = table.position[old]
     order = np.argsort(rows[:, 0])
-    problem = problem_of(
+    problem, _ = problem_of(
         scene, views, np.array([new]), rows[order, 0], origin, points.position[rows[order, 1]] - origin, config
     )
     best, least = problem.start, np.inf
