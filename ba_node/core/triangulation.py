@@ -73,7 +73,8 @@ def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
     """
     obs, cams = problem.observations, problem.cameras
     if kernels != "numpy" and native.kernels is not None:
-        turned, all_good = native.kernels.rays(problem, bent_rays(problem, slice(None)))
+        found = native.kernels.rays(problem, np.empty(0)) or native.kernels.rays(problem, rays_in_cameras(problem))
+        turned, all_good = found
         rays = Rays(obs.point, *turned)
         return rays if all_good else rays.part(np.isfinite(rays.direction[:, 2]))
     # Camera centre: x with R x + t = -Rc' tc.
@@ -96,14 +97,12 @@ def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
     return rays if good.all() else rays.part(good)
 
 
-def bent_rays(problem: Problem, rows: IntArray | slice) -> FloatArray:
-    """Return the rays of some observations as unit vectors in their cameras, (n, 3), as the C++ kernels want them.
+def rays_in_cameras(problem: Problem, rows: IntArray | slice = slice(None)) -> FloatArray:
+    """Return the rays of some observations, all by default, as unit vectors in their cameras, (n, 3).
 
-    None, (0,), where no camera has distortion: they have those of straight ones themselves.
+    The C++ kernels have those of cameras without distortion themselves.
     """
     obs, cams = problem.observations, problem.cameras
-    if (cams.model != cameras.Model.EQUIDISTANT).all() and not cams.params[:, cameras.DISTORTION].any():
-        return np.empty(0)
     camera = obs.camera[rows]
     return cameras.rays(obs.uv[rows], cams.model.take(camera), cams.params.take(camera, axis=0))
 

@@ -195,7 +195,7 @@ def classify(
     obs, n_points, outlier_px = selection.observations, selection.problem.n_points, tracks.outlier_px
     whole = dataclasses.replace(selection.problem, observations=obs, start=state)
     # What was left out of the solve tells nothing about how good it is.
-    gate = widened(outlier_px, norm[selection.inlier]) if outlier_px > 0 else np.inf
+    gate = widened(outlier_px, norm.take(selection.used)) if outlier_px > 0 else np.inf
     outlier = norm > gate
     if outlier_px > 0:
         _place_anew(scene, selection, whole, (norm, outlier), tracks, kernels)

@@ -70,6 +70,11 @@ class Selection:
     beside: tuple[KeyframeFactors, ...] = ()  # factors of the problem that are no steps of the front-end
 
     @cached_property
+    def used(self) -> IntArray:
+        """Return which of all observations are in the problem, in its order."""
+        return np.flatnonzero(self.inlier)
+
+    @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
         return dataclasses.replace(self.problem, observations=self.observations)

@@ -90,9 +90,13 @@ def explained(
     rows, track = ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin)
     if kernels == "numpy" or native.kernels is None:
         return _Trial(problem, rows, track, (len(tried), n_out)).explained(before, after)
-    views = rows, track, triangulation.bent_rays(problem, rows)
     limits = MIN_PARALLAX, _BOUND, _BEHIND, _MIN_VIEWS, _MIN_RESIDUALS
-    return Explained(*native.kernels.explained(problem, views, (len(tried), n_out), (*before, *after), limits))
+    others = (len(tried), n_out), (*before, *after), limits
+    found = native.kernels.explained(problem, (rows, track, np.empty(0)), *others)
+    found = found or native.kernels.explained(
+        problem, (rows, track, triangulation.rays_in_cameras(problem, rows)), *others
+    )
+    return Explained(*found)
 
 
 class _Trial:

@@ -20,6 +20,7 @@ from ba_node.core.problem import Problem
 from ba_node.scene.scene import Scene
 from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window import moving, trial
+from ba_node.window.initial_points import agreed_points
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
 pytestmark = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
@@ -140,3 +141,13 @@ def test_tracks_are_explained_as_numpy_does(cameras: int, distorted: bool) -> No
         np.testing.assert_allclose(
             getattr(compiled, field.name), getattr(plain, field.name), rtol=1e-7, err_msg=field.name
         )
+
+
+@pytest.mark.parametrize("depth_share", [0.0, 0.3])
+def test_places_that_views_agree_on_are_those_of_numpy(depth_share: float) -> None:
+    problem, tracks = window(depth_share), Config().tracks
+    compiled, plain = (agreed_points(problem, tracks, 30.0, kernels) for kernels in ("native", "numpy"))
+    assert 20 < np.count_nonzero(plain.good) < problem.n_points - 5
+    np.testing.assert_array_equal(compiled.good, plain.good)
+    np.testing.assert_array_equal(compiled.measured[plain.good], plain.measured[plain.good])
+    np.testing.assert_allclose(compiled.points[plain.good], plain.points[plain.good], rtol=1e-6)

@@ -79,6 +79,15 @@ inline bool rays_of(const ProblemView& p, const StateView& s, const double* seen
   return good;
 }
 
+// Whether no camera has distortion, so that straight_ray has its rays.
+inline bool all_straight(const ProblemView& p) {
+  for (std::int64_t c = 0; c < p.n_cameras; ++c) {
+    const double* f = p.params + kParams * c;
+    if (p.model[c] != 0 || std::any_of(f + 4, f + kParams, [](double k) { return k != 0.0; })) return false;
+  }
+  return true;
+}
+
 // Observations of tracks: n of them, by track.
 struct RowsOfTracks {
   std::int64_t n, n_tracks;
@@ -192,6 +201,44 @@ inline void leave_more_than_noise(const ResidualsView& seen, std::int64_t n_poin
     const auto count = static_cast<double>(sums[p].count), large = static_cast<double>(sums[p].large);
     found[p] =
         large >= at.least_large && sums[p].total > at.large * at.large * count && large >= at.large_share * count;
+  }
+}
+
+// As in window/initial_points.py; rad, and standard deviations.
+struct AgreementLimits {
+  double gate, min_parallax, least_parallax, two_views, least_support;
+};
+
+// Of which points the rays that agree tell the place: (n_points,). parallax, measured and agrees are of consensus.
+inline void tells_place(const RaysView& rays, std::int64_t n_points, const double* points, const double* parallax,
+                        const bool* measured, const bool* agrees, const AgreementLimits& at, bool* good) {
+  struct Views {
+    std::int64_t all = 0, agreeing = 0;
+    double sharpness = 0.0, worst = 0.0;
+  };
+  std::vector<Views> views(n_points);
+  for (std::int64_t o = 0; o < rays.n_rays; ++o) {
+    Views& of = views[rays.point[o]];
+    ++of.all;
+    if (!agrees[o]) continue;
+    ++of.agreeing;
+    of.sharpness = std::max(of.sharpness, rays.px_per_rad[o]);
+    const double *d = rays.direction + 3 * o, *c = rays.centre + 3 * o, *x = points + 3 * rays.point[o];
+    const double away[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]};
+    const double cross[3] = {d[1] * away[2] - d[2] * away[1], d[2] * away[0] - d[0] * away[2],
+                             d[0] * away[1] - d[1] * away[0]};
+    const double length = std::sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2]);
+    const double across = std::sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]);
+    const bool before = d[0] * away[0] + d[1] * away[1] + d[2] * away[2] > 0.0;
+    const double error = rays.px_per_rad[o] * (across / std::max(length, 1e-300));
+    of.worst = std::max(of.worst, before ? error : std::numeric_limits<double>::infinity());
+  }
+  for (std::int64_t p = 0; p < n_points; ++p) {
+    const Views& of = views[p];
+    const bool wide = parallax[p] >= at.min_parallax && parallax[p] * of.sharpness >= at.least_parallax;
+    const bool fits = of.worst <= at.gate * (of.agreeing > 2 ? 1.0 : at.two_views);
+    const bool many = static_cast<double>(of.agreeing) > at.least_support * static_cast<double>(of.all);
+    good[p] = ((wide && of.agreeing >= 2) || measured[p]) && fits && many;
   }
 }
 
