@@ -221,3 +221,9 @@ def explained(
     views: rows, the track of each, and seen, as of rays. tracks: how many, and how many took no part. poses: two sets.
     limits: constants of window.trial.
     """
+
+def is_sound(problem: Problem) -> bool:
+    """Return whether indices are in range, observations sorted, numbers finite, sigmas positive."""
+
+def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, float]:
+    """Return what core.covariance.weakest does, of blocks (n, 6, 6) of S and positions (n, 3)."""

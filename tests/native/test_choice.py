@@ -14,7 +14,7 @@ import pytest
 from ba_node import native
 from ba_node.arrays import take_rows
 from ba_node.config import Config
-from ba_node.core import triangulation
+from ba_node.core import geometry, triangulation
 from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
 from ba_node.scene.scene import Scene
@@ -151,3 +151,35 @@ def test_places_that_views_agree_on_are_those_of_numpy(depth_share: float) -> No
     np.testing.assert_array_equal(compiled.good, plain.good)
     np.testing.assert_array_equal(compiled.measured[plain.good], plain.measured[plain.good])
     np.testing.assert_allclose(compiled.points[plain.good], plain.points[plain.good], rtol=1e-6)
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_the_loosest_pose_is_that_of_numpy(singular: bool) -> None:
+    rng = np.random.default_rng(9)
+    root = rng.normal(size=(5, 6, 6)) * [1e3, 1e3, 1e3, 1.0, 1.0, 1.0]
+    blocks, position = np.swapaxes(root, 1, 2) @ root, rng.normal(size=(5, 3)) * 10.0
+    inverse = np.linalg.inv(blocks)
+    moves = np.concatenate([geometry.hat(position), np.broadcast_to(-np.eye(3), (5, 3, 3))], axis=2)
+    of_position = np.linalg.eigvalsh(moves @ inverse @ np.swapaxes(moves, 1, 2))[:, -1]
+    of_rotation = np.linalg.eigvalsh(inverse[:, :3, :3])[:, -1]
+    expected = (0.0, 0.0) if singular else np.sqrt([of_position.max(), of_rotation.max()])
+    if singular:
+        root[3, :, 2] = root[3, :, 4]
+        blocks = np.swapaxes(root, 1, 2) @ root
+    np.testing.assert_allclose(native.kernels.loosest(blocks, position, 1e11), expected, rtol=1e-6)
+
+
+def test_what_cannot_be_worked_with_is_not_sound() -> None:
+    problem = window()
+    problem.start.points[:] = 1e300
+    assert native.kernels.is_sound(problem)
+    for place in ("observations", "start", "cameras"):
+        record = getattr(problem, place)
+        for field in ("keyframe", "camera", "point", "uv", "sigma_px", "rotation", "translation", "points", "params"):
+            values = getattr(record, field, None)
+            if values is None or (place, field) in (("cameras", "rotation"), ("cameras", "translation")):
+                continue
+            wrong = values.copy()
+            wrong[len(wrong) // 2] = -1 if values.dtype.kind == "i" else np.nan
+            changed = dataclasses.replace(problem, **{place: dataclasses.replace(record, **{field: wrong})})
+            assert not native.kernels.is_sound(changed), f"{place}.{field}"

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "adjustment/choice.hpp"
+#include "adjustment/sound.hpp"
 #include "adjustment/trial.hpp"
 #include "adjustment/views.hpp"
 #include "bindings/arrays.hpp"
@@ -220,6 +221,17 @@ py::object explained(const py::object& problem, const std::tuple<Ints, Ints, Dou
   return py::make_tuple(held_out, mean, found.parallax, points);
 }
 
+bool is_sound_problem(const py::object& problem) {
+  const ProblemArrays arrays(problem);
+  return is_sound(arrays.view(), arrays.start.view());
+}
+
+// most: variances of blocks that are scaled to a unit diagonal.
+py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double most) {
+  const auto [sigma_m, sigma_rad] = loosest(blocks.data(), positions.data(), blocks.shape(0), most);
+  return py::make_tuple(sigma_m, sigma_rad);
+}
+
 }  // namespace
 
 void bind_window(py::module_& m) {
@@ -228,6 +240,8 @@ void bind_window(py::module_& m) {
   m.def("inliers_by_keyframe", &inliers_by_keyframe);
   m.def("explained", &explained);
   m.def("agreed", &agreed);
+  m.def("is_sound", &is_sound_problem);
+  m.def("loosest", &loosest_of);
   m.def("gather", &gather);
   m.def("take", &take);
   m.def("rays", &rays);
