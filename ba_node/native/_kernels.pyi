@@ -175,3 +175,31 @@ def gather(
     table: object, rows: Ints, listed: tuple[Ints, Ints], scratch: tuple[Ints, Ints]
 ) -> tuple[Ints, Ints, Ints, Ints, Doubles, Doubles, Doubles]:
     """Return views of listed landmarks by listed keyframes; see scene.views.Views.gather."""
+
+def take(
+    observations: object, rows: Ints, of_point: Ints, of_keyframe: Ints
+) -> tuple[Ints, Ints, Ints, Doubles, Doubles, Doubles, Doubles]:
+    """Return the columns of core.problem.Observations at some rows, renumbered by what is not empty."""
+
+def rays(problem: Problem, seen: Doubles) -> tuple[tuple[Doubles, Doubles, Doubles, Doubles, Doubles], bool]:
+    """Return the columns of core.triangulation.Rays but the first, and whether all observations have a ray.
+
+    seen: (n_obs, 3) unit vectors in the cameras, or (0,) for cameras without distortion.
+    """
+
+def determined(
+    observations: object,
+    usable: NDArray[np.bool_],
+    least: tuple[NDArray[np.bool_], Ints, int],
+    points: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return rows, keyframes and points that are left; see window.problems.determined.
+
+    least: whether a keyframe may take part, points that it has to see, observations likewise. points: that may take
+    part, and that count.
+    """
+
+def move_more_than_noise(
+    observations: object, norms: Doubles, off: Doubles, n_points: int, limits: tuple[float, float, float, int, float]
+) -> NDArray[np.bool_]:
+    """Return which points move, see window.moving; limits are the first five constants there."""

@@ -11,6 +11,7 @@ import dataclasses
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry
@@ -67,6 +68,10 @@ def _taken(
     obs: Observations, rows: IntArray, of_point: IntArray | None = None, of_keyframe: IntArray | None = None
 ) -> Observations:
     """Return some observations; (n_pt,) and (n_kf,) are the new numbers of points and keyframes, None for the old."""
+    if native.kernels is not None:
+        every = np.empty(0, np.intp)
+        numbers = (every if of is None else of for of in (of_point, of_keyframe))
+        return Observations(*native.kernels.take(obs, rows, *numbers))
     has_depth = len(obs.depth_m) > 0
     keyframe, point = obs.keyframe.take(rows), obs.point.take(rows)
     return Observations(
@@ -103,17 +108,19 @@ def determined(
     keep_pt = placed.copy()
     if np.count_nonzero(keep_pt) > max_landmarks:
         keep_pt = _most_seen(keep_pt, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
-    # Views of a point by several cameras of a keyframe are neighbours, and count once.
-    first = np.ones(len(obs), bool)
-    first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
-    static = ~moves.take(obs.point)
     mostly = np.full(n_kf, True)
     # Several cameras, or depths, place points where nothing moves: if they place few, that is for the guard to say.
     if len(problem.cameras.model) == 1 and not np.isfinite(obs.depth_m).any():
+        first = _first_of_pair(obs)
         views = np.bincount(obs.point[first], minlength=n_pt)
         shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
         known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
         mostly = known >= _LEAST_PLACED * shared
+    if native.kernels is not None:
+        least = mostly, min_points, MIN_OBSERVATIONS
+        found: tuple[IntArray, BoolArray, BoolArray] = native.kernels.determined(obs, usable, least, (keep_pt, ~moves))
+        return found
+    first, static = _first_of_pair(obs), ~moves.take(obs.point)
     while True:
         used = usable & keep_pt.take(obs.point)
         counted = used & static
@@ -127,6 +134,13 @@ def determined(
         if np.array_equal(keep_pt, before):
             break
     return np.flatnonzero(keep_pt.take(obs.point) & keep_kf.take(obs.keyframe)), keep_kf, keep_pt
+
+
+def _first_of_pair(obs: Observations) -> BoolArray:
+    """Return which observations count: views of a point by several cameras of a keyframe are neighbours, as one."""
+    first = np.ones(len(obs), bool)
+    first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
+    return first
 
 
 def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:
