@@ -73,10 +73,7 @@ def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
     """
     obs, cams = problem.observations, problem.cameras
     if kernels != "numpy" and native.kernels is not None:
-        seen = np.empty(0)
-        if (cams.model == cameras.Model.EQUIDISTANT).any() or cams.params[:, cameras.DISTORTION].any():
-            seen = cameras.rays(obs.uv, cams.model.take(obs.camera), cams.params.take(obs.camera, axis=0))
-        turned, all_good = native.kernels.rays(problem, seen)
+        turned, all_good = native.kernels.rays(problem, bent_rays(problem, slice(None)))
         rays = Rays(obs.point, *turned)
         return rays if all_good else rays.part(np.isfinite(rays.direction[:, 2]))
     # Camera centre: x with R x + t = -Rc' tc.
@@ -97,6 +94,18 @@ def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
     rays = Rays(obs.point, *columns)
     good = np.isfinite(rays.direction[:, 2])
     return rays if good.all() else rays.part(good)
+
+
+def bent_rays(problem: Problem, rows: IntArray | slice) -> FloatArray:
+    """Return the rays of some observations as unit vectors in their cameras, (n, 3), as the C++ kernels want them.
+
+    None, (0,), where no camera has distortion: they have those of straight ones themselves.
+    """
+    obs, cams = problem.observations, problem.cameras
+    if (cams.model != cameras.Model.EQUIDISTANT).all() and not cams.params[:, cameras.DISTORTION].any():
+        return np.empty(0)
+    camera = obs.camera[rows]
+    return cameras.rays(obs.uv[rows], cams.model.take(camera), cams.params.take(camera, axis=0))
 
 
 def _columns(problem: Problem, centres: FloatArray, rows: slice) -> tuple[FloatArray, ...]:

@@ -203,3 +203,16 @@ def move_more_than_noise(
     observations: object, norms: Doubles, off: Doubles, n_points: int, limits: tuple[float, float, float, int, float]
 ) -> NDArray[np.bool_]:
     """Return which points move, see window.moving; limits are the first five constants there."""
+
+def explained(
+    problem: Problem,
+    views: tuple[Ints, Ints, Doubles],
+    tracks: tuple[int, int],
+    poses: tuple[Doubles, Doubles, Doubles, Doubles],
+    limits: tuple[float, float, float, int, int],
+) -> tuple[Doubles, Doubles, float, Doubles]:
+    """Return the fields of window.trial.Explained.
+
+    views: rows, the track of each, and seen, as of rays. tracks: how many, and how many took no part. poses: two sets.
+    limits: constants of window.trial.
+    """

@@ -62,7 +62,7 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
     Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
     far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
     """
-    explained = selection.trial(kernels).explained(selection.measured, (state.rotation, state.translation))
+    explained = selection.explained(state, kernels)
     found = explained.points
     if len(found):
         points, aside = state.points.copy(), selection.tried[: len(found)]

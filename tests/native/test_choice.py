@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 
 from ba_node import native
+from ba_node.arrays import take_rows
 from ba_node.config import Config
 from ba_node.core import triangulation
 from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
 from ba_node.scene.scene import Scene
 from ba_node.synthetic import SyntheticOptions, generate
-from ba_node.window import moving
-from ba_node.window.problems import determined, part_of, problem_of
+from ba_node.window import moving, trial
+from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
 pytestmark = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
 
@@ -114,3 +115,28 @@ def test_what_moves_is_what_numpy_finds() -> None:
     compiled, plain = (moving._leaves_more_than_noise(problem, norms, off, kernels) for kernels in ("native", "numpy"))
     assert 20 < np.count_nonzero(plain) < problem.n_points - 20
     np.testing.assert_array_equal(compiled, plain)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("distorted", [False, True])
+def test_tracks_are_explained_as_numpy_does(cameras: int, distorted: bool) -> None:
+    problem, rng = window(), np.random.default_rng(8)
+    cams = problem.cameras
+    params = cams.params.copy()
+    if distorted:
+        params[:, DISTORTION][:, 0] = -0.02
+    cams = dataclasses.replace(cams, params=params)
+    problem = dataclasses.replace(problem, cameras=take_rows(cams, slice(cameras)))
+    obs = problem.observations
+    problem = some_observations(problem, np.flatnonzero(obs.camera < cameras))
+    tried = rng.permutation(np.flatnonzero(np.bincount(problem.observations.point) > 2))[:60]
+    poses = problem.start.rotation, problem.start.translation
+    off = poses[0], poses[1] + 0.02 * rng.normal(size=poses[1].shape)
+    compiled, plain = (trial.explained(problem, (tried, 9), off, poses, kernels) for kernels in ("native", "numpy"))
+    assert plain.mean.shape == (2, 1 + cameras)
+    assert np.isfinite(plain.mean[:, 0]).all()
+    assert abs(plain.mean[0, 0] - plain.mean[1, 0]) > 1e-3, "the poses differ"
+    for field in dataclasses.fields(plain):
+        np.testing.assert_allclose(
+            getattr(compiled, field.name), getattr(plain, field.name), rtol=1e-7, err_msg=field.name
+        )

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "adjustment/choice.hpp"
+#include "adjustment/trial.hpp"
 #include "adjustment/views.hpp"
 #include "bindings/arrays.hpp"
 
@@ -183,12 +184,33 @@ Array<bool> move_more_than_noise(const py::object& observations, const Doubles& 
   return found;
 }
 
+// rows: views of the tracks, and which of these each is of; seen: of each, as in rays. limits: as TrialLimits.
+py::tuple explained(const py::object& problem, const std::tuple<Ints, Ints, Doubles>& views,
+                    const std::pair<std::int64_t, std::int64_t>& tracks, const std::array<Doubles, 4>& poses,
+                    const std::tuple<double, double, double, std::int64_t, std::int64_t>& limits) {
+  const ProblemArrays arrays(problem);
+  const auto& [rows, track, seen] = views;
+  const auto& [parallax, bound, behind, least_views, least_residuals] = limits;
+  const auto [n_tried, n_out] = tracks;
+  Trial trial(active_target(), arrays.view(), {rows.size(), n_tried, rows.data(), track.data()},
+              seen.size() ? seen.data() : nullptr);
+  const Explained found = trial.explained({{poses[0].data(), poses[2].data()}, {poses[1].data(), poses[3].data()}},
+                                          n_out, {parallax, bound, behind, least_views, least_residuals});
+  Doubles held_out({py::ssize_t{2}}), mean({py::ssize_t{2}, static_cast<py::ssize_t>(found.mean[0].size())}),
+      points({static_cast<py::ssize_t>(n_out), py::ssize_t{3}});
+  std::copy_n(found.held_out.data(), 2, held_out.mutable_data());
+  for (int s = 0; s < 2; ++s) std::copy(found.mean[s].begin(), found.mean[s].end(), mean.mutable_data(s));
+  std::copy_n(found.points.data(), 3 * n_out, points.mutable_data());
+  return py::make_tuple(held_out, mean, found.parallax, points);
+}
+
 }  // namespace
 
 void bind_window(py::module_& m) {
   m.def("views_of", &views_of_landmarks);
   m.def("distinct_landmarks", &distinct_landmarks);
   m.def("inliers_by_keyframe", &inliers_by_keyframe);
+  m.def("explained", &explained);
   m.def("gather", &gather);
   m.def("take", &take);
   m.def("rays", &rays);
