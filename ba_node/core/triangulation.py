@@ -66,9 +66,19 @@ class Triangulation:
     measured: BoolArray  # (n_pt,) True where a distance was measured
 
 
-def rays_of(problem: Problem) -> Rays:
-    """Return the rays of all observations of a problem at its start poses."""
+def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
+    """Return the rays of all observations of a problem at its start poses.
+
+    The C++ kernels turn them where they are built, unless ``kernels`` is numpy.
+    """
     obs, cams = problem.observations, problem.cameras
+    if kernels != "numpy" and native.kernels is not None:
+        seen = np.empty(0)
+        if (cams.model == cameras.Model.EQUIDISTANT).any() or cams.params[:, cameras.DISTORTION].any():
+            seen = cameras.rays(obs.uv, cams.model.take(obs.camera), cams.params.take(obs.camera, axis=0))
+        turned, all_good = native.kernels.rays(problem, seen)
+        rays = Rays(obs.point, *turned)
+        return rays if all_good else rays.part(np.isfinite(rays.direction[:, 2]))
     # Camera centre: x with R x + t = -Rc' tc.
     turn = np.swapaxes(cams.rotation, -1, -2)
     body_centre = -(turn @ cams.translation[:, :, None])[..., 0]

@@ -80,7 +80,7 @@ def poses_gate(problem: Problem, config: TracksConfig, kernels: str = "auto") ->
 
     Args: as of :func:`initial_points`.
     """
-    rays, n = triangulation.rays_of(problem), problem.n_points
+    rays, n = triangulation.rays_of(problem, kernels), problem.n_points
     gate = config.max_triangulation_px
     views = np.bincount(rays.point, minlength=n)
     agrees = consensus.agreeing(rays, n, gate, kernels) & (views > 1).take(rays.point)
@@ -97,7 +97,7 @@ def agreed_points(problem: Problem, config: TracksConfig, gate: float, kernels: 
 
     Args: as of :func:`initial_points`.
     """
-    rays, n = triangulation.rays_of(problem), problem.n_points
+    rays, n = triangulation.rays_of(problem, kernels), problem.n_points
     found = _agreed(rays, n, config, gate, kernels)
     views = np.bincount(rays.point, minlength=n)
     # An id may have become another point's.

@@ -188,7 +188,7 @@ def _evaluated(
         return none
     origin = scene.keyframes.position[scene.order[0]]
     positions = table.position[landmarks] - origin
-    problem = problem_of(scene, rows, scene.order, landmarks, origin, positions, config)
+    problem, rows = problem_of(scene, rows, scene.order, landmarks, origin, positions, config)
     if state == "refined":
         return problem, rows, objective.reprojection_errors(problem, problem.start)
     return problem, rows, _input_errors(scene, problem, table.guess[landmarks] - origin, origin)

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "bindings/arrays.hpp"
+#include "bindings/window.hpp"
 #include "parallel/memory.hpp"
 #include "targets/target.hpp"
 
@@ -319,6 +320,7 @@ PYBIND11_MODULE(_kernels, m) {
   ba::bind_reduced_system(kernel);
   ba::bind_sparse_factor(m);
   ba::bind_relative_poses(m);
+  ba::bind_window(m);
   m.def("targets", &ba::target_names);
   m.def("target", [] { return ba::target->name; });
   m.def("use_target", &ba::use_target);
