@@ -223,7 +223,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              without_gil([&] { k.factor(c, p); });
            })
       .def("damp", [](Kernel& k, bool diagonal, double mu) { without_gil([&] { k.damp(diagonal, mu); }); })
-      .def("rhs", [](const Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
+      .def("rhs", [](Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
       .def("dense",
            [](Kernel& k, OutDoubles out) {
              double* s = out.mutable_data();
