@@ -66,9 +66,17 @@ class Triangulation:
     measured: BoolArray  # (n_pt,) True where a distance was measured
 
 
-def rays_of(problem: Problem) -> Rays:
-    """Return the rays of all observations of a problem at its start poses."""
+def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
+    """Return the rays of all observations of a problem at its start poses.
+
+    The C++ kernels turn them where they are built, unless ``kernels`` is numpy.
+    """
     obs, cams = problem.observations, problem.cameras
+    if kernels != "numpy" and native.kernels is not None:
+        found = native.kernels.rays(problem, np.empty(0)) or native.kernels.rays(problem, rays_in_cameras(problem))
+        turned, all_good = found
+        rays = Rays(obs.point, *turned)
+        return rays if all_good else rays.part(np.isfinite(rays.direction[:, 2]))
     # Camera centre: x with R x + t = -Rc' tc.
     turn = np.swapaxes(cams.rotation, -1, -2)
     body_centre = -(turn @ cams.translation[:, :, None])[..., 0]
@@ -87,6 +95,16 @@ def rays_of(problem: Problem) -> Rays:
     rays = Rays(obs.point, *columns)
     good = np.isfinite(rays.direction[:, 2])
     return rays if good.all() else rays.part(good)
+
+
+def rays_in_cameras(problem: Problem, rows: IntArray | slice = slice(None)) -> FloatArray:
+    """Return the rays of some observations, all by default, as unit vectors in their cameras, (n, 3).
+
+    The C++ kernels have those of cameras without distortion themselves.
+    """
+    obs, cams = problem.observations, problem.cameras
+    camera = obs.camera[rows]
+    return cameras.rays(obs.uv[rows], cams.model.take(camera), cams.params.take(camera, axis=0))
 
 
 def _columns(problem: Problem, centres: FloatArray, rows: slice) -> tuple[FloatArray, ...]:

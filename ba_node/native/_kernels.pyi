@@ -159,3 +159,71 @@ def agreeing(rays: Rays, n_points: int, gate: float) -> NDArray[np.bool_]: ...
 def consensus(
     rays: Rays, n_points: int, gate: float
 ) -> tuple[Doubles, Doubles, NDArray[np.bool_], NDArray[np.bool_]]: ...
+def views_of(last: Ints, previous: Ints, landmarks: Ints, newest: int) -> Ints:
+    """Return the rows of all views of landmarks (-1), or of the newest of each, by landmark, in order of arrival."""
+
+def distinct_landmarks(table: object, begin: Ints, end: Ints, scratch: Ints) -> Ints:
+    """Return the different landmarks in the rows from each begin to its end of an ObservationTable, in no order.
+
+    Here and below scratch holds -1 for each row of keyframes or landmarks, and does again afterwards.
+    """
+
+def inliers_by_keyframe(table: object, rows: Ints, scratch: Ints) -> tuple[Ints, Ints]:
+    """Return the keyframes of those of some rows that are no outliers, in no order, and how many each has."""
+
+def gather(
+    table: object, rows: Ints, listed: tuple[Ints, Ints], scratch: tuple[Ints, Ints]
+) -> tuple[Ints, Ints, Ints, Ints, Doubles, Doubles, Doubles]:
+    """Return views of listed landmarks by listed keyframes; see scene.views.Views.gather."""
+
+def take(
+    observations: object, rows: Ints, of_point: Ints, of_keyframe: Ints
+) -> tuple[Ints, Ints, Ints, Doubles, Doubles, Doubles, Doubles]:
+    """Return the columns of core.problem.Observations at some rows, renumbered by what is not empty."""
+
+def rays(problem: Problem, seen: Doubles) -> tuple[tuple[Doubles, Doubles, Doubles, Doubles, Doubles], bool] | None:
+    """Return the columns of core.triangulation.Rays but the first, and whether all observations have a ray.
+
+    seen: (n_obs, 3) unit vectors in the cameras, or (0,) for cameras without distortion; None if one has some.
+    """
+
+def agreed(
+    rays: Rays, n_points: int, gate: float, limits: tuple[float, float, float, float]
+) -> tuple[Doubles, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the fields of window.initial_points.Agreed; limits: least parallax (rad), and constants there."""
+
+def determined(
+    observations: object,
+    usable: NDArray[np.bool_],
+    least: tuple[NDArray[np.bool_], Ints, int],
+    points: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return rows, keyframes and points that are left; see window.problems.determined.
+
+    least: whether a keyframe may take part, points that it has to see, observations likewise. points: that may take
+    part, and that count.
+    """
+
+def move_more_than_noise(
+    observations: object, norms: Doubles, off: Doubles, n_points: int, limits: tuple[float, float, float, int, float]
+) -> NDArray[np.bool_]:
+    """Return which points move, see window.moving; limits are the first five constants there."""
+
+def explained(
+    problem: Problem,
+    views: tuple[Ints, Ints, Doubles],
+    tracks: tuple[int, int],
+    poses: tuple[Doubles, Doubles, Doubles, Doubles],
+    limits: tuple[float, float, float, int, int],
+) -> tuple[Doubles, Doubles, float, Doubles] | None:
+    """Return the fields of window.trial.Explained; None as of rays.
+
+    views: rows, the track of each, and seen, as of rays. tracks: how many, and how many took no part. poses: two sets.
+    limits: constants of window.trial.
+    """
+
+def is_sound(problem: Problem) -> bool:
+    """Return whether indices are in range, observations sorted, numbers finite, sigmas positive."""
+
+def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, float]:
+    """Return what core.covariance.weakest does, of blocks (n, 6, 6) of S and positions (n, 3)."""

@@ -1,24 +1,17 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of one map, and what keeps them consistent: order, indices, links between views, forgetting.
-
-All observations stand in one table in order of arrival. Each row knows the previous row of the same landmark and each
-landmark its last, so that the views of some landmarks are found in as many vector steps as the longest track has views,
-however large the map is.
-"""
+"""The tables of one map, and what keeps them consistent: order, indices, links between views, forgetting."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import SceneConfig
 from ba_node.core import geometry
-from ba_node.scene.records import Block, Keyframes, Landmarks, ObservationTable
+from ba_node.scene.records import Block
 from ba_node.scene.tables import Growing, IdIndex
+from ba_node.scene.views import Views
 
 # 2^64 over the golden ratio: its multiples, modulo 2^64, are all different and spread evenly.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -26,21 +19,17 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _NEAR = 64
 
 
-class MapTables:
+class MapTables(Views):
     """Keyframes, landmarks and who saw what."""
 
     def __init__(self, config: SceneConfig) -> None:
+        super().__init__()
         self.config = config  # how much is kept
-        self.keyframes = Keyframes()  # table, in order of arrival; see ``order``
-        self.landmarks = Landmarks()  # table, in order of arrival
-        self.observations = ObservationTable()  # table, in order of arrival
-        self.blocks: list[list[Block]] = []  # per keyframe row, its rows in ``observations``
         self._keyframe_rows: dict[int, int] = {}
         self._landmark_rows = IdIndex()
         self._order, self._places = Growing(np.intp), Growing(np.intp)
         # The place in the order of time from which on keyframes that took part in no solve have to be moved.
         self._unsettled = 0
-        self._scratch: IntArray = np.empty(0, np.intp)
 
     @property
     def order(self) -> IntArray:
@@ -71,47 +60,6 @@ class MapTables:
     def by_time(self, keyframes: IntArray) -> IntArray:
         """Return rows of keyframes, oldest first."""
         return self.order[np.sort(self.places()[keyframes])]
-
-    def numbers(self, rows: NDArray[np.integer[Any]], listed: IntArray) -> IntArray:
-        """Return the place of each of some rows of keyframes or landmarks in a list of different ones, -1 if in none.
-
-        Its cost does not depend on the size of the table.
-        """
-        scratch = self._cleared()
-        scratch[listed] = np.arange(len(listed))
-        found = scratch.take(rows)
-        scratch[listed] = -1
-        return found
-
-    def distinct(self, rows: NDArray[np.integer[Any]]) -> IntArray:
-        """Return the different ones among rows of keyframes or landmarks, ascending; its cost is likewise."""
-        scratch, at = self._cleared(), np.arange(len(rows))
-        scratch[rows] = at
-        found: IntArray = np.sort(rows[scratch.take(rows) == at]).astype(np.intp)
-        scratch[found] = -1
-        return found
-
-    def _cleared(self) -> IntArray:
-        """Return numbers for each row of keyframes or landmarks, all -1; whoever writes to some puts them back."""
-        size = max(len(self.keyframes), len(self.landmarks))
-        if size > len(self._scratch):
-            self._scratch = np.full(2 * size, -1)
-        return self._scratch
-
-    def cameras_of(self, keyframe_row: int) -> set[int]:
-        """Return the indices of the cameras that delivered for a keyframe."""
-        return {block.camera for block in self.blocks[keyframe_row]}
-
-    def views_of(self, landmarks: IntArray, newest: int | None = None) -> IntArray:
-        """Return the rows of all observations of some landmarks, or of the newest of each, in no particular order."""
-        found: list[IntArray] = []
-        front = self.landmarks.last[landmarks]
-        front = front[front >= 0]
-        while len(front) and (newest is None or len(found) < newest):
-            found.append(front)
-            front = self.observations.previous[front]
-            front = front[front >= 0]
-        return np.concatenate(found) if found else np.empty(0, np.intp)
 
     def split(self, landmarks: IntArray, since: IntArray) -> IntArray:
         """Give the older views of some tracks landmarks of their own: their ids have become another point's.

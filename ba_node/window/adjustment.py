@@ -30,7 +30,7 @@ from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, constraints, full
+from ba_node.window import arrival, constraints, full, retriangulation
 from ba_node.window.problems import problem_of
 
 # So many tracks place a keyframe; a view agrees within so many outlier gates, as the map has drifted apart.
@@ -84,7 +84,8 @@ class Adjustment:
         """Refine all of the copy if that can be; return why the map is to stay as it is."""
         if len(self._copy.keyframes) > self.config.factors.adjust_max_keyframes:
             return ""
-        begun = full.take_snapshot(self._copy, self.config, self.wanted, self.scene)
+        config = retriangulation.close_gaps(self._copy, self.config) if self.due.loops else self.config
+        begun = full.take_snapshot(self._copy, config, self.wanted, self.scene)
         if isinstance(begun, str):
             # Where no point has a place, images have nothing to say against it.
             return f"no solve of everything can begin: {begun}" if self._copy.landmarks.has_position.any() else ""
@@ -362,10 +363,9 @@ def _resected(
     """
     table, points = scene.keyframes, scene.landmarks
     views = scene.views_of(rows[:, 0])
-    views = views[scene.observations.keyframe[views] == new]
     origin = table.position[old]
     order = np.argsort(rows[:, 0])
-    problem = problem_of(
+    problem, _ = problem_of(
         scene, views, np.array([new]), rows[order, 0], origin, points.position[rows[order, 1]] - origin, config
     )
     best, least = problem.start, np.inf

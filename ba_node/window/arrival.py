@@ -134,7 +134,7 @@ def _views(scene: Scene, config: Config, row: int) -> Problem | None:
     if len(landmarks) < _MIN_POINTS:
         return None
     origin = scene.keyframes.position[scene.order[0]]
-    return problem_of(scene, rows, np.array([row]), landmarks, origin, points.position[landmarks] - origin, config)
+    return problem_of(scene, rows, np.array([row]), landmarks, origin, points.position[landmarks] - origin, config)[0]
 
 
 def _near(problem: Problem, state: State, config: Config) -> int:

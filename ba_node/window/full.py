@@ -330,13 +330,10 @@ def follow_points(scene: Scene, updated: IntArray, anchor_of_row: IntArray, simi
 
 def _classify(scene: Scene, config: Config, selection: Selection, keyframes: IntArray, landmarks: IntArray) -> None:
     """Classify what the keyframes of the snapshot saw of its points anew; later ones have their windows for that."""
-    is_ours = np.zeros(len(scene.keyframes), bool)
-    is_ours[keyframes] = True
-    rows = scene.views_of(landmarks)
-    rows = rows[is_ours[scene.observations.keyframe[rows]]]
+    views = scene.views_of(landmarks)
     origin = selection.origin
-    problem = problem_of(
-        scene, rows, keyframes, landmarks, origin, scene.landmarks.position[landmarks] - origin, config
+    problem, rows = problem_of(
+        scene, views, keyframes, landmarks, origin, scene.landmarks.position[landmarks] - origin, config
     )
     now = dataclasses.replace(
         selection,

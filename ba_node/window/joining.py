@@ -118,7 +118,7 @@ def _alignment(
     keyframes = scene.by_time(scene.distinct(scene.observations.keyframe[views]))
     origin = scene.keyframes.position[keyframes[0]]
     there = position @ found[0].T + found[1] - origin
-    problem = problem_of(scene, views, keyframes, rows, origin, there, config)
+    problem, _ = problem_of(scene, views, keyframes, rows, origin, there, config)
     norms = native_kernels.residual_norms(problem, problem.start, config.solver.kernels)
     near = norms <= WIDE * (config.tracks.outlier_px or np.inf)
     agreeing = np.count_nonzero(np.bincount(problem.observations.point, near, len(rows)) > 0)

@@ -28,6 +28,7 @@ import dataclasses
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import consensus, native_kernels, triangulation
 from ba_node.core.problem import Problem
@@ -67,15 +68,14 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
         return np.zeros(problem.n_points, bool)
     norms = np.where(np.isnan(problem.start.points[:, 0]).take(point), np.inf, norms)
     off = _off(problem, norms, unrefined)
-    found = _leaves_more_than_noise(problem, norms / off.take(problem.observations.keyframe))
+    found = _leaves_more_than_noise(problem, norms, off, kernels)
     rows = np.flatnonzero(found.take(point))
     if not len(rows):
         return found
     doubted = part_of(problem, rows, found)
-    places, _ = consensus.triangulate(triangulation.rays_of(doubted), doubted.n_points, _BOUND, kernels)
+    places, _ = consensus.triangulate(triangulation.rays_of(doubted, kernels), doubted.n_points, _BOUND, kernels)
     at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
-    again = native_kernels.residual_norms(doubted, at, kernels) / off.take(doubted.observations.keyframe)
-    found[found] = _leaves_more_than_noise(doubted, again)
+    found[found] = _leaves_more_than_noise(doubted, native_kernels.residual_norms(doubted, at, kernels), off, kernels)
     return found
 
 
@@ -104,13 +104,21 @@ def _times_noise(norms: FloatArray) -> float:
     return max(1.0, float(np.partition(norms, rank)[rank]) / _NOISE_AT_RANK)
 
 
-def _leaves_more_than_noise(problem: Problem, norms: FloatArray) -> BoolArray:
+def _leaves_more_than_noise(problem: Problem, norms: FloatArray, off: FloatArray, kernels: str) -> BoolArray:
+    """Return which points leave more than noise in most of their views, of residuals over what keyframes are off."""
+    if kernels != "numpy" and native.kernels is not None:
+        limits = _LARGE, _MISMATCH, _BOUND, _LEAST_LARGE, _LARGE_SHARE
+        found: BoolArray = native.kernels.move_more_than_noise(
+            problem.observations, norms, off, problem.n_points, limits
+        )
+        return found
+    norms = norms / off.take(problem.observations.keyframe)
     point, n = problem.observations.point, problem.n_points
     large = np.bincount(point[(norms > _LARGE) & (norms < _MISMATCH)], minlength=n)
-    found = large >= _LEAST_LARGE
+    moves = large >= _LEAST_LARGE
     # Few have so many large residuals: the others need not be looked at.
-    rows = np.flatnonzero(found.take(point) & (norms < _MISMATCH))
+    rows = np.flatnonzero(moves.take(point) & (norms < _MISMATCH))
     point, norms = point.take(rows), norms.take(rows)
     total = np.bincount(point, np.minimum(norms, _BOUND) ** 2, n)
     count = np.bincount(point, minlength=n)
-    return np.asarray(found & (total > _LARGE**2 * count) & (large >= _LARGE_SHARE * count))
+    return np.asarray(moves & (total > _LARGE**2 * count) & (large >= _LARGE_SHARE * count))

@@ -11,6 +11,7 @@ import dataclasses
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry
@@ -26,33 +27,21 @@ def problem_of(
     origin: FloatArray,
     positions: FloatArray,
     config: Config,
-) -> Problem:
-    """Return the problem of some observations, sorted by point, keyframe, camera; all poses fixed.
+) -> tuple[Problem, IntArray]:
+    """Return the problem of observations by some keyframes, all poses fixed, and the row in the scene of each.
 
-    Rows of keyframes and landmarks are in the order of the problem; ``rows`` of the observations are reordered in
-    place. ``origin`` (3,) is that of the problem in the map, m; ``positions`` (n_pt, 3) are in the problem.
+    They are sorted by point, keyframe, camera. Keyframes and landmarks are rows in the order of the problem, ``rows``
+    are observations of these landmarks. ``origin`` (3,) is that of the problem in the map, m; ``positions`` (n_pt, 3)
+    are in the problem.
     """
-    table, cameras = scene.observations, scene.cameras
+    cameras = scene.cameras
     assert cameras is not None
-    keyframe = scene.numbers(table.keyframe.take(rows), keyframes)
-    point = scene.numbers(table.landmark.take(rows), landmarks)
-    camera = table.camera.take(rows).astype(np.intp)
-    # No camera sees a point twice in a keyframe, so no two keys are equal and any sort gives the same.
-    order = _sorted((point * len(keyframes) + keyframe) * len(cameras.model) + camera)
-    rows[:] = rows.take(order)
-    depth = table.depth_m.take(rows).astype(float)
-    depth = np.empty(0) if np.isnan(depth).all() else depth
-    observations = Observations(
-        keyframe.take(order),
-        camera.take(order),
-        point.take(order),
-        table.uv.take(rows, axis=0).astype(float),
-        table.sigma_px.take(rows).astype(float),
-        depth,
-        config.tracks.depth_sigma_ratio * depth,
-    )
+    found = scene.gather(rows, keyframes, landmarks, config.solver.kernels)
+    rows, keyframe, camera, point, uv, sigma_px, depth = found
+    observations = Observations(keyframe, camera, point, uv, sigma_px, depth, config.tracks.depth_sigma_ratio * depth)
     poses = geometry.inverse(scene.keyframes.rotation[keyframes], scene.keyframes.position[keyframes] - origin)
-    return Problem(State(*poses, positions, np.empty((0, 3))), np.ones(len(keyframes), bool), cameras, observations)
+    start = State(*poses, positions, np.empty((0, 3)))
+    return Problem(start, np.ones(len(keyframes), bool), cameras, observations), rows
 
 
 def some_observations(problem: Problem, rows: IntArray) -> Problem:
@@ -79,6 +68,10 @@ def _taken(
     obs: Observations, rows: IntArray, of_point: IntArray | None = None, of_keyframe: IntArray | None = None
 ) -> Observations:
     """Return some observations; (n_pt,) and (n_kf,) are the new numbers of points and keyframes, None for the old."""
+    if native.kernels is not None:
+        every = np.empty(0, np.intp)
+        numbers = (every if of is None else of for of in (of_point, of_keyframe))
+        return Observations(*native.kernels.take(obs, rows, *numbers))
     has_depth = len(obs.depth_m) > 0
     keyframe, point = obs.keyframe.take(rows), obs.point.take(rows)
     return Observations(
@@ -90,17 +83,6 @@ def _taken(
         obs.depth_m.take(rows) if has_depth else obs.depth_m,
         obs.depth_sigma_m.take(rows) if has_depth else obs.depth_sigma_m,
     )
-
-
-def _sorted(keys: IntArray) -> IntArray:
-    """Return the rows in the order of their keys, which are not negative and all different."""
-    # Numbers are sorted in half the time that it takes to sort rows by them: so each row goes in the key's low bits.
-    bits = len(keys).bit_length()
-    if not len(keys) or int(keys.max()) >= 1 << (63 - bits):
-        return np.argsort(keys)
-    packed = (keys << bits) | np.arange(len(keys))
-    packed.sort()
-    return packed & ((1 << bits) - 1)
 
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
@@ -126,17 +108,19 @@ def determined(
     keep_pt = placed.copy()
     if np.count_nonzero(keep_pt) > max_landmarks:
         keep_pt = _most_seen(keep_pt, np.bincount(obs.point[usable], minlength=n_pt), max_landmarks)
-    # Views of a point by several cameras of a keyframe are neighbours, and count once.
-    first = np.ones(len(obs), bool)
-    first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
-    static = ~moves.take(obs.point)
     mostly = np.full(n_kf, True)
     # Several cameras, or depths, place points where nothing moves: if they place few, that is for the guard to say.
     if len(problem.cameras.model) == 1 and not np.isfinite(obs.depth_m).any():
+        first = _first_of_pair(obs)
         views = np.bincount(obs.point[first], minlength=n_pt)
         shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
         known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
         mostly = known >= _LEAST_PLACED * shared
+    if native.kernels is not None:
+        least = mostly, min_points, MIN_OBSERVATIONS
+        found: tuple[IntArray, BoolArray, BoolArray] = native.kernels.determined(obs, usable, least, (keep_pt, ~moves))
+        return found
+    first, static = _first_of_pair(obs), ~moves.take(obs.point)
     while True:
         used = usable & keep_pt.take(obs.point)
         counted = used & static
@@ -150,6 +134,13 @@ def determined(
         if np.array_equal(keep_pt, before):
             break
     return np.flatnonzero(keep_pt.take(obs.point) & keep_kf.take(obs.keyframe)), keep_kf, keep_pt
+
+
+def _first_of_pair(obs: Observations) -> BoolArray:
+    """Return which observations count: views of a point by several cameras of a keyframe are neighbours, as one."""
+    first = np.ones(len(obs), bool)
+    first[1:] = (obs.point[1:] != obs.point[:-1]) | (obs.keyframe[1:] != obs.keyframe[:-1])
+    return first
 
 
 def _most_seen(known: BoolArray, views: IntArray, limit: int) -> BoolArray:

@@ -120,7 +120,7 @@ def _keyframes_of(track: IntArray, keyframe: IntArray, n: int) -> IntArray:
 
 def _agrees(whole: Problem, rows: IntArray, gate: float, kernels: str) -> BoolArray:
     """Return for each point whether most of some of its views agree with each other."""
-    rays = triangulation.rays_of(some_observations(whole, rows))
+    rays = triangulation.rays_of(some_observations(whole, rows), kernels)
     agree = consensus.agreeing(rays, whole.n_points, gate, kernels)
     views = np.bincount(whole.observations.point[rows], minlength=whole.n_points)
     return np.asarray(np.bincount(rays.point, agree, whole.n_points) >= _AGREEING * views)

@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray, ranges
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
-from ba_node.core.problem import KeyframeFactors, Observations, Problem
+from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, gauge, moving, odometry, old_keyframes, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
@@ -71,13 +70,19 @@ class Selection:
     beside: tuple[KeyframeFactors, ...] = ()  # factors of the problem that are no steps of the front-end
 
     @cached_property
+    def used(self) -> IntArray:
+        """Return which of all observations are in the problem, in its order."""
+        return np.flatnonzero(self.inlier)
+
+    @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
         return dataclasses.replace(self.problem, observations=self.observations)
 
-    def trial(self, backend: str) -> trial.Trial:
-        """Return the tracks that poses are tried on."""
-        return trial.Trial(self.whole, self.tried, int(np.count_nonzero(self.held_out)), backend)
+    def explained(self, state: State, kernels: str) -> trial.Explained:
+        """Return how well the front-end's poses and those of a solution explain the tracks that they are tried on."""
+        tracks = self.tried, int(np.count_nonzero(self.held_out))
+        return trial.explained(self.whole, tracks, self.measured, (state.rotation, state.translation), kernels)
 
 
 @dataclass(frozen=True)
@@ -249,24 +254,18 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
 
     Keyframes of ``without`` take no part, nor do landmarks that they alone see.
     """
-    table = scene.observations
     taking_part = window[~np.isin(window, without)] if len(without) else window
-    blocks = np.array([b[1:] for row in taking_part.tolist() for b in scene.blocks[row]], np.intp).reshape(-1, 2)
-    landmarks = scene.distinct(table.landmark[ranges(*blocks.T)])
-    rows = scene.views_of(landmarks, _views_needed(scene, window, config.window.max_fixed_keyframes))
-    keyframe = table.keyframe.take(rows)
+    landmarks = scene.seen_by(taking_part)
+    views = scene.views_of(landmarks, _views_needed(scene, window, config.window.max_fixed_keyframes))
     known = old_keyframes.memory(scene, config, window)
     if known is not None:
-        rows = rows[known.takes_part(scene, rows, window)]
-        keyframe = table.keyframe.take(rows)
-    older = _older(scene, window, keyframe[~table.outlier.take(rows)])
+        views = views[known.takes_part(scene, views, window)]
+    older = _older(scene, window, views)
     older = older[: 0 if config.window.old_keyframes == "drop" else config.window.max_fixed_keyframes]
     keyframes = scene.by_time(np.concatenate([taking_part, older]))
-    rows = rows[scene.numbers(keyframe, keyframes) >= 0]
-    landmarks = landmarks[np.argsort(scene.landmarks.track_id[landmarks])]
     origin = scene.keyframes.position[keyframes[0]] if len(keyframes) else np.zeros(3)
     positions = scene.landmarks.position[landmarks] - origin
-    problem = problem_of(scene, rows, keyframes, landmarks, origin, positions, config)
+    problem, rows = problem_of(scene, views, keyframes, landmarks, origin, positions, config)
     return _Part(problem, rows, keyframes, landmarks, origin)
 
 
@@ -282,19 +281,17 @@ def _views_needed(scene: Scene, window: IntArray, n_fixed: int) -> int | None:
     return _SPARE * images * (len(window) + n_fixed)
 
 
-def _older(scene: Scene, window: IntArray, keyframe: NDArray[np.int32]) -> IntArray:
+def _older(scene: Scene, window: IntArray, views: IntArray) -> IntArray:
     """Return the refined keyframes before a window that see its points, those first that share most with it.
 
-    ``keyframe`` is that of each inlier observation of its points. A keyframe that was never refined would only hold the
-    others to the front-end's drift.
+    ``views`` are the observations of its points. A keyframe that was never refined would only hold the others to the
+    front-end's drift.
     """
-    place = scene.places().take(keyframe)
-    before = keyframe[place < (int(scene.places()[window[0]]) if len(window) else 0)]
-    seeing = scene.by_time(scene.distinct(before))
-    shared = np.bincount(scene.numbers(before, seeing), minlength=len(seeing))
-    # Newest first, so that of those that share equally many the newest are taken.
-    older = np.flatnonzero(scene.keyframes.refined[seeing])[::-1]
-    return seeing[older[np.argsort(-shared[older], kind="stable")]]
+    seeing, shared = scene.inliers_by_keyframe(views)
+    place = scene.places()[seeing]
+    older = (place < (int(scene.places()[window[0]]) if len(window) else 0)) & scene.keyframes.refined[seeing]
+    # Of those that share equally many the newest are taken.
+    return seeing[older][np.lexsort((-place[older], -shared[older]))]
 
 
 def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Part:

@@ -128,13 +128,16 @@ def test_a_loop_closes_and_the_odometry_frame_stays() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("noise_px", "baseline_m", "seed"), [(1.0, 0.12, 4), (0.5, 0.0, 4), (0.5, 0.0, 7)])
-def test_noisy_loops_close_to_a_tenth(noise_px: float, baseline_m: float, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("noise_px", "baseline_m", "seed", "drift"),
+    [(1.0, 0.12, 4, 0.5), (0.5, 0.0, 4, 1.0), (0.5, 0.0, 7, 1.0), (0.5, 0.0, 4, 3.0), (0.5, 0.0, 8, 3.0)],
+)
+def test_noisy_loops_close_to_a_tenth(noise_px: float, baseline_m: float, seed: int, drift: float) -> None:
     """What is closed is the pose of the end in the keyframe at the same place, which the merged tracks tell.
 
-    Against the truth in the frame of the first keyframe is no measure: what the first steps are off turns all.
+    Against the truth in the frame of the first keyframe is no measure: what the first steps are off turns all. With 3
+    degrees a root metre one camera's windows leave gaps: all poses are far off until these are closed.
     """
-    drift = 0.5 if baseline_m else 1.0
     data = round_trip(noise_px, baseline_m=baseline_m, seed=seed, drift_rotation_deg=drift)
     table = np.array(merges(data), np.uint64)
     measurements = [*(one for _, _, one in data.timeline()), TrackMerge(0, table[:, 0], table[:, 1])]
@@ -146,6 +149,11 @@ def test_noisy_loops_close_to_a_tenth(noise_px: float, baseline_m: float, seed: 
         moves = [poses.position[end] - poses.position[12] for poses in (here, data.truth)]
         errors.append(float(np.linalg.norm(turns[0].T @ moves[0] - turns[1].T @ moves[1])))
     assert errors[0] > 0.3 and errors[1] < 0.1 * errors[0], errors
+    if drift > 1.0:
+        rms = [
+            aligned_rms(one.trajectory.position, data.truth.position[: len(one.trajectory)]) for one in estimates[-2:]
+        ]
+        assert rms[0] > 3.0 and rms[1] < 0.1 * rms[0], rms
 
 
 def test_what_cannot_be_is_counted(street: SyntheticData) -> None:

@@ -23,7 +23,7 @@ def test_a_part_is_what_would_have_been_made_of_its_rows(depth_share: float) -> 
     rows = np.arange(len(scene.observations))
     landmarks = rng.permutation(len(scene.landmarks))
     origin, positions = np.array([1.0, 2.0, 3.0]), rng.normal(size=(len(landmarks), 3))
-    whole = problem_of(scene, rows, scene.order, landmarks, origin, positions, settings)
+    whole, rows = problem_of(scene, rows, scene.order, landmarks, origin, positions, settings)
     obs = whole.observations
     keys = np.stack([obs.point, obs.keyframe, obs.camera])
     assert (np.lexsort(keys[::-1]) == np.arange(len(obs))).all(), "sorted by point, keyframe, camera"
@@ -31,7 +31,7 @@ def test_a_part_is_what_would_have_been_made_of_its_rows(depth_share: float) -> 
     kept = np.flatnonzero(keyframes[obs.keyframe] & points[obs.point])
     assert 10 < len(kept) < len(obs) - 10
     part = part_of(whole, kept, points, keyframes)
-    again = problem_of(
+    again, _ = problem_of(
         scene,
         rng.permutation(rows[kept]),
         scene.order[keyframes],

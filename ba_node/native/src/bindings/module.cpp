@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "bindings/arrays.hpp"
+#include "bindings/window.hpp"
 #include "parallel/memory.hpp"
 #include "targets/target.hpp"
 
@@ -55,6 +56,12 @@ void use_target(const std::string& name) {
   }
   throw py::value_error("target '" + name + "' is not one that this processor runs");
 }
+
+}  // namespace
+
+const Target& active_target() { return *target; }
+
+namespace {
 
 template <class F>
 auto without_gil(F f) {
@@ -216,7 +223,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              without_gil([&] { k.factor(c, p); });
            })
       .def("damp", [](Kernel& k, bool diagonal, double mu) { without_gil([&] { k.damp(diagonal, mu); }); })
-      .def("rhs", [](const Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
+      .def("rhs", [](Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
       .def("dense",
            [](Kernel& k, OutDoubles out) {
              double* s = out.mutable_data();
@@ -319,6 +326,7 @@ PYBIND11_MODULE(_kernels, m) {
   ba::bind_reduced_system(kernel);
   ba::bind_sparse_factor(m);
   ba::bind_relative_poses(m);
+  ba::bind_window(m);
   m.def("targets", &ba::target_names);
   m.def("target", [] { return ba::target->name; });
   m.def("use_target", &ba::use_target);

@@ -169,6 +169,58 @@ BA_INLINE void subtract_product(Block<9>& s, const Left<9>& x, const Edge<9>& y)
   s.corner -= x.b[0] * y.b[0] + x.b[1] * y.b[1] + x.b[2] * y.b[2];
 }
 
+// Whether there are registers enough for two products with one factor in common: what is loaded of it serves both.
+constexpr bool kProductsByTwo = sizeof(Register) == sizeof(V8);
+
+// s -= x z', t -= y z'.
+#if defined(__AVX512F__)
+BA_INLINE void subtract_products(Block<6>& s, Block<6>& t, const Left<6>& x, const Left<6>& y, const Edge<6>& z) {
+#pragma GCC unroll 6
+  for (int c = 0; c < 6; ++c) {
+    V8 first = load(&s.v[kStride6 * c]), second = load(&t.v[kStride6 * c]);
+#pragma GCC unroll 3
+    for (int i = 0; i < 3; ++i) {
+      const V8 factor = splat(reinterpret_cast<const double*>(&z.a[i])[c]);
+      first -= x.a[i] * factor;
+      second -= y.a[i] * factor;
+    }
+    std::memcpy(&s.v[kStride6 * c], &first, sizeof(first));
+    std::memcpy(&t.v[kStride6 * c], &second, sizeof(second));
+  }
+}
+
+BA_INLINE void subtract_products(Block<9>& s, Block<9>& t, const Left<9>& x, const Left<9>& y, const Edge<9>& z) {
+#pragma GCC unroll 9
+  for (int c = 0; c < 9; ++c) {
+    V8 first = s.col[c], second = t.col[c];
+#pragma GCC unroll 3
+    for (int i = 0; i < 3; ++i) {
+      const V8 factor = splat(c < 8 ? reinterpret_cast<const double*>(&z.a[i])[c] : z.b[i]);
+      first -= x.a[i] * factor;
+      second -= y.a[i] * factor;
+    }
+    s.col[c] = first;
+    t.col[c] = second;
+  }
+  V8 first = s.row, second = t.row;
+#pragma GCC unroll 3
+  for (int i = 0; i < 3; ++i) {
+    first -= z.a[i] * x.b[i];
+    second -= z.a[i] * y.b[i];
+  }
+  s.row = first;
+  t.row = second;
+  s.corner -= x.b[0] * z.b[0] + x.b[1] * z.b[1] + x.b[2] * z.b[2];
+  t.corner -= y.b[0] * z.b[0] + y.b[1] * z.b[1] + y.b[2] * z.b[2];
+}
+#else
+template <int D>
+BA_INLINE void subtract_products(Block<D>& s, Block<D>& t, const Left<D>& x, const Left<D>& y, const Edge<D>& z) {
+  subtract_product(s, x, z);
+  subtract_product(t, y, z);
+}
+#endif
+
 // c -= a b'.
 #if defined(__AVX512F__)
 inline void subtract_transposed(Block<6>& c, const Block<6>& a, const Block<6>& b) {

@@ -1,0 +1,252 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bindings/window.hpp"
+
+#include <pybind11/stl.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "adjustment/choice.hpp"
+#include "adjustment/sound.hpp"
+#include "adjustment/trial.hpp"
+#include "adjustment/views.hpp"
+#include "bindings/arrays.hpp"
+
+namespace ba {
+
+namespace {
+
+// Never converted: what is written would be lost, and to copy a map's column takes longer than the call.
+template <class T>
+using Column = py::array_t<T, py::array::c_style>;
+
+template <class T>
+Column<T> column_of(const py::handle& table, const char* name) {
+  return table.attr(name).cast<Column<T>>();
+}
+
+// scene.records.ObservationTable.
+struct TableArrays {
+  explicit TableArrays(const py::handle& table)
+      : keyframe(column_of<std::int32_t>(table, "keyframe")),
+        camera(column_of<std::int32_t>(table, "camera")),
+        landmark(column_of<std::int32_t>(table, "landmark")),
+        uv(column_of<float>(table, "uv")),
+        sigma(column_of<float>(table, "sigma_px")),
+        depth(column_of<float>(table, "depth_m")),
+        outlier(column_of<bool>(table, "outlier")) {}
+
+  TableView view() const {
+    return {keyframe.data(), camera.data(), landmark.data(), uv.data(), sigma.data(), depth.data(), outlier.data()};
+  }
+
+  Column<std::int32_t> keyframe, camera, landmark;
+  Column<float> uv, sigma, depth;
+  Column<bool> outlier;
+};
+
+RowsView rows_view(const Ints& rows) { return {rows.size(), rows.data()}; }
+
+Ints ints(const std::vector<std::int64_t>& values) {
+  return Ints(static_cast<py::ssize_t>(values.size()), values.data());
+}
+
+Ints views_of_landmarks(const Column<std::int64_t>& last, const Column<std::int64_t>& previous, const Ints& landmarks,
+                        std::int64_t newest) {
+  return ints(views_of(last.data(), previous.data(), rows_view(landmarks), newest));
+}
+
+Ints distinct_landmarks(const py::object& table, const Ints& begin, const Ints& end, Column<std::int64_t> scratch) {
+  const auto landmark = column_of<std::int32_t>(table, "landmark");
+  return ints(distinct(landmark.data(), rows_view(begin), end.data(), scratch.mutable_data()));
+}
+
+py::tuple inliers_by_keyframe(const py::object& table, const Ints& rows, Column<std::int64_t> scratch) {
+  const auto [keyframe, count] = counted(TableArrays(table).view(), rows_view(rows), scratch.mutable_data());
+  return py::make_tuple(ints(keyframe), ints(count));
+}
+
+// scratch: of keyframes and of landmarks.
+py::tuple gather(const py::object& table, const Ints& rows, const std::pair<Ints, Ints>& listed,
+                 const std::pair<Column<std::int64_t>, Column<std::int64_t>>& scratch) {
+  const TableArrays arrays(table);
+  const TableView from = arrays.view();
+  Column<std::int64_t> of_keyframe = scratch.first, of_landmark = scratch.second;
+  const Numbered keyframes(rows_view(listed.first), of_keyframe.mutable_data());
+  const Numbered landmarks(rows_view(listed.second), of_landmark.mutable_data());
+  const std::vector<PlacedView> views = placed(from, rows_view(rows), keyframes, landmarks);
+  const auto n = static_cast<py::ssize_t>(views.size());
+  Ints row({n}), keyframe({n}), camera({n}), point({n});
+  Doubles uv({n, py::ssize_t{2}}), sigma({n}), depth({n});
+  std::int64_t *to_row = row.mutable_data(), *to_keyframe = keyframe.mutable_data(), *to_camera = camera.mutable_data(),
+               *to_point = point.mutable_data();
+  double *to_uv = uv.mutable_data(), *to_sigma = sigma.mutable_data(), *to_depth = depth.mutable_data();
+  bool measured = false;
+  for (py::ssize_t i = 0; i < n; ++i) {
+    const PlacedView& v = views[i];
+    to_row[i] = v.row;
+    to_keyframe[i] = v.keyframe;
+    to_camera[i] = v.camera;
+    to_point[i] = v.point;
+    to_uv[2 * i] = from.uv[2 * v.row];
+    to_uv[2 * i + 1] = from.uv[2 * v.row + 1];
+    to_sigma[i] = from.sigma[v.row];
+    to_depth[i] = from.depth[v.row];
+    measured |= !std::isnan(to_depth[i]);
+  }
+  return py::make_tuple(row, keyframe, camera, point, uv, sigma, measured ? depth : Doubles({py::ssize_t{0}}));
+}
+
+// What core.problem.Observations holds, of some rows; with other numbers of points and keyframes where these are given.
+py::tuple take(const py::object& observations, const Ints& rows, const Ints& of_point, const Ints& of_keyframe) {
+  const Ints keyframe = array_of<std::int64_t>(observations, "keyframe"),
+             camera = array_of<std::int64_t>(observations, "camera"),
+             point = array_of<std::int64_t>(observations, "point");
+  const Doubles uv = array_of<double>(observations, "uv"), sigma = array_of<double>(observations, "sigma_px"),
+                depth = array_of<double>(observations, "depth_m"),
+                depth_sigma = array_of<double>(observations, "depth_sigma_m");
+  const py::ssize_t n = rows.size(), n_depths = depth.size() ? n : 0;
+  Ints to_keyframe({n}), to_camera({n}), to_point({n});
+  Doubles to_uv({n, py::ssize_t{2}}), to_sigma({n}), to_depth({n_depths}), to_depth_sigma({n_depths});
+  const auto taken = [&rows, n](const auto& from, auto& to) {
+    const auto* source = from.data();
+    auto* out = to.mutable_data();
+    for (py::ssize_t i = 0; i < n; ++i) out[i] = source[rows.data()[i]];
+  };
+  const auto renumbered = [n](const Ints& number, Ints& to) {
+    std::int64_t* out = to.mutable_data();
+    if (number.size())
+      for (py::ssize_t i = 0; i < n; ++i) out[i] = number.data()[out[i]];
+  };
+  taken(keyframe, to_keyframe);
+  taken(camera, to_camera);
+  taken(point, to_point);
+  taken(sigma, to_sigma);
+  renumbered(of_point, to_point);
+  renumbered(of_keyframe, to_keyframe);
+  double* pixels = to_uv.mutable_data();
+  for (py::ssize_t i = 0; i < n; ++i) std::copy_n(uv.data() + 2 * rows.data()[i], 2, pixels + 2 * i);
+  if (n_depths) {
+    taken(depth, to_depth);
+    taken(depth_sigma, to_depth_sigma);
+  }
+  return py::make_tuple(to_keyframe, to_camera, to_point, to_uv, to_sigma, to_depth, to_depth_sigma);
+}
+
+// seen: of each observation as a unit vector in its camera; empty for cameras without distortion. None if it must not
+// be.
+py::object rays(const py::object& problem, const Doubles& seen) {
+  const ProblemArrays arrays(problem);
+  const ProblemView view = arrays.view();
+  const auto n = static_cast<py::ssize_t>(view.n_obs);
+  if (seen.size() < 3 * n && !all_straight(view)) return py::none();
+  Doubles centre({n, py::ssize_t{3}}), direction({n, py::ssize_t{3}}), px_per_rad({n}), distance({n}),
+      distance_sigma({n});
+  const RaysSpan out{centre.mutable_data(), direction.mutable_data(), px_per_rad.mutable_data(),
+                     distance.mutable_data(), distance_sigma.mutable_data()};
+  const bool good = rays_of(view, arrays.start.view(), seen.size() ? seen.data() : nullptr, out);
+  return py::make_tuple(py::make_tuple(centre, direction, px_per_rad, distance, distance_sigma), good);
+}
+
+// limits: of AgreementLimits all but the gate.
+py::tuple agreed(const py::object& rays, py::ssize_t n_points, double gate, const std::array<double, 4>& limits) {
+  const RaysArrays arrays(rays);
+  const RaysView view = arrays.view();
+  Doubles points({n_points, py::ssize_t{3}}), parallax({n_points});
+  Array<bool> measured({n_points}), good({n_points}), agrees({arrays.point.size()});
+  active_target().consensus(view, n_points, gate, points.mutable_data(), parallax.mutable_data(),
+                            measured.mutable_data(), agrees.mutable_data());
+  tells_place(view, n_points, points.data(), parallax.data(), measured.data(), agrees.data(),
+              {gate, limits[0], limits[1], limits[2], limits[3]}, good.mutable_data());
+  return py::make_tuple(points, good, measured);
+}
+
+// flags: usable (n_obs,); least: of a keyframe, whether it may take part at all (n_kf,) and how many points it has to
+// see (n_kf,); points: whether they may take part, and whether they count (n_pt,).
+py::tuple determined_of(const py::object& observations, const Array<bool>& usable,
+                        const std::tuple<Array<bool>, Ints, std::int64_t>& least,
+                        const std::pair<Array<bool>, Array<bool>>& points) {
+  const Ints keyframe = array_of<std::int64_t>(observations, "keyframe"),
+             point = array_of<std::int64_t>(observations, "point");
+  const Doubles depth = array_of<double>(observations, "depth_m");
+  const auto& [may, least_points, least_observations] = least;
+  Determined found({point.size(), point.data(), keyframe.data(), usable.data(), depth.size() ? depth.data() : nullptr},
+                   points.second.data(), {may.data(), least_points.data(), least_observations});
+  found.keep_points.assign(points.first.data(), points.first.data() + points.first.size());
+  found.keep_keyframes.resize(may.size());
+  found.run();
+  const auto flags = [](const std::vector<char>& from) {
+    Array<bool> out({static_cast<py::ssize_t>(from.size())});
+    std::copy(from.begin(), from.end(), out.mutable_data());
+    return out;
+  };
+  return py::make_tuple(ints(found.rows()), flags(found.keep_keyframes), flags(found.keep_points));
+}
+
+// off: of each keyframe, what its residuals are divided by. limits: as MotionLimits.
+Array<bool> move_more_than_noise(const py::object& observations, const Doubles& norms, const Doubles& off,
+                                 std::int64_t n_points, const std::array<double, 5>& limits) {
+  const Ints keyframe = array_of<std::int64_t>(observations, "keyframe"),
+             point = array_of<std::int64_t>(observations, "point");
+  Array<bool> found({static_cast<py::ssize_t>(n_points)});
+  const MotionLimits at{limits[0], limits[1], limits[2], limits[3], limits[4]};
+  leave_more_than_noise({norms.size(), point.data(), keyframe.data(), norms.data(), off.data()}, n_points, at,
+                        found.mutable_data());
+  return found;
+}
+
+// rows: views of the tracks, and which of these each is of; seen: of each, as in rays. limits: as TrialLimits.
+py::object explained(const py::object& problem, const std::tuple<Ints, Ints, Doubles>& views,
+                     const std::pair<std::int64_t, std::int64_t>& tracks, const std::array<Doubles, 4>& poses,
+                     const std::tuple<double, double, double, std::int64_t, std::int64_t>& limits) {
+  const ProblemArrays arrays(problem);
+  const auto& [rows, track, seen] = views;
+  const auto& [parallax, bound, behind, least_views, least_residuals] = limits;
+  const auto [n_tried, n_out] = tracks;
+  if (seen.size() < 3 * rows.size() && !all_straight(arrays.view())) return py::none();
+  Trial trial(active_target(), arrays.view(), {rows.size(), n_tried, rows.data(), track.data()},
+              seen.size() ? seen.data() : nullptr);
+  const Explained found = trial.explained({{poses[0].data(), poses[2].data()}, {poses[1].data(), poses[3].data()}},
+                                          n_out, {parallax, bound, behind, least_views, least_residuals});
+  Doubles held_out({py::ssize_t{2}}), mean({py::ssize_t{2}, static_cast<py::ssize_t>(found.mean[0].size())}),
+      points({static_cast<py::ssize_t>(n_out), py::ssize_t{3}});
+  std::copy_n(found.held_out.data(), 2, held_out.mutable_data());
+  for (int s = 0; s < 2; ++s) std::copy(found.mean[s].begin(), found.mean[s].end(), mean.mutable_data(s));
+  std::copy_n(found.points.data(), 3 * n_out, points.mutable_data());
+  return py::make_tuple(held_out, mean, found.parallax, points);
+}
+
+bool is_sound_problem(const py::object& problem) {
+  const ProblemArrays arrays(problem);
+  return is_sound(arrays.view(), arrays.start.view());
+}
+
+// most: variances of blocks that are scaled to a unit diagonal.
+py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double most) {
+  const auto [sigma_m, sigma_rad] = loosest(blocks.data(), positions.data(), blocks.shape(0), most);
+  return py::make_tuple(sigma_m, sigma_rad);
+}
+
+}  // namespace
+
+void bind_window(py::module_& m) {
+  m.def("views_of", &views_of_landmarks);
+  m.def("distinct_landmarks", &distinct_landmarks);
+  m.def("inliers_by_keyframe", &inliers_by_keyframe);
+  m.def("explained", &explained);
+  m.def("agreed", &agreed);
+  m.def("is_sound", &is_sound_problem);
+  m.def("loosest", &loosest_of);
+  m.def("gather", &gather);
+  m.def("take", &take);
+  m.def("rays", &rays);
+  m.def("determined", &determined_of);
+  m.def("move_more_than_noise", &move_more_than_noise);
+}
+
+}  // namespace ba

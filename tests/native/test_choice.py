@@ -1,0 +1,185 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What takes part in a window, chosen by the C++ kernels and by numpy."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ba_node import native
+from ba_node.arrays import take_rows
+from ba_node.config import Config
+from ba_node.core import geometry, triangulation
+from ba_node.core.cameras import DISTORTION, Model
+from ba_node.core.problem import Problem
+from ba_node.scene.scene import Scene
+from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.window import moving, trial
+from ba_node.window.initial_points import agreed_points
+from ba_node.window.problems import determined, part_of, problem_of, some_observations
+
+pytestmark = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
+
+Find = Callable[[], Any]
+Both = Callable[[Find], tuple[Any, Any]]
+
+
+@pytest.fixture
+def both(monkeypatch: pytest.MonkeyPatch) -> Both:
+    """Return what gives the results of a function with the C++ kernels and without."""
+
+    def results(function: Find) -> tuple[Any, Any]:
+        compiled = function()
+        with monkeypatch.context() as without:
+            without.setattr(native, "kernels", None)
+            return compiled, function()
+
+    return results
+
+
+def window(depth_share: float = 0.3) -> Problem:
+    """Return a problem of all that a short drive sees."""
+    options = SyntheticOptions(seed=5, keyframes=10, tracks=60, length_m=12.0, depth_share=depth_share)
+    scene = Scene(Config().scene)
+    for _, _, measurement in generate(options).timeline():
+        scene.add(measurement)
+    landmarks = np.arange(len(scene.landmarks))
+    positions = np.random.default_rng(4).normal(size=(len(landmarks), 3))
+    return problem_of(
+        scene, np.arange(len(scene.observations)), scene.order, landmarks, np.zeros(3), positions, Config()
+    )[0]
+
+
+@pytest.mark.parametrize("kind", ["straight", "distorted", "fisheye", "without depths"])
+def test_rays_are_those_of_numpy(kind: str) -> None:
+    problem = window(0.0 if kind == "without depths" else 0.3)
+    cams = problem.cameras
+    params = cams.params.copy()
+    if kind in ("distorted", "fisheye"):
+        params[0, DISTORTION] = [-0.05, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    model = np.array([Model.EQUIDISTANT, Model.RATIONAL], np.uint8) if kind == "fisheye" else cams.model
+    uv = problem.observations.uv.copy()
+    if kind != "straight":
+        uv[::9] = 1e5  # where cameras with distortion see nothing
+    problem = dataclasses.replace(
+        problem,
+        cameras=dataclasses.replace(cams, params=params, model=model),
+        observations=dataclasses.replace(problem.observations, uv=uv),
+    )
+    compiled, plain = (triangulation.rays_of(problem, kernels) for kernels in ("native", "numpy"))
+    assert (len(plain.point) < len(uv)) == (kind in ("distorted", "fisheye"))
+    for field in dataclasses.fields(plain):
+        np.testing.assert_allclose(
+            getattr(compiled, field.name), getattr(plain, field.name), rtol=1e-13, atol=1e-14, err_msg=field.name
+        )
+
+
+@pytest.mark.parametrize("depth_share", [0.0, 0.3])
+def test_what_determines_something_is_what_numpy_finds(depth_share: float, both: Both) -> None:
+    problem, rng = window(depth_share), np.random.default_rng(6)
+    usable = rng.random(len(problem.observations)) < 0.9
+    moves = rng.random(problem.n_points) < 0.1
+    problem.start.points[rng.random(problem.n_points) < 0.1] = np.nan
+    least = rng.integers(5, 30, problem.n_keyframes)
+    compiled, plain = both(lambda: determined(problem, usable, moves, 3 * problem.n_points // 4, least))
+    assert 0 < np.count_nonzero(plain[1]) < problem.n_keyframes, "some keyframes are left"
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("depth_share", [0.0, 0.3])
+def test_a_part_is_what_numpy_takes(depth_share: float, both: Both) -> None:
+    problem = window(depth_share)
+    points, keyframes = np.arange(problem.n_points) % 3 > 0, np.arange(problem.n_keyframes) % 4 > 0
+    obs = problem.observations
+    rows = np.flatnonzero(points[obs.point] & keyframes[obs.keyframe])
+    compiled, plain = both(lambda: part_of(problem, rows, points, keyframes))
+    for field in dataclasses.fields(plain.observations):
+        a, b = (getattr(found.observations, field.name) for found in (compiled, plain))
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+        assert a.dtype == b.dtype, field.name
+
+
+def test_what_moves_is_what_numpy_finds() -> None:
+    problem, rng = window(), np.random.default_rng(7)
+    norms = (
+        np.abs(rng.normal(size=len(problem.observations)))
+        * rng.choice([1.0, 4.0, 100.0], problem.n_points)[problem.observations.point]
+    )
+    norms[::11] = np.inf
+    off = rng.uniform(1.0, 1.5, problem.n_keyframes)
+    compiled, plain = (moving._leaves_more_than_noise(problem, norms, off, kernels) for kernels in ("native", "numpy"))
+    assert 20 < np.count_nonzero(plain) < problem.n_points - 20
+    np.testing.assert_array_equal(compiled, plain)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("distorted", [False, True])
+def test_tracks_are_explained_as_numpy_does(cameras: int, distorted: bool) -> None:
+    problem, rng = window(), np.random.default_rng(8)
+    cams = problem.cameras
+    params = cams.params.copy()
+    if distorted:
+        params[:, DISTORTION][:, 0] = -0.02
+    cams = dataclasses.replace(cams, params=params)
+    problem = dataclasses.replace(problem, cameras=take_rows(cams, slice(cameras)))
+    obs = problem.observations
+    problem = some_observations(problem, np.flatnonzero(obs.camera < cameras))
+    tried = rng.permutation(np.flatnonzero(np.bincount(problem.observations.point) > 2))[:60]
+    poses = problem.start.rotation, problem.start.translation
+    off = poses[0], poses[1] + 0.02 * rng.normal(size=poses[1].shape)
+    compiled, plain = (trial.explained(problem, (tried, 9), off, poses, kernels) for kernels in ("native", "numpy"))
+    assert plain.mean.shape == (2, 1 + cameras)
+    assert np.isfinite(plain.mean[:, 0]).all()
+    assert abs(plain.mean[0, 0] - plain.mean[1, 0]) > 1e-3, "the poses differ"
+    for field in dataclasses.fields(plain):
+        np.testing.assert_allclose(
+            getattr(compiled, field.name), getattr(plain, field.name), rtol=1e-7, err_msg=field.name
+        )
+
+
+@pytest.mark.parametrize("depth_share", [0.0, 0.3])
+def test_places_that_views_agree_on_are_those_of_numpy(depth_share: float) -> None:
+    problem, tracks = window(depth_share), Config().tracks
+    compiled, plain = (agreed_points(problem, tracks, 30.0, kernels) for kernels in ("native", "numpy"))
+    assert 20 < np.count_nonzero(plain.good) < problem.n_points - 5
+    np.testing.assert_array_equal(compiled.good, plain.good)
+    np.testing.assert_array_equal(compiled.measured[plain.good], plain.measured[plain.good])
+    np.testing.assert_allclose(compiled.points[plain.good], plain.points[plain.good], rtol=1e-6)
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_the_loosest_pose_is_that_of_numpy(singular: bool) -> None:
+    rng = np.random.default_rng(9)
+    root = rng.normal(size=(5, 6, 6)) * [1e3, 1e3, 1e3, 1.0, 1.0, 1.0]
+    blocks, position = np.swapaxes(root, 1, 2) @ root, rng.normal(size=(5, 3)) * 10.0
+    inverse = np.linalg.inv(blocks)
+    moves = np.concatenate([geometry.hat(position), np.broadcast_to(-np.eye(3), (5, 3, 3))], axis=2)
+    of_position = np.linalg.eigvalsh(moves @ inverse @ np.swapaxes(moves, 1, 2))[:, -1]
+    of_rotation = np.linalg.eigvalsh(inverse[:, :3, :3])[:, -1]
+    expected = (0.0, 0.0) if singular else np.sqrt([of_position.max(), of_rotation.max()])
+    if singular:
+        root[3, :, 2] = root[3, :, 4]
+        blocks = np.swapaxes(root, 1, 2) @ root
+    np.testing.assert_allclose(native.kernels.loosest(blocks, position, 1e11), expected, rtol=1e-6)
+
+
+def test_what_cannot_be_worked_with_is_not_sound() -> None:
+    problem = window()
+    problem.start.points[:] = 1e300
+    assert native.kernels.is_sound(problem)
+    for place in ("observations", "start", "cameras"):
+        record = getattr(problem, place)
+        for field in ("keyframe", "camera", "point", "uv", "sigma_px", "rotation", "translation", "points", "params"):
+            values = getattr(record, field, None)
+            if values is None or (place, field) in (("cameras", "rotation"), ("cameras", "translation")):
+                continue
+            wrong = values.copy()
+            wrong[len(wrong) // 2] = -1 if values.dtype.kind == "i" else np.nan
+            changed = dataclasses.replace(problem, **{place: dataclasses.replace(record, **{field: wrong})})
+            assert not native.kernels.is_sound(changed), f"{place}.{field}"
