@@ -57,6 +57,12 @@ void use_target(const std::string& name) {
   throw py::value_error("target '" + name + "' is not one that this processor runs");
 }
 
+}  // namespace
+
+const Target& active_target() { return *target; }
+
+namespace {
+
 template <class F>
 auto without_gil(F f) {
   py::gil_scoped_release release;
