@@ -91,7 +91,7 @@ def _place_roughly(scene: Scene, config: Config) -> None:
     rows = scene.views_of(landmarks)
     table.outlier[rows] = False
     origin, none = scene.keyframes.position[scene.order[0]], np.zeros((len(landmarks), 3))
-    problem = problem_of(scene, rows, scene.order, landmarks, origin, none, config)
+    problem, _ = problem_of(scene, rows, scene.order, landmarks, origin, none, config)
     usual = float(np.median(np.linalg.norm(away, axis=1)))
     points.position[landmarks] = _rough(problem, usual, config.solver.kernels) + origin
     points.has_position[landmarks] = True
