@@ -17,6 +17,8 @@ from ba_node.io.yaml_file import YamlError, read_yaml
 METADATA = "metadata.yaml"
 STORAGES = (".mcap", ".db3")
 PACKED = ".zstd"
+# How the name of a recording ends.
+SUFFIXES = (*STORAGES, PACKED)
 MAX_PACKED_BYTES = 2**40
 _KNOWN = ("mcap", "sqlite3")
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from ba_node.core.geometry import quaternion_from_matrix
 from ba_node.estimate import Poses
+from ba_node.io.bag_files import SUFFIXES
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import BagError
 from ba_node.io.files import opened
@@ -30,8 +31,8 @@ _POSES: dict[str, Callable[[Any], Iterator[tuple[Any, Any]]]] = {
     "nav_msgs/msg/Odometry": lambda message: iter([(message.header, message.pose.pose)]),
     "nav_msgs/msg/Path": lambda message: ((one.header, one.pose) for one in message.poses),
 }
-_RECORDINGS = (".mcap", ".db3", ".zstd")
 TRUTH_TOPIC = "ground_truth/pose"
+# A day at 10 Hz: more is no list of poses of keyframes.
 _MAX_MESSAGES = 10**6
 # A KITTI file has no stamps: poses are numbered, a second apart.
 _SECOND_NS = 1_000_000_000
@@ -69,7 +70,7 @@ def read_poses(path: Path) -> Poses:
 
 def _read(path: Path, topic: str) -> tuple[Poses, bool]:
     """Return a trajectory, and whether it has stamps."""
-    if path.is_dir() or path.suffix in _RECORDINGS:
+    if path.is_dir() or path.suffix in SUFFIXES:
         return _read_topic(path, topic), True
     columns = first_line(path)
     if "," in columns:

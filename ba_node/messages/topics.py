@@ -177,6 +177,8 @@ TOPICS = {topic.name: topic for topic in _ALL}
 # Of the inputs: it rises when one of their definitions changes in its fields, types or meanings. What is new comes on
 # topics of its own and leaves it as it is.
 INTERFACE_VERSION = 1
+# Of images, as they are and compressed.
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # What a recording holds for a replay, and what a solve gives: type by name.
 INPUT_TYPES = {one.name: one.type_name for one in _ALL if one.direction is _IN and not one.is_shared}
 OUTPUT_TYPES = {one.name: one.type_name for one in _ALL if one.direction is _OUT and not one.is_shared}

@@ -20,14 +20,13 @@ from ba_node.io.bag_source import BagChannel
 from ba_node.io.bag_topics import BagError, TopicChoice
 from ba_node.io.bag_writer import BagWriter
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.topics import CAMERA_TYPES, INPUT_TYPES, TF_STATIC
+from ba_node.messages.topics import CAMERA_TYPES, IMAGE_TYPES, INPUT_TYPES, TF_STATIC
 
 _NS = 1e9
 # A pause between keyframes that is so many times as long as the median is told.
 _GAP = 4.0
 # Different things that are wrong with messages; the others are like them.
 _TOLD = 5
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 Progress = Callable[[int, int], None]
 
 
@@ -95,7 +94,7 @@ def _use(reader: BagReader, facts: RecordingFacts) -> None:
             seen.add(measurement)
     except BagError as error:
         facts.refusal = str(error).removeprefix(f"{reader.path}: ")
-        images = sorted(topic for topic, of in facts.topics.items() if of.type_name in _IMAGES)
+        images = sorted(topic for topic, of in facts.topics.items() if of.type_name in IMAGE_TYPES)
         if images:
             facts.attention.append(f"images on {', '.join(images)}: `ba run` makes a map of them, `ba track` keyframes")
         return

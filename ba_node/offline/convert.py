@@ -18,6 +18,7 @@ from ba_node.core.geometry import inverse, quaternion_from_matrix
 from ba_node.core.problem import Cameras
 from ba_node.estimate import Cloud, Poses
 from ba_node.io import bundler, colmap
+from ba_node.io.bag_files import SUFFIXES
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import TopicChoice
 from ba_node.io.bal import read_bal, write_bal
@@ -33,7 +34,6 @@ from ba_node.offline.recording import record
 _FIXED_FRAME, _BODY_FRAME = "map", "body"
 _MAX_CAMERAS = 2**16
 BAL = (".txt", ".bz2", ".gz")
-_BAGS = (".mcap", ".db3", ".zstd")
 # By name, how a target of the format usually ends.
 FORMATS = {
     "mcap": (".mcap",),
@@ -58,7 +58,7 @@ def read(
     """
     if path.is_dir() and colmap.is_model(path):
         return colmap.read_colmap(path).model
-    if path.is_dir() or path.suffix in _BAGS:
+    if path.is_dir() or path.suffix in SUFFIXES:
         return of_recording(path, choice, progress)
     if bundler.is_bundler(path):
         scene = bundler.read_bundler(path)

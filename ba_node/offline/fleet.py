@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from ba_node import __version__
+from ba_node.io.bag_files import PACKED, STORAGES
 
 # A task is begun so many times before its recording is given up: it may be what kills workers.
 _TRIES = 3
@@ -188,7 +189,7 @@ def expand(places: Sequence[str]) -> list[str]:
 def name_of(place: str) -> str:
     """Return the last part of a path or URL, without what its kind adds."""
     name = Path(urlsplit(place).path if is_url(place) else place).resolve().name
-    for end in (".zstd", ".mcap", ".db3"):
+    for end in (PACKED, *STORAGES):
         name = name.removesuffix(end)
     return name or "recording"
 

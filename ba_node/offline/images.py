@@ -39,6 +39,7 @@ from ba_node.io.rig_file import read_rig
 from ba_node.measurements import CameraRig
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.rig import rig_from_infos
+from ba_node.messages.topics import IMAGE_TYPES, INPUT_TYPES
 from ba_node.offline.rig import rig_of_recording, static_tree
 
 FOLDERS = {
@@ -49,8 +50,7 @@ FOLDERS = {
     "rgbd": (("rgb", "color"), ("depth",)),
 }
 PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
-_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_INFO, _RIG = "sensor_msgs/msg/CameraInfo", "ba_msgs/msg/CameraRig"
+_INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _BEGIN_NS = 1_000_000_000
@@ -124,7 +124,7 @@ def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str,
 
 def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:
     """Return the topic of each image of a mode: by what the user says, by names, or the only ones there."""
-    found = sorted(topic for topic, kind in reader.topics.items() if kind in _TYPES)
+    found = sorted(topic for topic, kind in reader.topics.items() if kind in IMAGE_TYPES)
     given = {name: absolute(topic) for name, topic in request.topics.items() if name != "odometry"}
     for name, topic in given.items():
         if topic not in found:

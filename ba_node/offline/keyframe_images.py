@@ -14,8 +14,8 @@ from ba_node.front_end.images import grey_of
 from ba_node.front_end.records import FrontEndError
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import BagError
+from ba_node.messages.topics import IMAGE_TYPES
 
-IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # Images are looked for in no more than this of a recording.
 _MAX_BYTES = 2**31
 

@@ -23,7 +23,6 @@ from ba_node.messages.topics import INPUT_TYPES, TF_STATIC
 from ba_node.offline.rig import static_tree
 
 TRUTH_TYPE = "geometry_msgs/msg/PoseStamped"
-# A day at 10 Hz: more is no list of poses of keyframes.
 
 
 def record(

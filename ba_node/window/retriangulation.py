@@ -100,7 +100,7 @@ def _place_roughly(scene: Scene, config: Config) -> None:
 
 def _rough(problem: Problem, usual_m: float, kernels: str) -> FloatArray:
     """Return where rays come nearest to each other, (n_pt, 3), or so far along their mean where that tells no place."""
-    rays, n = triangulation.rays_of(problem), problem.n_points
+    rays, n = triangulation.rays_of(problem, kernels), problem.n_points
     points = triangulation.triangulate(rays, n, kernels).points
     start = problem.start
     state = State(start.rotation, start.translation, np.nan_to_num(points), start.intrinsics)

@@ -49,7 +49,7 @@ from ba_node.messages.cdr import tf_message
 from ba_node.messages.conversion import InputMessages
 from ba_node.messages.factory import ConversionError, header_message, pose_message, stamp_ns_from_message
 from ba_node.messages.rig import rig_from_infos
-from ba_node.messages.topics import INPUT_TYPES, TF, TF_STATIC, TOPICS
+from ba_node.messages.topics import IMAGE_TYPES, INPUT_TYPES, TF, TF_STATIC, TOPICS
 from ba_node.messages.transforms import StaticTree
 from ba_node.ros import qos
 from ba_node.ros.log import Severity, Throttle, log
@@ -59,7 +59,7 @@ from ba_node.ros.rclpy_compat.lifecycle import ManagedNode
 from ba_node.ros.tools.adapter import PUBLISHED
 
 NODE_NAME = "ba_front_end"
-_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_IMAGE, _COMPRESSED = IMAGE_TYPES
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _LOOK_S, _LOG_S = 0.5, 5.0
 # Frames that wait for cameras, or for the odometry of their time.
