@@ -31,8 +31,6 @@ _TURNS = 4
 _ALIKE = 1.5
 # Angle by which cameras must be turned for all steps to point where the front-end's do.
 _BESIDE_DEG = 5.0
-# A relation takes the place of the best if this share of the tracks that agree with that agree with it.
-_AS_GOOD = 0.95
 # A hypothesis takes the place of what was given if it halves the angle.
 _BETTER = 0.5
 
@@ -42,10 +40,7 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     usable = [one for one in relations if one.has_direction]
     before = compare(tracks, usable)
     moving = before.length > 0.1 * np.median(before.length) if usable else np.zeros(0, bool)
-    far = before.off > _DOUBTFUL_DEG
-    usable = [
-        _nearer(tracks, one) if off else one for one, moves, off in zip(usable, moving, far, strict=True) if moves
-    ]
+    usable = [one for one, moves in zip(usable, moving, strict=True) if moves]
     if len(usable) < _PAIRS_NEEDED:
         return Diagnosis(
             untold=[f"too little parallax to compare poses with tracks ({len(usable)} pairs of keyframes)"]
@@ -64,17 +59,6 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             )
             return Diagnosis([finding(named, evidence)], rows=rows)
     return _by_turns(tracks, usable, now, rows) or _unnamed(tracks, usable, now, rows)
-
-
-def _nearer(tracks: Tracks, one: Relation) -> Relation:
-    """Return the relation that is found from the front-end's step on, if it explains the tracks as well.
-
-    Two relations explain the images of a plane, as of a wall beside the way (Longuet-Higgins, *The reconstruction of a
-    plane surface from two perspective projections*, 1986), and a few points off the plane hardly choose between them.
-    """
-    given = tracks.between_images(one.a, one.b)
-    other = one.at(two_view.refined(one.pair, given))
-    return other if other.share >= _AS_GOOD * one.share else one
 
 
 def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis | None:

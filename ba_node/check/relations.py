@@ -21,6 +21,10 @@ _KEYFRAMES = 20
 _MAX_RAYS = 800
 # Keyframes between the images of one camera that are tried, widest first.
 _GAPS = (8, 5, 3, 2, 1)
+# A relation that is this far off the front-end's step is looked at twice, degrees: another one may explain as much. It
+# takes its place if this share of the tracks that agree with that agree with it.
+_FAR_DEG = 15.0
+_AS_GOOD = 0.95
 # Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
 # is estimated, and nothing but the usual mistakes of placement is told.
 AGREED = 0.7
@@ -43,7 +47,10 @@ class Relation:
 
     def at(self, pose: Pose) -> Relation:
         """Return the same with another pose."""
-        return dataclasses.replace(self, pose=pose, share=two_view.share(self.pair, pose))
+        good = two_view.explained(self.pair, pose)
+        across = two_view.depths(self.pair, pose)[2][good]
+        parallax = float(np.median(across) / self.pair.gate) if len(across) else 0.0
+        return dataclasses.replace(self, pose=pose, share=float(good.mean()), parallax=parallax)
 
     @property
     def has_direction(self) -> bool:
@@ -58,9 +65,21 @@ def relate(tracks: Tracks, a: Image, b: Image, rows: tuple[IntArray, IntArray]) 
     pose = two_view.estimate(pair)
     if pose is None:
         return None
-    good = two_view.explained(pair, pose)
-    parallax = float(np.median(two_view.depths(pair, pose)[2][good]) / pair.gate)
-    return Relation(a, b, *rows, pair, pose, float(good.mean()), parallax)
+    found = Relation(a, b, *rows, pair, pose, 0.0, 0.0).at(pose)
+    return found if a[0] < 0 else _nearer(found, tracks.between_images(a, b))
+
+
+def _nearer(found: Relation, given: Pose) -> Relation:
+    """Return the relation that is found from the front-end's step on, if it explains the tracks as well.
+
+    Two relations explain the images of a plane, as of a wall beside the way (Longuet-Higgins, *The reconstruction of a
+    plane surface from two perspective projections*, 1986), and a few points off the plane hardly choose between them.
+    """
+    off = np.nan_to_num(given.direction_from(found.pose), nan=0.0) + 2.0 * given.turned_from(found.pose)
+    if off < _FAR_DEG or not np.linalg.norm(given.translation) > 0.0:
+        return found
+    other = found.at(two_view.refined(found.pair, given))
+    return other if other.share >= _AS_GOOD * found.share else found
 
 
 def rays(tracks: Tracks, rows: tuple[IntArray, IntArray]) -> Pair:

@@ -51,6 +51,8 @@ _FOCAL = 30.0
 # Values of sigma_px that are not looked at; the factor by which others are wrong, and the least noise of tracks, px.
 _USUAL_SIGMA_PX = (0.05, 5.0)
 _SIGMA_FACTOR, _LEAST_NOISE_PX = 8.0, 0.01
+# Smaller shifts of all disparities are not named, px.
+_LEAST_SHIFT_PX = 0.5
 # Sensible distances between keyframes, s; and units that stamps may have been taken for.
 _SPACING_S = (5e-4, 600.0)
 _STAMP_UNITS = ((1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds"))
@@ -176,11 +178,7 @@ def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: boo
         keyframes = sorted({one.b[0] for one in relations if one.b[1] == 0})
         if not any(len(tracks.match((k, 0), (k, camera))[0]) for k in keyframes):
             continue
-        pairs = _depth_pairs(tracks, relations, _stereo_depths(tracks, keyframes, camera, baseline, _PARALLAX))
-        if len(pairs) < _PAIRS:
-            # Points that are far tell no more than whether it is of the right size at all.
-            far = _depth_pairs(tracks, relations, _stereo_depths(tracks, keyframes, camera, baseline, 1.0))
-            pairs = far if len(far) >= _PAIRS and abs(_log_factor(far)) > np.log(_GROSS) else pairs
+        pairs = _stereo_pairs(tracks, relations, *_stereo_depths(tracks, keyframes, camera, baseline))
         if len(pairs) < _PAIRS:
             outcome.untold.append(f"too little parallax to compare the baseline of camera {camera} with steps")
             continue
@@ -194,18 +192,37 @@ def check_lengths(tracks: Tracks, relations: list[Relation], intrinsics_fit: boo
     return outcome
 
 
-def _stereo_depths(tracks: Tracks, keyframes: list[int], camera: int, baseline: Pose, least: float) -> FloatArray:
-    """Return the depth of each observation by two cameras, (n_obs,) m; NaN below a parallax, in gates, or for none."""
-    depth = np.full(len(tracks.keyframe), np.nan)
+def _stereo_depths(tracks: Tracks, keyframes: list[int], camera: int, baseline: Pose) -> tuple[FloatArray, FloatArray]:
+    """Return the depth of each observation by two cameras, and that at which it would have a parallax of one gate.
+
+    Both are (n_obs,) m; NaN where there is less parallax, or no second camera.
+    """
+    depth, reach = np.full((2, len(tracks.keyframe)), np.nan)
     for k in keyframes:
         rows = tracks.match((k, 0), (k, camera))
         if not len(rows[0]):
             continue
         pair = rays(tracks, rows)
         in_a, _, parallax = two_view.depths(pair, baseline)
-        good = two_view.explained(pair, baseline) & (parallax > least * pair.gate) & (in_a > 0.0)
+        good = two_view.explained(pair, baseline) & (parallax > pair.gate) & (in_a > 0.0)
         depth[rows[0][good]] = in_a[good]
-    return depth
+        reach[rows[0][good]] = (in_a * parallax)[good] / pair.gate
+    return depth, reach
+
+
+def _stereo_pairs(
+    tracks: Tracks, relations: list[Relation], depth: FloatArray, reach: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return depths by two cameras and by the front-end's steps, of points that are near enough.
+
+    Which are is not for the two cameras to say: of points at the limit those would be taken that noise brings nearer.
+    """
+    near = _depth_pairs(tracks, relations, np.where(_PARALLAX * depth < reach, depth, np.nan))
+    if len(near) < _PAIRS:
+        # Points that are far tell no more than whether it is of the right size at all.
+        far = _depth_pairs(tracks, relations, depth)
+        return far if len(far) >= _PAIRS and abs(_log_factor(far)) > np.log(_GROSS) else near
+    return _depth_pairs(tracks, relations, depth, reach / (_PARALLAX * np.exp(_log_factor(near))))
 
 
 def _log_factor(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
@@ -237,6 +254,8 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
 def _of_shift(tracks: Tracks, camera: int, turn: float) -> dict[str, str]:
     """Return what shifts all disparities by an angle (its tangent), and what to change."""
     px, degrees = turn * float(tracks.cameras.params[camera, 0]), float(np.degrees(np.arctan(turn)))
+    if px < _LEAST_SHIFT_PX:
+        return {}
     return {
         f"camera {camera} does not fit its place on the body by about {angle(degrees)}, towards camera 0 or away": (
             f"body_from_camera of camera {camera} in camera_rig (or tf_static)"
@@ -264,8 +283,13 @@ def _scale_of_steps(factor: float) -> str:
     return f"poses {_unit(1.0 / factor) or 'in another unit'}"
 
 
-def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Return given depths and those of the front-end's steps, m, for each pair of images with enough of them."""
+def _depth_pairs(
+    tracks: Tracks, relations: list[Relation], depth: FloatArray, most: FloatArray | None = None
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return given depths and those of the front-end's steps, m, for each pair of images with enough of them.
+
+    ``most`` (n_obs,) is how far a point may be by the steps, m.
+    """
     found = []
     for one in relations:
         length = float(np.linalg.norm(tracks.between_images(one.a, one.b).translation))
@@ -274,6 +298,8 @@ def _depth_pairs(tracks: Tracks, relations: list[Relation], depth: FloatArray) -
         _, in_b, parallax = two_view.depths(one.pair, Pose(one.pose.rotation, one.pose.translation * length))
         good = two_view.explained(one.pair, one.pose) & (parallax > _PARALLAX * one.pair.gate)
         good &= (depth[one.rows_b] > 0.0) & (in_b > 0.0)
+        if most is not None:
+            good &= in_b < most[one.rows_b]
         if np.count_nonzero(good) >= _POINTS:
             found.append((depth[one.rows_b][good], in_b[good]))
     return found

@@ -55,6 +55,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import geometry
@@ -299,10 +300,14 @@ def weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOpt
     system = kernels.damp("none", 0.0)
     if system.side != "points":
         return unknown
-    tangent = _inverses(system.diagonal_blocks()[0][-_NEWEST:])
+    blocks = system.diagonal_blocks()[0][-_NEWEST:]
     newest = np.flatnonzero(~problem.fixed)[-_NEWEST:]
-    # The body is at p = -R't, and moves by p x dphi - dt.
     _, position = geometry.inverse(state.rotation[newest], state.translation[newest])
+    if options.kernels != "numpy" and native.kernels is not None:
+        found: tuple[float, float] = native.kernels.loosest(blocks, position, 1.0 / _ROUNDING)
+        return found
+    tangent = _inverses(blocks)
+    # The body is at p = -R't, and moves by p x dphi - dt.
     moves = np.concatenate([geometry.hat(position), np.broadcast_to(-np.eye(3), (len(position), 3, 3))], axis=2)
     both = np.stack([moves @ tangent @ np.swapaxes(moves, 1, 2), tangent[:, :3, :3]])
     if not np.isfinite(both).all():

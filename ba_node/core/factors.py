@@ -92,10 +92,10 @@ class RelativePoses:
             if not np.isfinite(array.sum()):
                 bad = ~np.isfinite(array).reshape(n, -1).all(axis=1)
                 raise ProblemError(f"{name} of relative pose {int(np.argmax(bad))} is not finite")
-        turned = self.rotation @ np.swapaxes(self.rotation, 1, 2) - np.eye(3)
-        bad = np.abs(turned).max(axis=(1, 2)) > _ORTHONORMAL
-        if bad.any() or (n and np.linalg.det(self.rotation).min() < 0.0):
-            bad |= np.linalg.det(self.rotation) < 0.0
+        turned = np.abs(self.rotation @ np.swapaxes(self.rotation, 1, 2) - np.eye(3))
+        mirrored = np.linalg.det(self.rotation) < 0.0
+        if turned.max(initial=0.0) > _ORTHONORMAL or mirrored.any():
+            bad = mirrored | (turned.max(axis=(1, 2)) > _ORTHONORMAL)
             raise ProblemError(f"rotation of relative pose {int(np.argmax(bad))} is no rotation: expected R R' = I")
         same = self.keyframes[:, 0] == self.keyframes[:, 1]
         if same.any():

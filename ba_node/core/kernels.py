@@ -39,9 +39,13 @@ class LinearSolver(NamedTuple):
 class System(Protocol):
     """A damped system ``S x = rhs`` after elimination of the points, of the keyframes, or of nothing."""
 
-    rhs: FloatArray  # (n,) right-hand side
+    unknowns: int  # n
     side: str  # what was eliminated: points, cameras or none
     radius_factor: float  # by what the radius of a trust region is multiplied on this side
+
+    @property
+    def rhs(self) -> FloatArray:
+        """Return the right-hand side, (n,)."""
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one.

@@ -86,11 +86,14 @@ class NativeKernels:
         # Where steps lead, in turn: the state that a step starts from is one of them.
         self._states = [_like(problem.start), _like(problem.start)]
         self._stepped: StepResult | None = None
+        # Where the last step began, until something is linearised: what was kept there has been written over.
+        self._left: State | None = None
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
         stepped, self._stepped, self._two_level.state = self._stepped, None, state
-        # The inner iterations have seen all of it where they ended.
+        self._left = None
+        # The step has seen all of it where it ended.
         if stepped is not None and state is stepped.state and self._kernel.linearise_prepared():
             value = stepped.objective
         else:
@@ -104,15 +107,23 @@ class NativeKernels:
 
     def gradient(self) -> FloatArray:
         """Return the keyframes' part of the gradient, (n_free, d)."""
+        self._return()
         return self._kernel.gradient()
 
     def diagonals(self, *, of_points: bool = True) -> tuple[FloatArray, FloatArray]:
         """Return diag(B) (n_free, d) and diag(C) (n_points, 3), or (0, 3) unless that is wanted too."""
+        self._return()
         d_c, d_p = self._kernel.diagonals(of_points)
         return d_c, d_p
 
+    def _return(self) -> None:
+        """Linearise once more where the last step began, if it was not taken."""
+        if self._left is not None:
+            self.linearise(self._left)
+
     def reduce(self, damping_c: FloatArray, damping_p: FloatArray) -> NativeSystem:
         """Add damping to the diagonals and eliminate the points."""
+        self._return()
         self._kernel.factor(damping_c, damping_p)
         return self._system.renew()
 
@@ -121,18 +132,20 @@ class NativeKernels:
         if kind == "inc":
             d_c, d_p = scaling.diagonals(kind, self.diagonals())
             return self.reduce(mu * d_c, mu * d_p)
+        self._return()
         self._kernel.damp(kind == "diag", 0.0 if kind == "none" else mu)
         return self._system.renew()
 
     def step(self, state: State, _system: System, x: FloatArray, inner_iterations: int) -> StepResult:
         """Take the step whose part in the system is x, and the inner iterations after it; see Kernels."""
         target = self._states[self._states[0] is state]
+        self._left = state
         predicted, damping, value, inner = self._kernel.step(state, x, inner_iterations, target)
         if self._factors is not None and np.isfinite(value):
             factors = self._factors.value(target)
             value, inner = value + factors, inner + factors
         stepped = StepResult(target, predicted, damping, value, inner)
-        self._stepped = stepped if inner_iterations and np.isfinite(inner) else None
+        self._stepped = stepped if np.isfinite(inner) else None
         return stepped
 
     def objective(self, state: State) -> float:
@@ -142,7 +155,6 @@ class NativeKernels:
 
     def iterate_points(self, state: State, iterations: int) -> tuple[float, State]:
         """Improve every point alone by up to so many damped Newton steps; return the objective and the state."""
-        self._stepped = None
         _before, value, points = self._kernel.inner_iterations(state, iterations)
         value += self._value_of_factors(state)
         return value, State(state.rotation, state.translation, points, state.intrinsics)
@@ -166,21 +178,30 @@ class NativeSystem:
     def __init__(self, kernel: Kernel, size: int, two_level: TwoLevel) -> None:
         self._kernel, self._size, self._two_level = kernel, size, two_level
         n = kernel.n_free * size
-        self.rhs: FloatArray = np.empty(n)
+        self.unknowns: int = n
         self.product = kernel.product
-        # These are written in every iteration; S only where it is asked for.
-        self._x, self._dense = np.empty(n), np.empty((0, 0))
+        # These are written in every iteration; right-hand side and S only where they are asked for.
+        self._x, self._rhs, self._dense = np.empty(n), np.empty(n), np.empty((0, 0))
+        self._has_rhs = False
         # S, and where its blocks on and above the diagonal go, and their transposes, -1 for those of the diagonal.
         self._sparse: tuple[scipy.sparse.bsr_matrix, IntArray, IntArray] | None = None
 
     def renew(self) -> NativeSystem:
         """Return the system after another reduction."""
-        self._kernel.rhs(self.rhs)
+        self._has_rhs = False
         return self
+
+    @property
+    def rhs(self) -> FloatArray:
+        """Return the right-hand side, (n,)."""
+        if not self._has_rhs:
+            self._kernel.rhs(self._rhs)
+            self._has_rhs = True
+        return self._rhs
 
     def dense(self) -> FloatArray:
         """Return S, (n, n); the next call writes over it."""
-        n = len(self.rhs)
+        n = self.unknowns
         if len(self._dense) != n:
             self._dense = np.empty((n, n))
         self._kernel.dense(self._dense)
@@ -194,7 +215,7 @@ class NativeSystem:
         """Return S, block-sparse; the next call writes over it."""
         if self._sparse is None:
             columns, starts = self._kernel.schur_pattern()
-            n, rows = len(self.rhs), np.repeat(np.arange(self._kernel.n_free), np.diff(starts))
+            n, rows = self.unknowns, np.repeat(np.arange(self._kernel.n_free), np.diff(starts))
             above = np.flatnonzero(rows != columns)
             all_rows, all_columns = np.concatenate([rows, columns[above]]), np.concatenate([columns, rows[above]])
             order = np.lexsort((all_columns, all_rows))
@@ -211,7 +232,7 @@ class NativeSystem:
     def sizes(self) -> Sizes:
         """Return what each linear solver would have to do."""
         edges, pairs = self._kernel.pairs()
-        return Sizes(len(self.rhs), self._size, edges, pairs)
+        return Sizes(self.unknowns, self._size, edges, pairs)
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
@@ -219,7 +240,7 @@ class NativeSystem:
         if asked == "pcg":
             return self._pcg(sizes)
         if asked == "dense":
-            return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), None, None))
+            return LinearSolver(asked, linear_costs.describe(asked, self.unknowns, None, None))
         exact = asked == "cholesky"
         limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=exact)
         factor = self.factor_size(linear_costs.max_blocks(sizes.block), limit)
@@ -227,8 +248,8 @@ class NativeSystem:
             asked = linear_costs.cheapest(sizes, factor, exact=exact)
         if asked == "pcg":
             return self._pcg(sizes)
-        formed = "two_level" if asked == "sparse" and len(self.rhs) > DENSE_LIMIT else "schur_block"
-        return LinearSolver(asked, linear_costs.describe(asked, len(self.rhs), sizes, factor), formed)
+        formed = "two_level" if asked == "sparse" and self.unknowns > DENSE_LIMIT else "schur_block"
+        return LinearSolver(asked, linear_costs.describe(asked, self.unknowns, sizes, factor), formed)
 
     def _pcg(self, sizes: Sizes) -> LinearSolver:
         text = linear_costs.describe("pcg", sizes.unknowns, None, None)

@@ -146,6 +146,7 @@ class NumpySystem:
         self._linearisation = linearisation
         self.two_level: TwoLevel
         self.rhs: FloatArray = reduction.rhs
+        self.unknowns = len(self.rhs)
         self.side = reduction.side
         self.dense, self.gather = reduction.dense, reduction.gather
         self.diagonal_blocks, self.own_blocks = reduction.diagonal_blocks, reduction.own_blocks

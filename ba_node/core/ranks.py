@@ -176,6 +176,7 @@ class RankSystem:
     def __init__(self, local: System, communicator: Communicator, two_level: TwoLevel, factor: SumFactor) -> None:
         self.local, self._communicator, self._two_level, self._factor = local, communicator, two_level, factor
         self.rhs: FloatArray = communicator.sum(local.rhs)
+        self.unknowns = len(self.rhs)
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one: dense while S is small, else by products with S."""

@@ -52,7 +52,7 @@ class ReducedSolver:
 
         The radius is in the scaled space, infinite for none.
         """
-        if len(system.rhs) == 0:
+        if system.unknowns == 0:
             return linear.Solution(np.zeros(0))
         if self._tries is None:
             self._tries = self._worth_trying(system)
@@ -74,7 +74,7 @@ class ReducedSolver:
         if self._preconditioner == "two_level":
             t_eps, q_eps = min(t_eps, _NEARLY), min(q_eps, _NEARLY)
         limits = linear.PcgLimits(t_eps, options.max_linear_iterations, radius, q_eps)
-        return self._pcg(system, hessian, limits, self._preconditioner, formed=len(system.rhs) <= DENSE_LIMIT)
+        return self._pcg(system, hessian, limits, self._preconditioner, formed=system.unknowns <= DENSE_LIMIT)
 
     def _share_inside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> float:
         """Return the share of a step that lies inside the region, 1 if all of it does."""
@@ -89,7 +89,7 @@ class ReducedSolver:
         options = self._options
         tries = system.pcg_tries() if options.linear_solver == "auto" else 0
         if tries:
-            self.text = f"PCG ({len(system.rhs)} unknowns), as long as less than {tries} steps do"
+            self.text = f"PCG ({system.unknowns} unknowns), as long as less than {tries} steps do"
         return tries
 
     def _try(self, system: System, hessian: Hessian, steps: int, radius: float) -> linear.Solution:

@@ -130,8 +130,9 @@ class _SummedSystem(NativeSystem):
 
     def __init__(self, system: NativeSystem, spread: scipy.sparse.csr_matrix, damping_z: FloatArray) -> None:
         self._of, self._spread = system, spread
-        self.rhs = np.asarray(spread.T @ system.rhs)
-        self._damping = np.concatenate([np.zeros(len(self.rhs) - len(damping_z)), damping_z])
+        self._rhs, self._has_rhs = np.asarray(spread.T @ system.rhs), True
+        self.unknowns = len(self._rhs)
+        self._damping = np.concatenate([np.zeros(self.unknowns - len(damping_z)), damping_z])
 
     def dense(self) -> FloatArray:
         """Return the summed system, (n, n)."""
@@ -146,7 +147,7 @@ class _SummedSystem(NativeSystem):
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one."""
-        return exact_solver(asked, len(self.rhs))
+        return exact_solver(asked, self.unknowns)
 
     def pcg_tries(self) -> int:
         """Try no steps of PCG."""

@@ -73,10 +73,8 @@ def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
     """
     obs, cams = problem.observations, problem.cameras
     if kernels != "numpy" and native.kernels is not None:
-        seen = np.empty(0)
-        if (cams.model == cameras.Model.EQUIDISTANT).any() or cams.params[:, cameras.DISTORTION].any():
-            seen = cameras.rays(obs.uv, cams.model.take(obs.camera), cams.params.take(obs.camera, axis=0))
-        turned, all_good = native.kernels.rays(problem, seen)
+        found = native.kernels.rays(problem, np.empty(0)) or native.kernels.rays(problem, rays_in_cameras(problem))
+        turned, all_good = found
         rays = Rays(obs.point, *turned)
         return rays if all_good else rays.part(np.isfinite(rays.direction[:, 2]))
     # Camera centre: x with R x + t = -Rc' tc.
@@ -97,6 +95,16 @@ def rays_of(problem: Problem, kernels: str = "auto") -> Rays:
     rays = Rays(obs.point, *columns)
     good = np.isfinite(rays.direction[:, 2])
     return rays if good.all() else rays.part(good)
+
+
+def rays_in_cameras(problem: Problem, rows: IntArray | slice = slice(None)) -> FloatArray:
+    """Return the rays of some observations, all by default, as unit vectors in their cameras, (n, 3).
+
+    The C++ kernels have those of cameras without distortion themselves.
+    """
+    obs, cams = problem.observations, problem.cameras
+    camera = obs.camera[rows]
+    return cameras.rays(obs.uv[rows], cams.model.take(camera), cams.params.take(camera, axis=0))
 
 
 def _columns(problem: Problem, centres: FloatArray, rows: slice) -> tuple[FloatArray, ...]:

@@ -181,11 +181,16 @@ def take(
 ) -> tuple[Ints, Ints, Ints, Doubles, Doubles, Doubles, Doubles]:
     """Return the columns of core.problem.Observations at some rows, renumbered by what is not empty."""
 
-def rays(problem: Problem, seen: Doubles) -> tuple[tuple[Doubles, Doubles, Doubles, Doubles, Doubles], bool]:
+def rays(problem: Problem, seen: Doubles) -> tuple[tuple[Doubles, Doubles, Doubles, Doubles, Doubles], bool] | None:
     """Return the columns of core.triangulation.Rays but the first, and whether all observations have a ray.
 
-    seen: (n_obs, 3) unit vectors in the cameras, or (0,) for cameras without distortion.
+    seen: (n_obs, 3) unit vectors in the cameras, or (0,) for cameras without distortion; None if one has some.
     """
+
+def agreed(
+    rays: Rays, n_points: int, gate: float, limits: tuple[float, float, float, float]
+) -> tuple[Doubles, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the fields of window.initial_points.Agreed; limits: least parallax (rad), and constants there."""
 
 def determined(
     observations: object,
@@ -203,3 +208,22 @@ def move_more_than_noise(
     observations: object, norms: Doubles, off: Doubles, n_points: int, limits: tuple[float, float, float, int, float]
 ) -> NDArray[np.bool_]:
     """Return which points move, see window.moving; limits are the first five constants there."""
+
+def explained(
+    problem: Problem,
+    views: tuple[Ints, Ints, Doubles],
+    tracks: tuple[int, int],
+    poses: tuple[Doubles, Doubles, Doubles, Doubles],
+    limits: tuple[float, float, float, int, int],
+) -> tuple[Doubles, Doubles, float, Doubles] | None:
+    """Return the fields of window.trial.Explained; None as of rays.
+
+    views: rows, the track of each, and seen, as of rays. tracks: how many, and how many took no part. poses: two sets.
+    limits: constants of window.trial.
+    """
+
+def is_sound(problem: Problem) -> bool:
+    """Return whether indices are in range, observations sorted, numbers finite, sigmas positive."""
+
+def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, float]:
+    """Return what core.covariance.weakest does, of blocks (n, 6, 6) of S and positions (n, 3)."""

@@ -32,6 +32,8 @@ _SYMMETRIC = 1e-6
 _STRANGE_M = 1e7
 # Variances below this, m^2 and rad^2, are a mistake: nothing is measured to 1e-12.
 _LEAST_VARIANCE = 1e-24
+# How many times the smallest the largest may be, for the inverse to hold both.
+_MOST_RATIO = 1e12
 # Absolute measurements that are kept, the newest: keyframes may never come.
 _MOST = 200_000
 
@@ -324,15 +326,22 @@ def _pose(name: str, position: FloatArray, orientation: FloatArray, log: Rejecti
 
 
 def positive_covariance(name: str, values: FloatArray, size: int, log: RejectionLog) -> FloatArray | None:
-    """Return a covariance (size, size), or None (counted) if it is not positive definite, or its inverse no number."""
+    """Return a covariance (size, size), or None (counted) if it is not positive definite, or its inverse no number.
+
+    Variances so large that they say "not known" are lowered to what still says so, and can be inverted.
+    """
     if np.size(values) != size * size:
         log.reject("bad_covariance", f"{name}: {np.size(values)} numbers, expected {size * size}")
         return None
     matrix = np.asarray(values, float).reshape(size, size)
     if np.isfinite(matrix).all() and np.abs(matrix - matrix.T).max() <= _SYMMETRIC * np.abs(matrix).max():
-        lowest = float(np.linalg.eigvalsh(matrix).min())
+        variances, axes = np.linalg.eigh(0.5 * matrix + 0.5 * matrix.T)
+        lowest, most = float(variances[0]), _MOST_RATIO * float(variances[0])
         if lowest > _LEAST_VARIANCE:
-            return np.asarray(0.5 * (matrix + matrix.T))
+            if variances[-1] <= most:
+                return np.asarray(0.5 * (matrix + matrix.T))
+            scaled = axes * np.sqrt(np.minimum(variances, most))
+            return np.asarray(scaled @ scaled.T)
         log.reject("bad_covariance", f"{name}: lowest eigenvalue {lowest:g}, expected > {_LEAST_VARIANCE:g}")
         return None
     log.reject("bad_covariance", f"{name}: {matrix.tolist()}, expected finite and symmetric")

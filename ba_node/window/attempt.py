@@ -71,7 +71,7 @@ def attempt(
         if isinstance(selection, str):
             return selection
         options = methods.from_config(config.solver)
-        problem = _begun(selection.problem, selection.norms[selection.inlier], options)
+        problem = _begun(selection.problem, selection.norms.take(selection.used), options)
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True)
         solve_time_s += clock() - began

@@ -16,6 +16,7 @@ import dataclasses
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import TracksConfig
 from ba_node.core import consensus, loss, native_kernels, triangulation
@@ -115,13 +116,17 @@ def agreed_points(problem: Problem, config: TracksConfig, gate: float, kernels: 
 
 
 def _agreed(rays: triangulation.Rays, n: int, config: TracksConfig, gate: float, kernels: str) -> Agreed:
+    min_parallax_rad = float(np.deg2rad(config.min_parallax_deg))
+    if kernels != "numpy" and native.kernels is not None:
+        limits = min_parallax_rad, _LEAST_PARALLAX, _TWO_VIEWS, _LEAST_SUPPORT
+        return Agreed(*native.kernels.agreed(rays, n, gate, limits))
     found, agrees = consensus.triangulate(rays, n, gate, kernels)
     point = rays.point[agrees]
     views, support = np.bincount(rays.point, minlength=n), np.bincount(point, minlength=n)
     sharpness, worst = np.zeros(n), np.zeros(n)
     np.maximum.at(sharpness, point, rays.px_per_rad[agrees])
     np.maximum.at(worst, point, triangulation.errors(rays, found.points)[agrees])
-    wide = found.parallax_rad >= np.deg2rad(config.min_parallax_deg)
+    wide = found.parallax_rad >= min_parallax_rad
     wide &= found.parallax_rad * sharpness >= _LEAST_PARALLAX
     fits = worst <= gate * np.where(support > 2, 1.0, _TWO_VIEWS)
     good = ((wide & (support >= 2)) | found.measured) & fits & (support > _LEAST_SUPPORT * views)

@@ -62,7 +62,7 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
     Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
     far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
     """
-    explained = selection.trial(kernels).explained(selection.measured, (state.rotation, state.translation))
+    explained = selection.explained(state, kernels)
     found = explained.points
     if len(found):
         points, aside = state.points.copy(), selection.tried[: len(found)]
@@ -195,7 +195,7 @@ def classify(
     obs, n_points, outlier_px = selection.observations, selection.problem.n_points, tracks.outlier_px
     whole = dataclasses.replace(selection.problem, observations=obs, start=state)
     # What was left out of the solve tells nothing about how good it is.
-    gate = widened(outlier_px, norm[selection.inlier]) if outlier_px > 0 else np.inf
+    gate = widened(outlier_px, norm.take(selection.used)) if outlier_px > 0 else np.inf
     outlier = norm > gate
     if outlier_px > 0:
         _place_anew(scene, selection, whole, (norm, outlier), tracks, kernels)

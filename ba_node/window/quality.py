@@ -33,8 +33,10 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
 
     One that is farther off than ``BOUND_PX`` counts as that: a point in the plane of a camera is anywhere.
     """
-    error = norms[selection.inlier] * selection.observations.sigma_px[selection.inlier]
-    error = np.minimum(error[np.isfinite(error)], BOUND_PX)
+    error = norms.take(selection.used) * selection.observations.sigma_px.take(selection.used)
+    if not np.isfinite(error).all():
+        error = error[np.isfinite(error)]
+    error = np.minimum(error, BOUND_PX)
     return float(np.sqrt(np.mean(error * error) / 2.0)) if len(error) else 0.0
 
 

@@ -27,7 +27,7 @@ _LEAST_KEYFRAMES = 2
 _MISPLACED = 0.15
 # How many gates off the other point is where the track goes over to it.
 _JUMP = 4.0
-# The share of a run that has to agree.
+# The share of a run that has to agree within itself, and of its views that do not fit the point.
 _AGREEING = 0.75
 # So many, and such a share of all tracks, are no accident of matching.
 _WARN_COUNT = 20
@@ -105,6 +105,9 @@ def _cut(whole: Problem, rows: IntArray, norm: FloatArray, limits: tuple[float, 
     other = good[track] & (in_later == later_wrong[track])
     keyframes = _keyframes_of(track[other], obs.keyframe[rows[other]], len(begin))
     good &= keyframes >= _LEAST_KEYFRAMES
+    # One mismatch among few views that fit is no other point.
+    views, unfit = (np.bincount(track, one, len(begin)) for one in (other, other & wrong))
+    good &= unfit >= _AGREEING * views
     return rows[best[good]], rows[other & good[track]]
 
 

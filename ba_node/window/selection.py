@@ -23,7 +23,7 @@ import numpy as np
 from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
 from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
-from ba_node.core.problem import KeyframeFactors, Observations, Problem
+from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, gauge, moving, odometry, old_keyframes, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
@@ -70,13 +70,19 @@ class Selection:
     beside: tuple[KeyframeFactors, ...] = ()  # factors of the problem that are no steps of the front-end
 
     @cached_property
+    def used(self) -> IntArray:
+        """Return which of all observations are in the problem, in its order."""
+        return np.flatnonzero(self.inlier)
+
+    @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
         return dataclasses.replace(self.problem, observations=self.observations)
 
-    def trial(self, backend: str) -> trial.Trial:
-        """Return the tracks that poses are tried on."""
-        return trial.Trial(self.whole, self.tried, int(np.count_nonzero(self.held_out)), backend)
+    def explained(self, state: State, kernels: str) -> trial.Explained:
+        """Return how well the front-end's poses and those of a solution explain the tracks that they are tried on."""
+        tracks = self.tried, int(np.count_nonzero(self.held_out))
+        return trial.explained(self.whole, tracks, self.measured, (state.rotation, state.translation), kernels)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import FloatArray, IdArray, IntArray, ranges
 from ba_node.core import native_kernels, triangulation
 from ba_node.core.cameras import FX, FY, rays
@@ -72,17 +73,40 @@ class Explained:
             return np.flatnonzero(self.mean[1] > (1.0 + share) * self.mean[0] + _SLACK)
 
 
-class Trial:
+# Rotation (n_kf, 3, 3) and translation (n_kf, 3) m of body from world.
+Poses = tuple[FloatArray, FloatArray]
+
+
+def explained(
+    problem: Problem, tracks: tuple[IntArray, int], before: Poses, after: Poses, kernels: str = "auto"
+) -> Explained:
+    """Return how well two sets of poses explain some tracks of a problem, by their points.
+
+    ``tracks`` are these points, and how many of them, the first ones, took no part in the solve.
+    """
+    tried, n_out = tracks
+    # Observations are sorted by point.
+    begin, end = (np.searchsorted(problem.observations.point, tried, side) for side in ("left", "right"))
+    rows, track = ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin)
+    if kernels == "numpy" or native.kernels is None:
+        return _Trial(problem, rows, track, (len(tried), n_out)).explained(before, after)
+    limits = MIN_PARALLAX, _BOUND, _BEHIND, _MIN_VIEWS, _MIN_RESIDUALS
+    others = (len(tried), n_out), (*before, *after), limits
+    found = native.kernels.explained(problem, (rows, track, np.empty(0)), *others)
+    found = found or native.kernels.explained(
+        problem, (rows, track, triangulation.rays_in_cameras(problem, rows)), *others
+    )
+    return Explained(*found)
+
+
+class _Trial:
     """Some tracks of a problem, to be tried with two sets of poses at once: each view stands in all arrays twice."""
 
-    def __init__(self, problem: Problem, tried: IntArray, n_out: int, kernels: str = "auto") -> None:
-        """Take the views of the tracks ``tried`` out of a problem; the first ``n_out`` of them took no part."""
-        self._problem, self._kernels = problem, kernels
-        self._n_cam, self._n_tried, self._n_out = len(problem.cameras.model), len(tried), n_out
-        obs = problem.observations
-        # Observations are sorted by point.
-        begin, end = (np.searchsorted(obs.point, tried, side) for side in ("left", "right"))
-        self._rays(obs, ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin))
+    def __init__(self, problem: Problem, rows: IntArray, track: IntArray, sizes: tuple[int, int]) -> None:
+        """Take the views ``rows`` out of a problem, each of a ``track``; see :func:`explained`."""
+        self._problem = problem
+        self._n_cam, (self._n_tried, self._n_out) = len(problem.cameras.model), sizes
+        self._rays(problem.observations, rows, track)
 
     def _rays(self, obs: Observations, rows: IntArray, group: IntArray) -> None:
         """Keep the rays of some observations, in the body, and to which track each belongs."""
@@ -128,8 +152,8 @@ class Trial:
         self._px_per_rad = np.tile(px_per_rad, 2)
         self._image = _twice(keyframe * self._n_cam + camera, n_kf * self._n_cam)
 
-    def explained(self, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]) -> Explained:
-        """Return how well two sets of poses explain the tracks: (n_kf, 3, 3) and (n_kf, 3) body from world, m."""
+    def explained(self, before: Poses, after: Poses) -> Explained:
+        """Return how well two sets of poses explain the tracks."""
         points, parallax, norms = self._tried(*(np.concatenate(pair) for pair in zip(before, after, strict=True)))
         # Rays that are parallel by either set meet anywhere.
         wide = (parallax > MIN_PARALLAX * self._noise_rad).all(axis=0)
@@ -160,10 +184,10 @@ class Trial:
             nan,
             nan,
         )
-        found = triangulation.triangulate(seen, 2 * self._n_groups, self._kernels)
+        found = triangulation.triangulate(seen, 2 * self._n_groups, "numpy")
         state = State(rotation, translation, np.nan_to_num(found.points), np.empty((0, 3)))
         problem = Problem(state, np.zeros(len(rotation), bool), self._problem.cameras, self._obs)
-        norms = native_kernels.residual_norms(problem, state, self._kernels)
+        norms = native_kernels.residual_norms(problem, state, "numpy")
         return found.points.reshape(2, -1, 3), found.parallax_rad.reshape(2, -1), norms.reshape(2, -1)
 
 

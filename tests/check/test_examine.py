@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from ba_node.check.examine import examine
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
+from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.synthetic.world import Path, World
 from experiments.robustness.faults import spoiled
 from tests.check.set_ups import recording, seen
 from tests.window.street import round_trip
@@ -158,6 +161,59 @@ def test_a_wall_beside_the_way_is_no_contradiction(keyframes: int) -> None:
     drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.01, "outlier_share": 0.01}
     data = recording(2, mode="mono", path="line", length_m=52.0, look_deg=-60.0, **drift)  # type: ignore[arg-type]
     assert not examine(seen(data, keyframes)).findings
+
+
+@pytest.mark.parametrize(
+    ("seed", "keyframes", "options"),
+    [
+        (143, 25, {"landmarks": 5000, "drift_rotation_deg": 0.8, "track_loss": 0.15}),
+        (170, 40, {"landmarks": 1500, "drift_translation": 0.06, "tracks": 200, "fov_deg": 60.0, "keyframes": 45}),
+    ],
+)
+def test_ids_are_not_told_by_the_other_relation_of_a_plane(
+    seed: int, keyframes: int, options: dict[str, object]
+) -> None:
+    """Images far apart that see a wall seemed to agree on half of their tracks: by the wrong one of two relations."""
+    usual = {"path": "line", "length_m": 10.0, "look_deg": -90.0, "noise_px": 0.3, "outlier_share": 0.01, "tracks": 120}
+    drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.02}
+    data = recording(seed, mode="mono", **(usual | drift | options))  # type: ignore[arg-type]
+    found = examine(seen(data, keyframes))
+    assert not found.findings, found.summary()
+
+
+def over_a_floor(_world: World, path: Path) -> tuple[World, Path]:
+    rng, n = np.random.default_rng(6), 12_000
+    points = np.zeros((n, 3))
+    points[:, :2] = rng.uniform(path.position.min(axis=0)[:2] - 15.0, path.position.max(axis=0)[:2] + 15.0, (n, 2))
+    return World(points, np.tile([0.0, 0.0, 1.0], (n, 1)), np.full((1, 2, 3), -1e4)), path
+
+
+@pytest.mark.parametrize("keyframes", [25, 40, 60])
+def test_a_floor_does_not_tell_a_wrong_baseline(keyframes: int) -> None:
+    """By the wrong one of two relations the baseline seemed to be 1.4 times what the steps tell."""
+    options = SyntheticOptions(
+        seed=123, keyframes=60, path="line", length_m=18.0, look_deg=-45.0, tracks=200, noise_px=0.3,
+        outlier_share=0.1, drift_rotation_deg=0.05, drift_translation=0.06,
+    )  # fmt: skip
+    found = examine(seen(generate(options, over_a_floor), keyframes))
+    assert not found.findings, found.summary()
+
+
+@pytest.mark.parametrize(
+    ("seed", "options"),
+    [
+        (1010, {"keyframes": 45, "length_m": 22.5, "look_deg": 60.0, "noise_px": 0.5, "tracks": 200}),
+        (118, {"keyframes": 30, "length_m": 10.0, "distortion": "equidistant", "noise_px": 0.3, "tracks": 120}),
+    ],
+)
+def test_points_at_the_limit_of_two_cameras_do_not_shorten_the_baseline(seed: int, options: dict[str, Any]) -> None:
+    """Those that noise brought nearer were taken alone: the baseline seemed to be 6 % too short."""
+    drift: dict[str, Any] = {"drift_rotation_deg": 0.05, "drift_translation": 0.02}
+    data = recording(seed, path="line", outlier_share=0.01, track_loss=0.02, landmarks=2500, **drift, **options)
+    found = examine(seen(data))
+    assert not found.findings, found.summary()
+    told = next(row.hypothesis for row in found.rows if row.test == "lengths")
+    assert abs(float(told.rpartition(" ")[2]) - 1.0) < 0.025, told
 
 
 def test_same_tracks_give_the_same_numbers() -> None:

@@ -60,13 +60,38 @@ def test_native_linearises_where_inner_iterations_ended(
 
 
 @built
-def test_native_knows_once_where_inner_iterations_ended(make_problem: Make) -> None:
-    kernels = native_kernels.make(make_problem()[0], SolverOptions(kernels="native"))
+@pytest.mark.parametrize("inner_iterations", [0, 2])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_native_goes_back_where_a_step_was_not_taken(
+    shape: dict[str, object], inner_iterations: int, make_problem: Make
+) -> None:
+    """A step writes over what was kept where it began; that comes back to the bit if the step is rejected."""
+    problem = make_problem(start_error=0.02, **shape)[0]
+    kernels = native_kernels.make(problem, SolverOptions(kernels="native"))
+    value = kernels.linearise(problem.start)
+    system = kernels.damp("diag", 1e-2)
+    before = [system.dense().copy(), system.rhs.copy(), *kernels.diagonals(), kernels.gradient()]
+    step = system.solve_dense()
+    assert step is not None
+    kernels.step(problem.start, system, step, inner_iterations)
+    system = kernels.damp("diag", 1e-2)
+    after = [system.dense(), system.rhs, *kernels.diagonals(), kernels.gradient()]
+    for one, other in zip(after, before, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert kernels.linearise(problem.start) == value
+
+
+@built
+def test_native_knows_once_where_a_step_ended(make_problem: Make) -> None:
+    problem = make_problem()[0]
+    kernels = native_kernels.make(problem, SolverOptions(kernels="native"))
     assert isinstance(kernels, native_kernels.NativeKernels)
-    iterated = kernels.iterate_points(make_problem()[0].start, 2)[1]
+    kernels.linearise(problem.start)
+    system = kernels.damp("diag", 1e-2)
+    state = kernels.step(problem.start, system, np.zeros(system.unknowns), 2).state
     assert kernels._kernel.linearise_prepared()
     assert not kernels._kernel.linearise_prepared()
-    kernels.linearise(iterated)
+    kernels.linearise(state)
     assert not kernels._kernel.linearise_prepared()
 
 

@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 
 from ba_node import native
+from ba_node.arrays import take_rows
 from ba_node.config import Config
-from ba_node.core import triangulation
+from ba_node.core import geometry, triangulation
 from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
 from ba_node.scene.scene import Scene
 from ba_node.synthetic import SyntheticOptions, generate
-from ba_node.window import moving
-from ba_node.window.problems import determined, part_of, problem_of
+from ba_node.window import moving, trial
+from ba_node.window.initial_points import agreed_points
+from ba_node.window.problems import determined, part_of, problem_of, some_observations
 
 pytestmark = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
 
@@ -114,3 +116,70 @@ def test_what_moves_is_what_numpy_finds() -> None:
     compiled, plain = (moving._leaves_more_than_noise(problem, norms, off, kernels) for kernels in ("native", "numpy"))
     assert 20 < np.count_nonzero(plain) < problem.n_points - 20
     np.testing.assert_array_equal(compiled, plain)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("distorted", [False, True])
+def test_tracks_are_explained_as_numpy_does(cameras: int, distorted: bool) -> None:
+    problem, rng = window(), np.random.default_rng(8)
+    cams = problem.cameras
+    params = cams.params.copy()
+    if distorted:
+        params[:, DISTORTION][:, 0] = -0.02
+    cams = dataclasses.replace(cams, params=params)
+    problem = dataclasses.replace(problem, cameras=take_rows(cams, slice(cameras)))
+    obs = problem.observations
+    problem = some_observations(problem, np.flatnonzero(obs.camera < cameras))
+    tried = rng.permutation(np.flatnonzero(np.bincount(problem.observations.point) > 2))[:60]
+    poses = problem.start.rotation, problem.start.translation
+    off = poses[0], poses[1] + 0.02 * rng.normal(size=poses[1].shape)
+    compiled, plain = (trial.explained(problem, (tried, 9), off, poses, kernels) for kernels in ("native", "numpy"))
+    assert plain.mean.shape == (2, 1 + cameras)
+    assert np.isfinite(plain.mean[:, 0]).all()
+    assert abs(plain.mean[0, 0] - plain.mean[1, 0]) > 1e-3, "the poses differ"
+    for field in dataclasses.fields(plain):
+        np.testing.assert_allclose(
+            getattr(compiled, field.name), getattr(plain, field.name), rtol=1e-7, err_msg=field.name
+        )
+
+
+@pytest.mark.parametrize("depth_share", [0.0, 0.3])
+def test_places_that_views_agree_on_are_those_of_numpy(depth_share: float) -> None:
+    problem, tracks = window(depth_share), Config().tracks
+    compiled, plain = (agreed_points(problem, tracks, 30.0, kernels) for kernels in ("native", "numpy"))
+    assert 20 < np.count_nonzero(plain.good) < problem.n_points - 5
+    np.testing.assert_array_equal(compiled.good, plain.good)
+    np.testing.assert_array_equal(compiled.measured[plain.good], plain.measured[plain.good])
+    np.testing.assert_allclose(compiled.points[plain.good], plain.points[plain.good], rtol=1e-6)
+
+
+@pytest.mark.parametrize("singular", [False, True])
+def test_the_loosest_pose_is_that_of_numpy(singular: bool) -> None:
+    rng = np.random.default_rng(9)
+    root = rng.normal(size=(5, 6, 6)) * [1e3, 1e3, 1e3, 1.0, 1.0, 1.0]
+    blocks, position = np.swapaxes(root, 1, 2) @ root, rng.normal(size=(5, 3)) * 10.0
+    inverse = np.linalg.inv(blocks)
+    moves = np.concatenate([geometry.hat(position), np.broadcast_to(-np.eye(3), (5, 3, 3))], axis=2)
+    of_position = np.linalg.eigvalsh(moves @ inverse @ np.swapaxes(moves, 1, 2))[:, -1]
+    of_rotation = np.linalg.eigvalsh(inverse[:, :3, :3])[:, -1]
+    expected = (0.0, 0.0) if singular else np.sqrt([of_position.max(), of_rotation.max()])
+    if singular:
+        root[3, :, 2] = root[3, :, 4]
+        blocks = np.swapaxes(root, 1, 2) @ root
+    np.testing.assert_allclose(native.kernels.loosest(blocks, position, 1e11), expected, rtol=1e-6)
+
+
+def test_what_cannot_be_worked_with_is_not_sound() -> None:
+    problem = window()
+    problem.start.points[:] = 1e300
+    assert native.kernels.is_sound(problem)
+    for place in ("observations", "start", "cameras"):
+        record = getattr(problem, place)
+        for field in ("keyframe", "camera", "point", "uv", "sigma_px", "rotation", "translation", "points", "params"):
+            values = getattr(record, field, None)
+            if values is None or (place, field) in (("cameras", "rotation"), ("cameras", "translation")):
+                continue
+            wrong = values.copy()
+            wrong[len(wrong) // 2] = -1 if values.dtype.kind == "i" else np.nan
+            changed = dataclasses.replace(problem, **{place: dataclasses.replace(record, **{field: wrong})})
+            assert not native.kernels.is_sound(changed), f"{place}.{field}"

@@ -66,3 +66,15 @@ def test_ids_that_are_not_reused_are_left_alone(baseline_m: float) -> None:
     backend = replayed(measurement for _, _, measurement in data.timeline())
     assert backend.scene.log.notices["ids_reused"] <= 2
     assert "ids_reused" not in backend.scene.log.warnings
+
+
+@pytest.mark.parametrize("outlier_share", [0.05, 0.1])
+def test_a_mismatch_near_an_end_of_a_long_track_is_no_other_point(outlier_share: float) -> None:
+    """The views behind it fit the point; they were parted from it, and ids said to be used again."""
+    options = SyntheticOptions(
+        seed=89, keyframes=45, length_m=10.0, baseline_m=0.0, path="line", landmarks=1500, track_loss=0.02,
+        outlier_share=outlier_share, drift_rotation_deg=0.3, drift_translation=0.01,
+    )  # fmt: skip
+    backend = replayed(one for _, _, one in generate(options).timeline())
+    assert "ids_reused" not in backend.scene.log.warnings
+    assert backend.scene.log.notices.get("ids_reused", 0) <= 2

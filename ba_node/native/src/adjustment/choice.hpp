@@ -28,38 +28,47 @@ inline void turn_back(const double* a, const double* b, double* out) {
   for (int i = 0; i < 3; ++i) out[i] = a[i] * b[0] + a[3 + i] * b[1] + a[6 + i] * b[2];
 }
 
-// The rays of all observations at some poses; false if one of them has none. seen: (n_obs, 3) unit vectors in the
-// cameras, null for cameras without distortion.
-inline bool rays_of(const ProblemView& p, const StateView& s, const double* seen, const RaysSpan& out) {
-  std::vector<double> centres(3 * p.n_keyframes * p.n_cameras), focal(p.n_cameras);
+// The ray of a pixel of a camera without distortion, in the camera: a unit vector.
+inline void straight_ray(const double* params, const double* uv, double* ray) {
+  const double x = (uv[0] - params[2]) / params[0], y = (uv[1] - params[3]) / params[1];
+  const double length = std::sqrt(x * x + y * y + 1.0);
+  ray[0] = x / length;
+  ray[1] = y / length;
+  ray[2] = 1.0 / length;
+}
+
+// Where the cameras of each keyframe are: (n_keyframes, n_cameras, 3) m.
+inline std::vector<double> camera_centres(const ProblemView& p, const double* rotation, const double* translation) {
+  std::vector<double> centres(3 * p.n_keyframes * p.n_cameras);
   for (std::int64_t c = 0; c < p.n_cameras; ++c) {
     double body[3];
     turn_back(p.camera_rotation + 9 * c, p.camera_translation + 3 * c, body);
-    focal[c] = std::sqrt(p.params[kParams * c] * p.params[kParams * c + 1]);
     for (std::int64_t k = 0; k < p.n_keyframes; ++k) {
       double from[3];
-      for (int i = 0; i < 3; ++i) from[i] = -body[i] - s.translation[3 * k + i];
-      turn_back(s.rotation + 9 * k, from, centres.data() + 3 * (k * p.n_cameras + c));
+      for (int i = 0; i < 3; ++i) from[i] = -body[i] - translation[3 * k + i];
+      turn_back(rotation + 9 * k, from, centres.data() + 3 * (k * p.n_cameras + c));
     }
   }
+  return centres;
+}
+
+// The rays of all observations at some poses; false if one of them has none. seen: (n_obs, 3) unit vectors in the
+// cameras, null for cameras without distortion.
+inline bool rays_of(const ProblemView& p, const StateView& s, const double* seen, const RaysSpan& out) {
+  const std::vector<double> centres = camera_centres(p, s.rotation, s.translation);
   bool good = true;
   for (std::int64_t o = 0; o < p.n_obs; ++o) {
     const std::int64_t c = p.camera[o], k = p.keyframe[o];
+    const double* f = p.params + kParams * c;
     double ray[3], body[3];
-    if (seen != nullptr) {
+    if (seen != nullptr)
       std::copy_n(seen + 3 * o, 3, ray);
-    } else {
-      const double* f = p.params + kParams * c;
-      const double x = (p.uv[2 * o] - f[2]) / f[0], y = (p.uv[2 * o + 1] - f[3]) / f[1];
-      const double length = std::sqrt(x * x + y * y + 1.0);
-      ray[0] = x / length;
-      ray[1] = y / length;
-      ray[2] = 1.0 / length;
-    }
+    else
+      straight_ray(f, p.uv + 2 * o, ray);
     turn_back(p.camera_rotation + 9 * c, ray, body);
     turn_back(s.rotation + 9 * k, body, out.direction + 3 * o);
     std::copy_n(centres.data() + 3 * (k * p.n_cameras + c), 3, out.centre + 3 * o);
-    out.px_per_rad[o] = focal[c] / p.sigma[o];
+    out.px_per_rad[o] = std::sqrt(f[0] * f[1]) / p.sigma[o];
     // A depth is along the axis: of a ray that is across it, or points back, it tells no distance.
     const bool tells = p.depth != nullptr && ray[2] > kLeastCosine;
     const double along = tells ? 1.0 / ray[2] : std::numeric_limits<double>::quiet_NaN();
@@ -69,6 +78,21 @@ inline bool rays_of(const ProblemView& p, const StateView& s, const double* seen
   }
   return good;
 }
+
+// Whether no camera has distortion, so that straight_ray has its rays.
+inline bool all_straight(const ProblemView& p) {
+  for (std::int64_t c = 0; c < p.n_cameras; ++c) {
+    const double* f = p.params + kParams * c;
+    if (p.model[c] != 0 || std::any_of(f + 4, f + kParams, [](double k) { return k != 0.0; })) return false;
+  }
+  return true;
+}
+
+// Observations of tracks: n of them, by track.
+struct RowsOfTracks {
+  std::int64_t n, n_tracks;
+  const std::int64_t *row, *track;
+};
 
 // Observations sorted by point and keyframe. depth null if there is none.
 struct UsableView {
@@ -177,6 +201,44 @@ inline void leave_more_than_noise(const ResidualsView& seen, std::int64_t n_poin
     const auto count = static_cast<double>(sums[p].count), large = static_cast<double>(sums[p].large);
     found[p] =
         large >= at.least_large && sums[p].total > at.large * at.large * count && large >= at.large_share * count;
+  }
+}
+
+// As in window/initial_points.py; rad, and standard deviations.
+struct AgreementLimits {
+  double gate, min_parallax, least_parallax, two_views, least_support;
+};
+
+// Of which points the rays that agree tell the place: (n_points,). parallax, measured and agrees are of consensus.
+inline void tells_place(const RaysView& rays, std::int64_t n_points, const double* points, const double* parallax,
+                        const bool* measured, const bool* agrees, const AgreementLimits& at, bool* good) {
+  struct Views {
+    std::int64_t all = 0, agreeing = 0;
+    double sharpness = 0.0, worst = 0.0;
+  };
+  std::vector<Views> views(n_points);
+  for (std::int64_t o = 0; o < rays.n_rays; ++o) {
+    Views& of = views[rays.point[o]];
+    ++of.all;
+    if (!agrees[o]) continue;
+    ++of.agreeing;
+    of.sharpness = std::max(of.sharpness, rays.px_per_rad[o]);
+    const double *d = rays.direction + 3 * o, *c = rays.centre + 3 * o, *x = points + 3 * rays.point[o];
+    const double away[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]};
+    const double cross[3] = {d[1] * away[2] - d[2] * away[1], d[2] * away[0] - d[0] * away[2],
+                             d[0] * away[1] - d[1] * away[0]};
+    const double length = std::sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2]);
+    const double across = std::sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2]);
+    const bool before = d[0] * away[0] + d[1] * away[1] + d[2] * away[2] > 0.0;
+    const double error = rays.px_per_rad[o] * (across / std::max(length, 1e-300));
+    of.worst = std::max(of.worst, before ? error : std::numeric_limits<double>::infinity());
+  }
+  for (std::int64_t p = 0; p < n_points; ++p) {
+    const Views& of = views[p];
+    const bool wide = parallax[p] >= at.min_parallax && parallax[p] * of.sharpness >= at.least_parallax;
+    const bool fits = of.worst <= at.gate * (of.agreeing > 2 ? 1.0 : at.two_views);
+    const bool many = static_cast<double>(of.agreeing) > at.least_support * static_cast<double>(of.all);
+    good[p] = ((wide && of.agreeing >= 2) || measured[p]) && fits && many;
   }
 }
 

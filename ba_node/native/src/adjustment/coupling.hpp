@@ -20,6 +20,7 @@ class Coupling {
  public:
   Coupling(const Layout& layout, const Equations<D>& equations) : l_(layout), equations_(equations) {
     inverse_l_.resize(6 * l_.n_batches);
+    scaled_gradient_.resize(3 * l_.n_batches);
     step_.resize(l_.n_free);
     find_columns();
   }
@@ -27,6 +28,10 @@ class Coupling {
   // L^-1 of the points of a batch.
   Packed& inverse_l(std::int64_t batch) { return *reinterpret_cast<Packed*>(&inverse_l_[6 * batch]); }
   const Packed& inverse_l(std::int64_t batch) const { return *reinterpret_cast<const Packed*>(&inverse_l_[6 * batch]); }
+
+  // y = L^-1 gp of the points of a batch.
+  V8* scaled_gradient(std::int64_t batch) { return &scaled_gradient_[3 * batch]; }
+  const V8* scaled_gradient(std::int64_t batch) const { return &scaled_gradient_[3 * batch]; }
 
   // The step of the free keyframes (n_free x D) that project_step is of.
   void load_step(const double* step) {
@@ -230,7 +235,7 @@ class Coupling {
   const Layout& l_;
   const Equations<D>& equations_;
   std::vector<std::int32_t> image_column_;
-  Buffer<V8> inverse_l_;
+  Buffer<V8> inverse_l_, scaled_gradient_;
   Buffer<Column<D>> step_;
 };
 

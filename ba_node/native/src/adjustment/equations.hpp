@@ -7,7 +7,6 @@
 
 #include <cmath>
 #include <cstdint>
-#include <utility>
 #include <vector>
 
 #include "adjustment/layout.hpp"
@@ -51,21 +50,15 @@ template <int kRows>
   for (int i = 0; i < 3; ++i) out[3 + i] = a[i];
 }
 
-// What is kept at a state.
-struct AtPoints {
-  // By batch: three registers of points, six of C (packed), three of g.
-  Buffer<V8> point, c, gradient_p;
-  // By observation: the rows of the Jacobian: (a_u, a_v, r_u, r_v); (i_u, i_v, -, -) with i by f, k1, k2 if those are
-  // free; (a_depth, r_depth, -) if depth is measured. The last is zero, of no observation.
-  Buffer<V8> record;
-};
-
 template <int D>
-class Equations : public AtPoints {
+class Equations {
  public:
   explicit Equations(const Layout& layout) : registers(registers_with(layout.has_depth)), l_(layout) {
-    const std::int64_t bytes = resize(*this);
-    if (bytes <= kMaxPreparedBytes) resize(prepared_);
+    record.resize((kLanes * l_.n_slots() + 1) * registers);
+    clear(&record[kLanes * l_.n_slots() * registers], registers);
+    point.resize(3 * l_.n_batches);
+    c.resize(6 * l_.n_batches);
+    gradient_p.resize(3 * l_.n_batches);
     b.resize(l_.n_free);
     gradient_c.resize(l_.n_free);
     partial_.resize(l_.n_chunks());
@@ -75,6 +68,11 @@ class Equations : public AtPoints {
   }
 
   double gradient_norm = 0;
+  // By batch: three registers of points, six of C (packed), three of g.
+  Buffer<V8> point, c, gradient_p;
+  // By observation: the rows of the Jacobian: (a_u, a_v, r_u, r_v); (i_u, i_v, -, -) with i by f, k1, k2 if those are
+  // free; (a_depth, r_depth, -) if depth is measured. The last is zero, of no observation.
+  Buffer<V8> record;
   Buffer<Block<D>> b;
   Buffer<Column<D>> gradient_c;
   // Rows of the Jacobian an observation, each `registers` registers.
@@ -103,8 +101,6 @@ class Equations : public AtPoints {
     find_gradient_norm();
   }
 
-  // Inner iterations end with what a linearisation there begins with; that is kept if it is small.
-  bool can_prepare() const { return prepared_.record.size() == this->record.size(); }
   // Registers a record, and those that stage() needs for a slot.
   static constexpr int registers_with(bool depth) { return (D == 9 ? 2 : 1) + (depth ? 1 : 0); }
   static constexpr int staged_with(bool depth) { return kLanes * registers_with(depth) + 2; }
@@ -127,35 +123,16 @@ class Equations : public AtPoints {
     }
   }
 
-  // The rows of a batch as staged, and what else follows from them at x, for a linearisation to come.
+  // The rows of a batch as staged, and what else follows from them at x, for a linearisation to come: that is all but
+  // sum_keyframes().
   template <bool kDepth>
   void prepare(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, const V8* rows) {
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot, rows += staged_with(kDepth))
-      write<kDepth>(rows, slot, prepared_);
-    put(batch, x, sums, prepared_);
+      write<kDepth>(rows, slot);
+    put(batch, x, sums);
   }
 
-  // Linearise where the last inner iterations ended.
-  void take_prepared(Pool& pool) {
-    std::swap(static_cast<AtPoints&>(*this), prepared_);
-    sum_keyframes(pool);
-  }
-
- private:
-  // Bytes of records up to which a second set stays in the caches with the first; beyond, it costs what it saves.
-  static constexpr std::int64_t kMaxPreparedBytes = 4 << 20;
-  // Tasks that the keyframes of a list are summed in.
-  static constexpr std::int64_t kTasksOfList = 4;
-
-  std::int64_t resize(AtPoints& at) const {
-    at.record.resize((kLanes * l_.n_slots() + 1) * registers);
-    clear(&at.record[kLanes * l_.n_slots() * registers], registers);
-    at.point.resize(3 * l_.n_batches);
-    at.c.resize(6 * l_.n_batches);
-    at.gradient_p.resize(3 * l_.n_batches);
-    return static_cast<std::int64_t>(at.record.size() * sizeof(V8));
-  }
-
+  // B and the keyframes' part of the gradient, of what is kept of the observations.
   void sum_keyframes(Pool& pool) {
     const std::int64_t partials = l_.n_lists(), n = l_.n_free;
     const auto sum_list = [this](std::int64_t list, Block<D>& block, Column<D>& gradient) {
@@ -187,11 +164,15 @@ class Equations : public AtPoints {
     find_gradient_norm();
   }
 
+ private:
+  // Tasks that the keyframes of a list are summed in.
+  static constexpr std::int64_t kTasksOfList = 4;
+
   void find_gradient_norm() {
     double norm2 = 0;
     for (const auto& x : gradient_c) norm2 += dot(x, x);
     V8 squares{};
-    for (const V8& x : this->gradient_p) squares += x * x;
+    for (const V8& x : gradient_p) squares += x * x;
     gradient_norm = std::sqrt(norm2 + sum(squares));
   }
 
@@ -210,32 +191,32 @@ class Equations : public AtPoints {
         rows.evaluate<kLens, kDepth, true>(slot, images, x, obs);
         add_point_rows<kDepth ? 3 : 2>(obs, sums);
         stage<kDepth>(obs, staged);
-        write<kDepth>(staged, slot, *this);
+        write<kDepth>(staged, slot);
       }
-      put(i, x, sums, *this);
+      put(i, x, sums);
       total += sums.cost;
     }
     return 0.5 * sum(total);
   }
 
-  static void put(std::int64_t batch, const V8 (&x)[3], const PointSums& sums, AtPoints& to) {
-    for (int j = 0; j < 3; ++j) to.point[3 * batch + j] = x[j];
-    for (int j = 0; j < 6; ++j) to.c[6 * batch + j] = sums.c[j];
-    for (int j = 0; j < 3; ++j) to.gradient_p[3 * batch + j] = sums.g[j];
+  void put(std::int64_t batch, const V8 (&x)[3], const PointSums& sums) {
+    for (int j = 0; j < 3; ++j) point[3 * batch + j] = x[j];
+    for (int j = 0; j < 6; ++j) c[6 * batch + j] = sums.c[j];
+    for (int j = 0; j < 3; ++j) gradient_p[3 * batch + j] = sums.g[j];
   }
 
   // Records of a slot, of its rows as staged: weighted, by observation.
   template <bool kDepth>
-  [[gnu::always_inline]] static void write(const V8* staged, std::int64_t slot, AtPoints& to) {
+  [[gnu::always_inline]] void write(const V8* staged, std::int64_t slot) {
     constexpr int kRegisters = registers_with(kDepth);
-    V8* record = &to.record[kLanes * slot * kRegisters];
+    V8* at = &record[kLanes * slot * kRegisters];
     const auto put_register = [&](int reg, int count, const V8& weight) {
       V8 r[8];
 #pragma GCC unroll 8
       for (int i = 0; i < 8; ++i) r[i] = i < count ? weight * staged[kLanes * reg + i] : V8{};
       transpose(r);
 #pragma GCC unroll 8
-      for (int l = 0; l < kLanes; ++l) record[l * kRegisters + reg] = r[l];
+      for (int l = 0; l < kLanes; ++l) at[l * kRegisters + reg] = r[l];
     };
     const V8 weight = root(staged[kLanes * kRegisters]);
     put_register(0, 8, weight);
@@ -331,7 +312,6 @@ class Equations : public AtPoints {
   std::vector<double> partial_;
   Buffer<Block<D>> partial_b_;  // by list, if a keyframe has several
   Buffer<Column<D>> partial_gradient_;
-  AtPoints prepared_;
 };
 
 }  // namespace ba::BA_TARGET

@@ -33,10 +33,9 @@ class KernelOf final : public Kernel {
         reduced_(l_, rows_, equations_, std::move(arguments.factors), pool_) {
     partial_.resize(l_.n_chunks());
     const std::int64_t most = l_.n_batches ? l_.slot_begin[1] : 0;
-    const std::int64_t staged = equations_.can_prepare() ? most * equations_.staged_with(l_.has_depth) : 0;
     for (int i = 0; i < pool_.threads(); ++i) {
       images_.emplace_back(most);
-      staged_.emplace_back(staged);
+      staged_.emplace_back(most * equations_.staged_with(l_.has_depth));
     }
   }
   // The members refer to one another.
@@ -63,12 +62,14 @@ class KernelOf final : public Kernel {
 
   Objectives inner_iterations(const StateView& s, double* points, int steps) override {
     rows_.load_images(s);
-    is_prepared_ = equations_.can_prepare();
     rows_.with_kind<D>([&](auto lens, auto depth) {
       pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int thread) {
+        const V8 none[3] = {};
+        const auto each_batch = [&](auto f) {
+          for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) f(i, none);
+        };
         constexpr Lens kLens = decltype(lens)::value;
-        constexpr bool kDepth = decltype(depth)::value;
-        partial_[chunk] = iterate_chunk<kLens, kDepth>(chunk, thread, s, points, steps);
+        partial_[chunk] = iterate<kLens, decltype(depth)::value, false>(thread, each_batch, s, points, steps);
       });
     });
     return total_of(partial_);
@@ -82,7 +83,7 @@ class KernelOf final : public Kernel {
   bool linearise_prepared() override {
     if (!is_prepared_) return false;
     is_prepared_ = false;
-    equations_.take_prepared(pool_);
+    equations_.sum_keyframes(pool_);
     return true;
   }
 
@@ -110,7 +111,7 @@ class KernelOf final : public Kernel {
 
   void factor(const double* damping_c, const double* damping_p) override { reduced_.factor(damping_c, damping_p); }
   void damp(bool diagonal, double mu) override { reduced_.damp(diagonal, mu); }
-  void rhs(double* out) const override { reduced_.rhs(out); }
+  void rhs(double* out) override { reduced_.rhs(out); }
   void dense(double* out) override { reduced_.dense(out); }
   bool solve(double* x) override { return reduced_.solve(x); }
   const Fill& analyse(const FillLimits& limits) override { return reduced_.analyse(limits); }
@@ -130,50 +131,57 @@ class KernelOf final : public Kernel {
   void product(const double* x, double* out) override { reduced_.product(x, out); }
   void diagonal_blocks(double* out) override { reduced_.diagonal_blocks(out); }
   double back_substitute(const double* step_c, double* step_p) override {
-    return reduced_.back_substitute(step_c, nullptr, step_p);
+    return reduced_.back_substitute(step_c, step_p);
   }
 
   StepResult step(const StateView& from, const double* step_c, int steps, const StateSpan& to) override {
     StepResult out;
     is_prepared_ = false;
-    out.predicted = reduced_.back_substitute(step_c, from.points, to.points);
-    out.damping = reduced_.damping_cost();
     retract_keyframes(l_, from, step_c, D, to);
-    const bool finite = all_finite(to.points, 3 * l_.n_points) && all_finite(to.rotation, 9 * l_.n_keyframes) &&
-                        all_finite(to.translation, 3 * l_.n_keyframes) &&
-                        (!l_.own_intrinsics || all_finite(to.intrinsics, 3 * l_.n_keyframes));
-    if (!finite) return out;
-    const StateView s{to.rotation, to.translation, to.points, to.intrinsics};
-    if (steps > 0) {
-      out.objective = inner_iterations(s, to.points, steps);
-    } else {
-      out.objective.before = out.objective.after = objective(s);
-    }
+    const StateView s{to.rotation, to.translation, from.points, to.intrinsics};
+    rows_.load_images(s);
+    rows_.with_kind<D>([&](auto lens, auto depth) {
+      constexpr Lens kLens = decltype(lens)::value;
+      out.predicted = reduced_.each_step(step_c, [&](std::int64_t chunk, int thread, auto each_batch) {
+        partial_[chunk] = iterate<kLens, decltype(depth)::value, true>(thread, each_batch, s, to.points, steps);
+      });
+    });
+    out.damping = reduced_.damping_cost();
+    const Objectives found = total_of(partial_);
+    is_prepared_ = !std::isnan(found.before) && all_finite(to.rotation, 9 * l_.n_keyframes) &&
+                   all_finite(to.translation, 3 * l_.n_keyframes) &&
+                   (!l_.own_intrinsics || all_finite(to.intrinsics, 3 * l_.n_keyframes));
+    if (is_prepared_) out.objective = found;
     return out;
   }
 
  private:
-  // With is_ahead_ keeps what a linearisation where it ends would begin with.
-  template <Lens kLens, bool kDepth>
-  Objectives iterate_chunk(std::int64_t chunk, int thread, const StateView& s, double* points, int steps) {
+  // Iterate on the points of a chunk. each_batch(f): calls f(batch, step) for each. kAfterStep: take that step before,
+  // and keep what a linearisation where it ends would begin with in place of what was there. The objective before is
+  // not a number if a point is not finite.
+  template <Lens kLens, bool kDepth, bool kAfterStep, class EachBatch>
+  Objectives iterate(int thread, EachBatch each_batch, const StateView& s, double* points, int steps) {
     V8 before{}, after{};
-    for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+    each_batch([&](std::int64_t i, const V8(&step)[3]) {
       const std::int64_t slot_begin = l_.slot_begin[i];
       V8 x[3], first{}, best{};
       PointSums sums;
       V8* staged = staged_[thread].data();
       const auto keep = [&](std::int64_t slot, const Evaluation& obs) {
-        if (is_prepared_)
+        if constexpr (kAfterStep)
           Equations<D>::template stage<kDepth>(obs, staged + (slot - slot_begin) * Equations<D>::staged_with(kDepth));
       };
       rows_.load_points(i, s.points, x);
+      if constexpr (kAfterStep)
+        for (int c = 0; c < 3; ++c) x[c] += step[c];
+      const V8 none = 0.0 * (x[0] + x[1] + x[2]);  // or NaN
       iterate_batch<kLens, kDepth>(rows_, slot_begin, l_.slot_begin[i + 1], steps, images_[thread].data(), keep, x,
                                    sums, first, best);
       rows_.store_points(i, x, points);
-      if (is_prepared_) equations_.template prepare<kDepth>(i, x, sums, staged);
-      before += first;
+      if constexpr (kAfterStep) equations_.template prepare<kDepth>(i, x, sums, staged);
+      before += first + none;
       after += select(best < std::numeric_limits<double>::infinity(), best, V8{});
-    }
+    });
     return {0.5 * sum(before), 0.5 * sum(after)};
   }
 

@@ -49,7 +49,6 @@ class ReducedSystem {
     pairs_.assign(factors_.size(), Block<D>{});
     rhs_.resize(l_.n_free);
     sums_.resize(l_.n_chunks() * l_.n_free);
-    scaled_gradient_.resize(3 * l_.n_batches);
     damping_p_.resize(3 * l_.n_batches);
     damping_c_.resize(l_.n_free * D);
     partial_.resize(l_.n_chunks());
@@ -79,7 +78,8 @@ class ReducedSystem {
     });
   }
 
-  void rhs(double* out) const {
+  void rhs(double* out) {
+    if (!is_rhs_known_) sum_rhs();
     for (std::int64_t k = 0; k < l_.n_free; ++k)
       for (int i = 0; i < D; ++i) out[k * D + i] = at(rhs_[k], i);
   }
@@ -128,6 +128,7 @@ class ReducedSystem {
   // S by blocks.
   const SparseSchur<D>& assemble() {
     schur().assemble(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); }, pairs_);
+    take_rhs(schur().sums());
     return schur();
   }
 
@@ -188,30 +189,39 @@ class ReducedSystem {
     for (std::int64_t k = 0; k < l_.n_free; ++k) write_block(blocks[k], out + k * D * D, D);
   }
 
-  // Step of the points for a step of the free keyframes (n_free x D), added to `base` unless that is null; returns the
-  // reduction of the undamped model.
+  // Step of the points for a step of the free keyframes (n_free x D); returns the reduction of the undamped model.
+  double back_substitute(const double* step_c, double* out) {
+    return each_step(step_c, [&](std::int64_t, int, auto each_batch) {
+      each_batch([&](std::int64_t batch, const V8(&p)[3]) { rows_.store_points(batch, p, out); });
+    });
+  }
+
+  // The same, but hand the steps on: take(chunk, thread, each_batch) is to call each_batch(f) once, which calls
+  // f(batch, step) for the batches of the chunk. What is kept of a batch at the state is not looked at again after
+  // that.
   //
   // With y = L^-1 gp, v = Z' step_c and w = -(y + v) the points' step is p = L^-T w, and as C + D = L L' the model's
   // curvature is step_c' B step_c + 2 w'v + |w|^2 - p' D p: E is not needed.
-  double back_substitute(const double* step_c, const double* base, double* out) {
+  template <class Take>
+  double each_step(const double* step_c, Take take) {
     coupling_.load_step(step_c);
-    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int thread) {
       V8 slope{}, curvature{}, damping{};
-      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
-        V8 v[3], w[3], p[3], x[3] = {};
-        coupling_.project_step(i, v);
-        const V8 *y = &scaled_gradient_[3 * i], *g = &equations_.gradient_p[3 * i], *d = &damping_p_[3 * i];
-        for (int c = 0; c < 3; ++c) w[c] = -(y[c] + v[c]);
-        upper_times(coupling_.inverse_l(i), w, p);
-        for (int c = 0; c < 3; ++c) {
-          slope += g[c] * p[c];
-          curvature += w[c] * (2 * v[c] + w[c]) - d[c] * p[c] * p[c];
-          damping += d[c] * p[c] * p[c];
+      take(chunk, thread, [&](auto f) {
+        for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+          V8 v[3], w[3], p[3];
+          coupling_.project_step(i, v);
+          const V8 *y = coupling_.scaled_gradient(i), *g = &equations_.gradient_p[3 * i], *d = &damping_p_[3 * i];
+          for (int c = 0; c < 3; ++c) w[c] = -(y[c] + v[c]);
+          upper_times(coupling_.inverse_l(i), w, p);
+          for (int c = 0; c < 3; ++c) {
+            slope += g[c] * p[c];
+            curvature += w[c] * (2 * v[c] + w[c]) - d[c] * p[c] * p[c];
+            damping += d[c] * p[c] * p[c];
+          }
+          f(i, p);
         }
-        if (base != nullptr) rows_.load_points(i, base, x);
-        for (int c = 0; c < 3; ++c) x[c] += p[c];
-        rows_.store_points(i, x, out);
-      }
+      });
       partial_[chunk] = {0.5 * sum(damping), -sum(slope) - 0.5 * sum(curvature)};
     });
     double reduction = total_of(partial_).after;
@@ -236,34 +246,54 @@ class ReducedSystem {
   template <class Damping>
   void factor_points(Damping damping) {
     pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
-      Column<D>* sums = &sums_[chunk * l_.n_free];
-      clear(sums, l_.n_free);
       for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
         V8 d[3];
         damping(i, d);
-        factor_batch(i, d, sums);
+        factor_batch(i, d);
       }
     });
-    // -gc + Z L^-1 gp.
-    each_sum([&](std::int64_t k, const Column<D>& sum) {
-      rhs_[k].a = sum.a - equations_.gradient_c[k].a;
-      if constexpr (D == 9) rhs_[k].b = sum.b - equations_.gradient_c[k].b;
-    });
+    is_rhs_known_ = false;
   }
 
-  // L^-1 and y = L^-1 gp of a batch; adds Z y to `sums`.
-  void factor_batch(std::int64_t batch, const V8 (&damping)[3], Column<D>* sums) {
+  // The right-hand side where S, whose sum has it too, is not formed.
+  void sum_rhs() {
+    pool_.each(l_.n_chunks(), [&](std::int64_t chunk, int) {
+      Column<D>* sums = &sums_[chunk * l_.n_free];
+      clear(sums, l_.n_free);
+      for (std::int64_t i = l_.chunks[chunk]; i < l_.chunks[chunk + 1]; ++i) {
+        const V8* of_batch = coupling_.scaled_gradient(i);
+        const V8 y[3] = {of_batch[0], of_batch[1], of_batch[2]};
+        V8 p[3];
+        upper_times(coupling_.inverse_l(i), y, p);
+        coupling_.add_coupling(i, p, sums);
+      }
+    });
+    each_sum([&](std::int64_t k, const Column<D>& sum) { take_rhs_of(k, sum); });
+    is_rhs_known_ = true;
+  }
+
+  void take_rhs(const Column<D>* sums) {
+    for (std::int64_t k = 0; k < l_.n_free; ++k) take_rhs_of(k, sums[k]);
+    is_rhs_known_ = true;
+  }
+
+  // -gc + Z L^-1 gp.
+  void take_rhs_of(std::int64_t k, const Column<D>& sum) {
+    rhs_[k].a = sum.a - equations_.gradient_c[k].a;
+    if constexpr (D == 9) rhs_[k].b = sum.b - equations_.gradient_c[k].b;
+  }
+
+  // L^-1 and y = L^-1 gp of a batch.
+  void factor_batch(std::int64_t batch, const V8 (&damping)[3]) {
     Packed& li = coupling_.inverse_l(batch);
-    V8 g[3], y[3], p[3];
+    V8 g[3], y[3];
     for (int i = 0; i < 3; ++i) {
       g[i] = equations_.gradient_p[3 * batch + i];
       damping_p_[3 * batch + i] = damping[i];
     }
     inverse_cholesky(*reinterpret_cast<const Packed*>(&equations_.c[6 * batch]), damping, li);
     lower_times(li, g, y);
-    for (int i = 0; i < 3; ++i) scaled_gradient_[3 * batch + i] = y[i];
-    upper_times(li, y, p);
-    coupling_.add_coupling(batch, p, sums);
+    for (int i = 0; i < 3; ++i) coupling_.scaled_gradient(batch)[i] = y[i];
   }
 
   // Call take(i, j, block) for the blocks S_ij with j >= i that are not zero.
@@ -285,7 +315,10 @@ class ReducedSystem {
   }
 
   const Block<D>* find_diagonal() {
-    return schur().diagonal(pool_, coupling_, [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); });
+    const auto add = [this](std::int64_t k, Block<D>& block) { add_diagonal(k, block); };
+    const Block<D>* blocks = schur().diagonal(pool_, coupling_, add);
+    take_rhs(schur().sums());
+    return blocks;
   }
 
   // B and the damping of keyframe k, onto its diagonal block.
@@ -321,9 +354,10 @@ class ReducedSystem {
   Buffer<Block<D>> own_;
   Buffer<double> rhs_as_given_;
   Buffer<Column<D>> rhs_, sums_;  // sums_: of each chunk
-  Buffer<V8> scaled_gradient_, damping_p_;
+  Buffer<V8> damping_p_;
   std::vector<double> damping_c_;
   double damping_cost_ = 0;
+  bool is_rhs_known_ = false;
   std::vector<Objectives> partial_;
   std::unique_ptr<SparseSchur<D>> schur_;
   std::unique_ptr<SparseCholesky<D>> factor_;

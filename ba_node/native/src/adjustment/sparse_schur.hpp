@@ -52,6 +52,7 @@ class SparseSchur {
     scratch_.resize(most_edges_ * threads);
     blocks_.resize(n_blocks() * n_partials());
     diagonal_.resize(l_.n_free * n_partials());
+    sums_.resize(l_.n_free * n_partials());
     index_rows();
     for (std::size_t k = 0; k < factors.size(); ++k) {
       const std::int32_t* index = pattern_.index.data();
@@ -83,28 +84,42 @@ class SparseSchur {
   void assemble(Pool& pool, const Coupling<D>& coupling, Add add_diagonal, const Buffer<Block<D>>& pairs) {
     pool.each(n_partials(), [&](std::int64_t partial, int thread) {
       Block<D>* blocks = &blocks_[partial * n_blocks()];
+      Column<D>* sums = &sums_[partial * l_.n_free];
       clear(blocks, n_blocks());
-      each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) { sum_edges(e, z, blocks); });
+      clear(sums, l_.n_free);
+      each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
+        sum_edges(e, z, blocks);
+        each_of(e, [&](std::int32_t f) { add_scaled(f, z, coupling, sums); });
+      });
     });
     pool.each(n_partials() > 1 ? kSumTasks : 0, [&](std::int64_t task, int) {
       add_partials(blocks_.data(), n_blocks(), n_blocks() * task / kSumTasks, n_blocks() * (task + 1) / kSumTasks);
     });
+    add_partials(sums_.data(), l_.n_free, 0, l_.n_free);
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
     for (std::size_t k = 0; k < place_of_pair_.size(); ++k) add(blocks_[place_of_pair_[k]], pairs[k]);
   }
+
+  // Z L^-1 gp by free keyframe, of the last assemble() or diagonal().
+  const Column<D>* sums() const { return sums_.data(); }
 
   // The diagonal blocks alone, n_free.
   template <class Add>
   const Block<D>* diagonal(Pool& pool, const Coupling<D>& coupling, Add add_diagonal) {
     pool.each(n_partials(), [&](std::int64_t partial, int thread) {
       Block<D>* blocks = &diagonal_[partial * l_.n_free];
+      Column<D>* sums = &sums_[partial * l_.n_free];
       clear(blocks, l_.n_free);
+      clear(sums, l_.n_free);
       each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
-        for (std::int32_t f = e; f < std::min(e + kRowsAtOnce, l_.edge_end[e]); ++f)
+        each_of(e, [&](std::int32_t f) {
           subtract_product(blocks[l_.edge_column[f]], Left<D>(z[f]), z[f]);
+          add_scaled(f, z, coupling, sums);
+        });
       });
     });
     add_partials(diagonal_.data(), l_.n_free, 0, l_.n_free);
+    add_partials(sums_.data(), l_.n_free, 0, l_.n_free);
     for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, diagonal_[k]);
     return diagonal_.data();
   }
@@ -154,8 +169,13 @@ class SparseSchur {
       most_edges_ = std::max<std::int64_t>(most_edges_, begin[i] - begin[i - 1]);
     order_.resize(l_.n_edges());
     std::vector<bool> leads(l_.n_edges(), false);
-    for (std::int64_t p = 0; p + 1 < static_cast<std::int64_t>(l_.point_edge.size()); ++p)
-      for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; e += kRowsAtOnce) leads[e] = true;
+    place_of_gradient_.resize(l_.n_edges());
+    for (std::int64_t p = 0; p + 1 < static_cast<std::int64_t>(l_.point_edge.size()); ++p) {
+      for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
+        leads[e] = (e - l_.point_edge[p]) % kRowsAtOnce == 0;
+        place_of_gradient_[e] = static_cast<std::int32_t>(p / kLanes * 3 * kLanes + p % kLanes);
+      }
+    }
     order_end_ = begin;
     for (std::int32_t e : l_.edges_of_keyframe)
       if (leads[e]) order_[order_end_[std::upper_bound(begin.begin(), begin.end(), e) - begin.begin() - 1]++] = e;
@@ -174,9 +194,24 @@ class SparseSchur {
     }
   }
 
-  // Onto the blocks [begin, end) of the first partial sum those of the others; n: blocks of each.
-  void add_partials(Block<D>* blocks, std::int64_t n, std::int64_t begin, std::int64_t end) const {
-    const std::int64_t count = static_cast<std::int64_t>(sizeof(Block<D>) / sizeof(double));
+  // Call f for the edges that e stands for.
+  template <class F>
+  void each_of(std::int32_t e, F f) const {
+    for (std::int32_t i = e; i < std::min(e + kRowsAtOnce, l_.edge_end[e]); ++i) f(i);
+  }
+
+  // What an edge adds to Z y, y = L^-1 gp.
+  void add_scaled(std::int32_t e, const Edge<D>* z, const Coupling<D>& coupling, Column<D>* sums) const {
+    const double* y = reinterpret_cast<const double*>(coupling.scaled_gradient(0)) + place_of_gradient_[e];
+    Column<D>& sum = sums[l_.edge_column[e]];
+    sum.a += z[e].a[0] * y[0] + z[e].a[1] * y[kLanes] + z[e].a[2] * y[2 * kLanes];
+    if constexpr (D == 9) sum.b += z[e].b[0] * y[0] + z[e].b[1] * y[kLanes] + z[e].b[2] * y[2 * kLanes];
+  }
+
+  // Onto the blocks or columns [begin, end) of the first partial sum those of the others; n: of each.
+  template <class T>
+  void add_partials(T* blocks, std::int64_t n, std::int64_t begin, std::int64_t end) const {
+    const std::int64_t count = static_cast<std::int64_t>(sizeof(T) / sizeof(double));
     double* to = reinterpret_cast<double*>(blocks);
     for (std::int64_t partial = 1; partial < n_partials(); ++partial) {
       const double* from = to + partial * n * count;
@@ -184,8 +219,8 @@ class SparseSchur {
     }
   }
 
-  // What the pairs of an edge, or of kRowsAtOnce of a point, with themselves and the later ones add to their rows. z: by
-  // edge.
+  // What the pairs of an edge, or of kRowsAtOnce of a point, with themselves and the later ones add to their rows. z:
+  // by edge.
   void sum_edges(std::int32_t e, const Edge<D>* z, Block<D>* blocks) const {
     const std::int32_t *column = l_.edge_column.data(), i = column[e], end = l_.edge_end[e];
     const bool is_last = kRowsAtOnce == 1 || e + 1 == end;
@@ -238,13 +273,15 @@ class SparseSchur {
   Rows32 pattern_;
   std::vector<std::int64_t> cut_;
   Buffer<Block<D>> blocks_, diagonal_;               // of each partial sum; the sums are in the first
+  Buffer<Column<D>> sums_;                           // the same
   std::vector<std::int64_t> strip_, partial_strip_;  // first batch of each strip; first strip of each partial sum
   // Edges, strip by strip and there by rows; where in it those of a strip end, which begin where its first edge would.
   Buffer<std::int32_t> order_;
   std::vector<std::int32_t> order_end_;
-  std::int64_t most_edges_ = 0;                      // of a strip
-  Buffer<Edge<D>> scratch_;                          // of each thread
-  Buffer<std::int32_t> place_;                       // for columns between those of the row, nothing
+  Buffer<std::int32_t> place_of_gradient_;  // where y of the point of an edge begins
+  std::int64_t most_edges_ = 0;             // of a strip
+  Buffer<Edge<D>> scratch_;                 // of each thread
+  Buffer<std::int32_t> place_;              // for columns between those of the row, nothing
   std::vector<std::int64_t> place_of_pair_;
   std::vector<std::int64_t> place_of_;  // of column j of row i: place_[place_of_[i] + j], or kSearched
 };

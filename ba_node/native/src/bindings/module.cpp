@@ -57,6 +57,12 @@ void use_target(const std::string& name) {
   throw py::value_error("target '" + name + "' is not one that this processor runs");
 }
 
+}  // namespace
+
+const Target& active_target() { return *target; }
+
+namespace {
+
 template <class F>
 auto without_gil(F f) {
   py::gil_scoped_release release;
@@ -217,7 +223,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              without_gil([&] { k.factor(c, p); });
            })
       .def("damp", [](Kernel& k, bool diagonal, double mu) { without_gil([&] { k.damp(diagonal, mu); }); })
-      .def("rhs", [](const Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
+      .def("rhs", [](Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
       .def("dense",
            [](Kernel& k, OutDoubles out) {
              double* s = out.mutable_data();

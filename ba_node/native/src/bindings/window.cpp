@@ -12,6 +12,8 @@
 #include <vector>
 
 #include "adjustment/choice.hpp"
+#include "adjustment/sound.hpp"
+#include "adjustment/trial.hpp"
 #include "adjustment/views.hpp"
 #include "bindings/arrays.hpp"
 
@@ -136,17 +138,32 @@ py::tuple take(const py::object& observations, const Ints& rows, const Ints& of_
   return py::make_tuple(to_keyframe, to_camera, to_point, to_uv, to_sigma, to_depth, to_depth_sigma);
 }
 
-// seen: of each observation as a unit vector in its camera; empty for cameras without distortion.
-py::tuple rays(const py::object& problem, const Doubles& seen) {
+// seen: of each observation as a unit vector in its camera; empty for cameras without distortion. None if it must not
+// be.
+py::object rays(const py::object& problem, const Doubles& seen) {
   const ProblemArrays arrays(problem);
-  const StateView at = arrays.start.view();
-  const auto n = static_cast<py::ssize_t>(arrays.keyframe.size());
+  const ProblemView view = arrays.view();
+  const auto n = static_cast<py::ssize_t>(view.n_obs);
+  if (seen.size() < 3 * n && !all_straight(view)) return py::none();
   Doubles centre({n, py::ssize_t{3}}), direction({n, py::ssize_t{3}}), px_per_rad({n}), distance({n}),
       distance_sigma({n});
   const RaysSpan out{centre.mutable_data(), direction.mutable_data(), px_per_rad.mutable_data(),
                      distance.mutable_data(), distance_sigma.mutable_data()};
-  const bool good = rays_of(arrays.view(), at, seen.size() ? seen.data() : nullptr, out);
+  const bool good = rays_of(view, arrays.start.view(), seen.size() ? seen.data() : nullptr, out);
   return py::make_tuple(py::make_tuple(centre, direction, px_per_rad, distance, distance_sigma), good);
+}
+
+// limits: of AgreementLimits all but the gate.
+py::tuple agreed(const py::object& rays, py::ssize_t n_points, double gate, const std::array<double, 4>& limits) {
+  const RaysArrays arrays(rays);
+  const RaysView view = arrays.view();
+  Doubles points({n_points, py::ssize_t{3}}), parallax({n_points});
+  Array<bool> measured({n_points}), good({n_points}), agrees({arrays.point.size()});
+  active_target().consensus(view, n_points, gate, points.mutable_data(), parallax.mutable_data(),
+                            measured.mutable_data(), agrees.mutable_data());
+  tells_place(view, n_points, points.data(), parallax.data(), measured.data(), agrees.data(),
+              {gate, limits[0], limits[1], limits[2], limits[3]}, good.mutable_data());
+  return py::make_tuple(points, good, measured);
 }
 
 // flags: usable (n_obs,); least: of a keyframe, whether it may take part at all (n_kf,) and how many points it has to
@@ -183,12 +200,48 @@ Array<bool> move_more_than_noise(const py::object& observations, const Doubles& 
   return found;
 }
 
+// rows: views of the tracks, and which of these each is of; seen: of each, as in rays. limits: as TrialLimits.
+py::object explained(const py::object& problem, const std::tuple<Ints, Ints, Doubles>& views,
+                     const std::pair<std::int64_t, std::int64_t>& tracks, const std::array<Doubles, 4>& poses,
+                     const std::tuple<double, double, double, std::int64_t, std::int64_t>& limits) {
+  const ProblemArrays arrays(problem);
+  const auto& [rows, track, seen] = views;
+  const auto& [parallax, bound, behind, least_views, least_residuals] = limits;
+  const auto [n_tried, n_out] = tracks;
+  if (seen.size() < 3 * rows.size() && !all_straight(arrays.view())) return py::none();
+  Trial trial(active_target(), arrays.view(), {rows.size(), n_tried, rows.data(), track.data()},
+              seen.size() ? seen.data() : nullptr);
+  const Explained found = trial.explained({{poses[0].data(), poses[2].data()}, {poses[1].data(), poses[3].data()}},
+                                          n_out, {parallax, bound, behind, least_views, least_residuals});
+  Doubles held_out({py::ssize_t{2}}), mean({py::ssize_t{2}, static_cast<py::ssize_t>(found.mean[0].size())}),
+      points({static_cast<py::ssize_t>(n_out), py::ssize_t{3}});
+  std::copy_n(found.held_out.data(), 2, held_out.mutable_data());
+  for (int s = 0; s < 2; ++s) std::copy(found.mean[s].begin(), found.mean[s].end(), mean.mutable_data(s));
+  std::copy_n(found.points.data(), 3 * n_out, points.mutable_data());
+  return py::make_tuple(held_out, mean, found.parallax, points);
+}
+
+bool is_sound_problem(const py::object& problem) {
+  const ProblemArrays arrays(problem);
+  return is_sound(arrays.view(), arrays.start.view());
+}
+
+// most: variances of blocks that are scaled to a unit diagonal.
+py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double most) {
+  const auto [sigma_m, sigma_rad] = loosest(blocks.data(), positions.data(), blocks.shape(0), most);
+  return py::make_tuple(sigma_m, sigma_rad);
+}
+
 }  // namespace
 
 void bind_window(py::module_& m) {
   m.def("views_of", &views_of_landmarks);
   m.def("distinct_landmarks", &distinct_landmarks);
   m.def("inliers_by_keyframe", &inliers_by_keyframe);
+  m.def("explained", &explained);
+  m.def("agreed", &agreed);
+  m.def("is_sound", &is_sound_problem);
+  m.def("loosest", &loosest_of);
   m.def("gather", &gather);
   m.def("take", &take);
   m.def("rays", &rays);

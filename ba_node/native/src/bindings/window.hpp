@@ -7,7 +7,12 @@
 
 #include <pybind11/pybind11.h>
 
+#include "targets/target.hpp"
+
 namespace ba {
+
+// Of the kernels that do the work.
+const Target& active_target();
 
 void bind_window(pybind11::module_& m);
 

@@ -37,7 +37,7 @@ class Kernel {
   // Improve each point alone, keyframes fixed. points: out.
   virtual Objectives inner_iterations(const StateView& s, double* points, int steps) = 0;
   virtual double linearise(const StateView& s) = 0;
-  // Linearise where the last inner iterations ended; false if too little is known of it.
+  // Linearise where the last step ended; false if there is no such state.
   virtual bool linearise_prepared() = 0;
   // Add what factors have at the state of the last linearisation: to B (n_free x 36), to the gradient (n_free x 6), and
   // the blocks of the coupled pairs (n_pairs x 36).
@@ -51,7 +51,7 @@ class Kernel {
   virtual void factor(const double* damping_c, const double* damping_p) = 0;
   // The same with mu times the diagonal itself, or the identity.
   virtual void damp(bool diagonal, double mu) = 0;
-  virtual void rhs(double* out) const = 0;
+  virtual void rhs(double* out) = 0;
   // S, symmetric, (n x n), n = n_free d.
   virtual void dense(double* out) = 0;
   // The pattern of the upper triangle of S; its blocks (d x d), block k to place[k] of out, and transposed to
@@ -73,7 +73,8 @@ class Kernel {
   // Step of the points for a step of the free keyframes (n_free x d); returns the reduction of the undamped model.
   virtual double back_substitute(const double* step_c, double* step_p) = 0;
   // Take a step of the free keyframes (n_free x d) and those of the points that go with it from `from` to `to`, and
-  // iterate on the points after it. Objectives are not numbers where the state after the step is not finite.
+  // iterate on the points after it. Objectives are not numbers where the state after the step is not finite. What was
+  // kept of the linearisation is written over: another has to follow.
   virtual StepResult step(const StateView& from, const double* step_c, int steps, const StateSpan& to) = 0;
 };
 
