@@ -91,7 +91,7 @@ def _place_roughly(scene: Scene, config: Config) -> None:
     rows = scene.views_of(landmarks)
     table.outlier[rows] = False
     origin, none = scene.keyframes.position[scene.order[0]], np.zeros((len(landmarks), 3))
-    problem = problem_of(scene, rows, scene.order, landmarks, origin, none, config)
+    problem, _ = problem_of(scene, rows, scene.order, landmarks, origin, none, config)
     usual = float(np.median(np.linalg.norm(away, axis=1)))
     points.position[landmarks] = _rough(problem, usual, config.solver.kernels) + origin
     points.has_position[landmarks] = True
@@ -100,7 +100,7 @@ def _place_roughly(scene: Scene, config: Config) -> None:
 
 def _rough(problem: Problem, usual_m: float, kernels: str) -> FloatArray:
     """Return where rays come nearest to each other, (n_pt, 3), or so far along their mean where that tells no place."""
-    rays, n = triangulation.rays_of(problem), problem.n_points
+    rays, n = triangulation.rays_of(problem, kernels), problem.n_points
     points = triangulation.triangulate(rays, n, kernels).points
     start = problem.start
     state = State(start.rotation, start.translation, np.nan_to_num(points), start.intrinsics)
