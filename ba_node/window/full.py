@@ -189,7 +189,9 @@ def take_snapshot(
     if isinstance(selection, str):
         return selection
     problem = selection.problem
-    fixed = _fixed(problem.fixed, selection.unscaled, scene.keyframes.position[selection.keyframes])
+    # Precise steps hold the scale; a second keyframe that is held would keep the map turned as it was.
+    floats = selection.unscaled if scene.step_shares == (1.0, 1.0) else np.full(len(selection.unscaled), -1)
+    fixed = _fixed(problem.fixed, floats, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
     return Optimization(
         origin or scene,

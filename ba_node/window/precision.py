@@ -4,9 +4,10 @@
 
 Once for so many keyframes as a window holds it is solved again without the steps. A step then differs from the
 front-end's by e, of which images explain the covariance C (``core/covariance.py``) and the front-end the rest:
-``e ~ N(0, C + s^2 sigma^2 I)``, with sigma as the parameters state it. The likelihood of the share s is added up over
-windows, for rotation and translation apart, with Student's distribution (5 degrees of freedom) of each component along
-the axes of C, so that single wild steps do not decide, and older windows fade. A share below 1 is taken where it is far
+``e ~ N(0, C + s^2 sigma^2 I)``, with sigma as the parameters state it, for all steps of the window at once: images that
+tell little of each may tell much of their sum. The likelihood of the share s is added up over windows, for rotation and
+translation apart, with Student's distribution (5 degrees of freedom) of each component along the axes of C in stated
+sigmas, so that single wild steps do not decide, and older windows fade. A share below 1 is taken where it is far
 more likely than 1. So a front-end that is more precise than images holds the keyframes, in place of being spoilt by
 them; the keyframes of before follow by a solve of everything (``adjustment.py``).
 
@@ -16,12 +17,11 @@ translation, and where images tell less than a fifth of a stated sigma at least:
 have no weight that could do harm, and none is to be had by mistake. Where the first windows tell nothing of the kind it
 is not asked any more; larger shares are odometry.py's.
 
-Only where images have a scale of their own: several cameras, or depths.
+Only where images have a scale of their own (several cameras, or depths), or two older keyframes hold one.
 """
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -71,8 +71,9 @@ class Precision:
         """Return what is to be asked of a window that was taken, with its solution; None if nothing is."""
         n, whole = len(scene.keyframes), selection.problem
         told_little = self.windows >= _ENOUGH and scene.step_shares == (1.0, 1.0)
+        held = whole.has_scale or np.count_nonzero(whole.fixed) > 1
         due = n - self.seen >= config.window.max_keyframes and config.window.old_keyframes == "fix"
-        if told_little or not (due and whole.has_scale and config.odometry.enabled) or selection.much_moves:
+        if told_little or not (due and held and config.odometry.enabled) or selection.much_moves:
             return None
         steps = odometry.stated(scene, config.odometry, selection.keyframes)
         many = np.bincount(whole.observations.keyframe, minlength=whole.n_keyframes) >= odometry.MANY_OBSERVATIONS
@@ -108,8 +109,8 @@ class Study:
     options: SolverOptions
     steps: odometry.Steps  # as stated
     kept: IntArray  # those between keyframes that see much
-    # errors (n, 3), their covariance by images (n, 3, 3), stated sigmas (n,), of rotation and translation; None before
-    # :meth:`run`, and where images do not tell
+    # errors (n, 3), their covariance by images (n, 3, n, 3), stated sigmas (n,), of rotation and translation; None
+    # before :meth:`run`, and where images do not tell
     found: list[tuple[FloatArray, FloatArray, FloatArray]] | None = None
 
     def run(self) -> None:
@@ -128,31 +129,39 @@ class Study:
         unit = np.tile(np.eye(6), (len(kept), 1, 1))
         factors = RelativePoses(pairs, steps.rotation[kept], steps.translation[kept], unit)
         error, by_pose = factors.residuals(result.state), factors.jacobians(result.state)
-        whole = uncertainty.of(np.arange(6 * len(free))).reshape(len(free), 6, len(free), 6)
-        ends = column[pairs]
-        covariances = np.zeros((len(kept), 6, 6))
-        for a, b in itertools.product((0, 1), (0, 1)):
-            between = whole[ends[:, a], :, ends[:, b], :]
-            covariances += by_pose[:, a] @ between @ np.swapaxes(by_pose[:, b], 1, 2)
+        by_free, at = np.zeros((len(kept), 6, len(free), 6)), np.arange(len(kept))
+        for end in (0, 1):
+            by_free[at, :, column[pairs[:, end]]] = by_pose[:, end]
+        J = by_free.reshape(6 * len(kept), -1)
+        covariances = (J @ uncertainty.of(np.arange(6 * len(free))) @ J.T).reshape(2 * (len(kept), 6))
         if np.isfinite(covariances).all():
             parts = ((slice(0, 3), steps.sigma_rad), (slice(3, 6), steps.sigma_m))
-            self.found = [(error[:, of], covariances[:, of, of], sigma[kept]) for of, sigma in parts]
+            self.found = [(error[:, of], covariances[:, of, :, of], sigma[kept]) for of, sigma in parts]
+
+
+def _own(covariances: FloatArray) -> FloatArray:
+    """Return the covariance of each step, (n, 3, 3), out of that of all, (n, 3, n, 3)."""
+    at = np.arange(len(covariances))
+    return covariances[at, :, at]
 
 
 def _fit(error: FloatArray, covariances: FloatArray) -> float:
-    """Return the mean of ``e' C^-1 e / 3``."""
-    return float(np.mean(np.sum(error * np.linalg.solve(covariances, error[:, :, None])[..., 0], axis=1))) / 3.0
+    """Return the mean of ``e' C^-1 e / 3`` over steps, each with its own C."""
+    weighted = np.linalg.solve(_own(covariances), error[:, :, None])[..., 0]
+    return float(np.mean(np.sum(error * weighted, axis=1))) / 3.0
 
 
 def _spread(covariances: FloatArray) -> FloatArray:
-    """Return the standard deviation of an axis, (n,)."""
-    return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 3.0))
+    """Return the standard deviation of an axis of each step, (n,)."""
+    return np.asarray(np.sqrt(np.trace(_own(covariances), axis1=1, axis2=2) / 3.0))
 
 
 def _likelihood(error: FloatArray, covariances: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the logarithm of the likelihood of each share, (n_shares,)."""
-    variance, axes = np.linalg.eigh(covariances)
-    along = (np.swapaxes(axes, 1, 2) @ error[:, :, None])[..., 0]
-    total = np.maximum(variance, 0.0) + (_SHARES[:, None, None] * sigma[:, None]) ** 2
+    """Return the logarithm of the likelihood of each share, (n_shares,), but for what is the same of all."""
+    scale = np.repeat(sigma, 3)
+    whitened = covariances.reshape(len(scale), -1) / np.outer(scale, scale)
+    variance, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    along = axes.T @ (error.ravel() / scale)
+    total = np.maximum(variance, 0.0) + _SHARES[:, None] ** 2
     odd = (_FREEDOM + 1.0) * np.log1p(along**2 / (_FREEDOM * total))
-    return np.asarray(-0.5 * np.sum(np.log(total) + odd, axis=(1, 2)))
+    return np.asarray(-0.5 * np.sum(np.log(total) + odd, axis=1))
