@@ -41,3 +41,14 @@ def test_the_page_names_what_is_there() -> None:
     assert len(names) >= 10
     missing = [name for name in names if not any((folder / name).exists() for folder in (draw.PACKAGE, ROOT))]
     assert missing == []
+
+
+def test_every_room_lies_within_the_picture() -> None:
+    drawn = ElementTree.fromstring(draw.picture())
+    _, _, width, height = map(float, drawn.attrib["viewBox"].split())
+    boxes = [one.attrib for one in drawn if one.attrib.get("class") == "box"]
+    assert len(boxes) == len({room for rooms in draw.LAYERS.values() for room in rooms} - {*draw.UNSEEN})
+    for box in boxes:
+        left, top = float(box["x"]), float(box["y"])
+        assert left >= 0.0 and left + float(box["width"]) <= width, box
+        assert top >= 0.0 and top + float(box["height"]) <= height, box

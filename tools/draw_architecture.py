@@ -60,7 +60,9 @@ STEPS = (
 
 # Sizes, px.
 _SPINE, _SIDE, _GAP, _MARGIN = 640, 172, 10, 20
-_HEIGHT, _LEGEND, _COLUMNS = 68, 440, 3
+_HEIGHT, _LEGEND = 68, 440
+# Beside the way of a keyframe.
+_COLUMNS = max(len(set(rooms) - set(UNSEEN)) for rooms in LAYERS.values()) - 1
 _LEFT = _MARGIN + _COLUMNS * (_SIDE + _GAP)
 _WIDTH = _LEFT + _SPINE + 2 * _MARGIN + _LEGEND
 _STYLE = """

@@ -134,9 +134,10 @@ def flops(sizes: Sizes, factor: Factor) -> float:
 def max_products(sizes: Sizes, *, exact: bool = False) -> float:
     """Return from how many block products on the sparse factor is not the cheapest way."""
     low, high = 1.0, max(sizes.unknowns / sizes.block, 1.0) ** 3
+    dense, form = dense_s(sizes), _form_s(sizes)
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
-        others = min(dense_s(sizes), math.inf if exact else pcg_s(sizes, middle)) - _form_s(sizes)
+        others = min(dense, math.inf if exact else pcg_s(sizes, middle)) - form
         low, high = (middle, high) if 2.0 * sizes.block**3 * middle < others * _SPARSE_FLOPS else (low, middle)
     return high
 

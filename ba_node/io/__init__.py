@@ -1,3 +1,3 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read and write files: MCAP recordings, BAL problems, TUM trajectories, PLY clouds."""
+"""Read and write files: recordings, maps, rigs, problems and models of other tools, trajectories, clouds."""

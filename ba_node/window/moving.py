@@ -29,7 +29,7 @@ import dataclasses
 import numpy as np
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import consensus, native_kernels, triangulation
 from ba_node.core.problem import Problem
 from ba_node.window.problems import part_of
@@ -75,8 +75,22 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     doubted = part_of(problem, rows, found)
     places, _ = consensus.triangulate(triangulation.rays_of(doubted, kernels), doubted.n_points, _BOUND, kernels)
     at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
-    found[found] = _leaves_more_than_noise(doubted, native_kernels.residual_norms(doubted, at, kernels), off, kernels)
+    again = native_kernels.residual_norms(doubted, at, kernels)
+    again[_mismatches(doubted.observations.point, again)] = np.inf
+    found[found] = _leaves_more_than_noise(doubted, again, off, kernels)
     return found
+
+
+def _mismatches(point: IntArray, norms: FloatArray) -> BoolArray:
+    """Return which views are off by far more than those before and after them of the same point, (n_obs,).
+
+    A point that moves leaves its place little by little.
+    """
+    same = point[1:] == point[:-1]
+    with np.errstate(invalid="ignore"):
+        step = np.diff(norms)
+    rises, falls = np.append(False, same & (step > _LARGE)), np.append(same & (step < -_LARGE), False)
+    return np.asarray(rises & falls)
 
 
 def much(problem: Problem, moves: BoolArray) -> bool:

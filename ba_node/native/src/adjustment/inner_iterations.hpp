@@ -53,7 +53,8 @@ inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end
   best_cost = splat(std::numeric_limits<double>::infinity());
   const double huber = rows.huber();
   Flatness flat;
-  const auto evaluate = [&](bool again) {
+  // bend: also what Huber's loss takes from the curvature, which the first and the last look have no use for.
+  const auto evaluate = [&](bool again, bool bend) {
     sums = PointSums{};
     flat = Flatness{};
     for (std::int64_t slot = first; slot < end; ++slot) {
@@ -61,12 +62,12 @@ inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end
       if (!again) rows.gather<kLens>(slot, images[slot - first]);
       rows.evaluate<kLens, kDepth, true>(slot, images[slot - first], x, obs);
       add_point_rows<kDepth ? 3 : 2>(obs, sums);
-      if (huber > 0.0) flat.add(obs, huber);
+      if (bend) flat.add(obs, huber);
       keep(slot, obs);
     }
   };
   for (int step = 0; step <= steps; ++step) {
-    evaluate(step > 0);
+    evaluate(step > 0, huber > 0.0 && step > 0 && step < steps);
     if (step == 0) before = sums.cost;
     const Mask better = active & (sums.cost < best_cost);  // not if worse, or not a number
     const V8 least = flat.any ? select(flat.where(), splat(kMinGainOutlier), splat(kMinGain)) : splat(kMinGain);
@@ -98,7 +99,7 @@ inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end
     mu *= 0.1;
   }
   for (int i = 0; i < 3; ++i) x[i] = best[i];
-  if (any(worse)) evaluate(true);
+  if (any(worse)) evaluate(true, false);
 }
 
 }  // namespace ba::BA_TARGET

@@ -168,17 +168,19 @@ class SparseSchur {
     for (std::size_t i = 1; i < begin.size(); ++i)
       most_edges_ = std::max<std::int64_t>(most_edges_, begin[i] - begin[i - 1]);
     order_.resize(l_.n_edges());
-    std::vector<bool> leads(l_.n_edges(), false);
+    std::vector<std::int32_t> strip_of(l_.n_edges(), -1);  // of the edges that stand for others
+    std::int32_t strip = 0;
     place_of_gradient_.resize(l_.n_edges());
     for (std::int64_t p = 0; p + 1 < static_cast<std::int64_t>(l_.point_edge.size()); ++p) {
       for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
-        leads[e] = (e - l_.point_edge[p]) % kRowsAtOnce == 0;
+        while (e >= begin[strip + 1]) ++strip;
+        if ((e - l_.point_edge[p]) % kRowsAtOnce == 0) strip_of[e] = strip;
         place_of_gradient_[e] = static_cast<std::int32_t>(p / kLanes * 3 * kLanes + p % kLanes);
       }
     }
     order_end_ = begin;
     for (std::int32_t e : l_.edges_of_keyframe)
-      if (leads[e]) order_[order_end_[std::upper_bound(begin.begin(), begin.end(), e) - begin.begin() - 1]++] = e;
+      if (strip_of[e] >= 0) order_[order_end_[strip_of[e]]++] = e;
   }
 
   std::int64_t first_edge(std::int64_t batch) const { return l_.point_edge[kLanes * batch]; }

@@ -63,18 +63,12 @@ const Target& active_target() { return *target; }
 
 namespace {
 
-template <class F>
-auto without_gil(F f) {
-  py::gil_scoped_release release;
-  return f();
-}
-
 Doubles residual_norms(const py::object& problem, const py::object& state) {
   const ProblemArrays arrays(problem);
   const StateArrays at(state);
   Doubles norms = empty({arrays.keyframe.size()});
   double* out = norms.mutable_data();
-  without_gil([&] { target->residual_norms(arrays.view(), at.view(), out); });
+  unless_short(norms.size(), [&] { target->residual_norms(arrays.view(), at.view(), out); });
   return norms;
 }
 

@@ -58,7 +58,9 @@ Ints ints(const std::vector<std::int64_t>& values) {
 
 Ints views_of_landmarks(const Column<std::int64_t>& last, const Column<std::int64_t>& previous, const Ints& landmarks,
                         std::int64_t newest) {
-  return ints(views_of(last.data(), previous.data(), rows_view(landmarks), newest));
+  const std::int64_t *from = last.data(), *before = previous.data();
+  const RowsView which = rows_view(landmarks);
+  return ints(unless_short(which.n, [&] { return views_of(from, before, which, newest); }));
 }
 
 Ints distinct_landmarks(const py::object& table, const Ints& begin, const Ints& end, Column<std::int64_t> scratch) {
@@ -79,7 +81,9 @@ py::tuple gather(const py::object& table, const Ints& rows, const std::pair<Ints
   Column<std::int64_t> of_keyframe = scratch.first, of_landmark = scratch.second;
   const Numbered keyframes(rows_view(listed.first), of_keyframe.mutable_data());
   const Numbered landmarks(rows_view(listed.second), of_landmark.mutable_data());
-  const std::vector<PlacedView> views = placed(from, rows_view(rows), keyframes, landmarks);
+  const RowsView asked = rows_view(rows);
+  const std::vector<PlacedView> views =
+      unless_short(asked.n, [&] { return placed(from, asked, keyframes, landmarks); });
   const auto n = static_cast<py::ssize_t>(views.size());
   Ints row({n}), keyframe({n}), camera({n}), point({n});
   Doubles uv({n, py::ssize_t{2}}), sigma({n}), depth({n});
@@ -87,18 +91,20 @@ py::tuple gather(const py::object& table, const Ints& rows, const std::pair<Ints
                *to_point = point.mutable_data();
   double *to_uv = uv.mutable_data(), *to_sigma = sigma.mutable_data(), *to_depth = depth.mutable_data();
   bool measured = false;
-  for (py::ssize_t i = 0; i < n; ++i) {
-    const PlacedView& v = views[i];
-    to_row[i] = v.row;
-    to_keyframe[i] = v.keyframe;
-    to_camera[i] = v.camera;
-    to_point[i] = v.point;
-    to_uv[2 * i] = from.uv[2 * v.row];
-    to_uv[2 * i + 1] = from.uv[2 * v.row + 1];
-    to_sigma[i] = from.sigma[v.row];
-    to_depth[i] = from.depth[v.row];
-    measured |= !std::isnan(to_depth[i]);
-  }
+  unless_short(n, [&] {
+    for (py::ssize_t i = 0; i < n; ++i) {
+      const PlacedView& v = views[i];
+      to_row[i] = v.row;
+      to_keyframe[i] = v.keyframe;
+      to_camera[i] = v.camera;
+      to_point[i] = v.point;
+      to_uv[2 * i] = from.uv[2 * v.row];
+      to_uv[2 * i + 1] = from.uv[2 * v.row + 1];
+      to_sigma[i] = from.sigma[v.row];
+      to_depth[i] = from.depth[v.row];
+      measured |= !std::isnan(to_depth[i]);
+    }
+  });
   return py::make_tuple(row, keyframe, camera, point, uv, sigma, measured ? depth : Doubles({py::ssize_t{0}}));
 }
 
@@ -149,7 +155,9 @@ py::object rays(const py::object& problem, const Doubles& seen) {
       distance_sigma({n});
   const RaysSpan out{centre.mutable_data(), direction.mutable_data(), px_per_rad.mutable_data(),
                      distance.mutable_data(), distance_sigma.mutable_data()};
-  const bool good = rays_of(view, arrays.start.view(), seen.size() ? seen.data() : nullptr, out);
+  const StateView at = arrays.start.view();
+  const double* in_cameras = seen.size() ? seen.data() : nullptr;
+  const bool good = unless_short(n, [&] { return rays_of(view, at, in_cameras, out); });
   return py::make_tuple(py::make_tuple(centre, direction, px_per_rad, distance, distance_sigma), good);
 }
 
@@ -223,7 +231,9 @@ py::object explained(const py::object& problem, const std::tuple<Ints, Ints, Dou
 
 bool is_sound_problem(const py::object& problem) {
   const ProblemArrays arrays(problem);
-  return is_sound(arrays.view(), arrays.start.view());
+  const ProblemView view = arrays.view();
+  const StateView start = arrays.start.view();
+  return unless_short(view.n_obs, [&] { return is_sound(view, start); });
 }
 
 // most: variances of blocks that are scaled to a unit diagonal.
