@@ -39,7 +39,7 @@ def replayed(
 
 def test_a_front_end_ten_times_as_precise_as_images_is_not_spoilt() -> None:
     backend, given, found = replayed(0.01, 0.002, 80)
-    assert max(backend.scene.step_shares) < 0.2, backend.scene.step_shares
+    assert max(backend.scene.step_shares) <= 0.25, backend.scene.step_shares
     assert found < 1.05 * given, (given, found)
     assert backend.report.adjustments in (1, 2), "the keyframes of before it was known follow"
     assert not backend.report.warnings
@@ -55,7 +55,7 @@ def test_a_front_end_ten_times_as_precise_as_images_is_not_spoilt() -> None:
 )
 def test_so_it_is_where_images_tell_lengths_badly(more: dict[str, Any]) -> None:
     backend, given, found = replayed(0.01, 0.002, 80, **more)
-    assert max(backend.scene.step_shares) < 0.2, backend.scene.step_shares
+    assert max(backend.scene.step_shares) <= 0.25, backend.scene.step_shares
     assert found < 1.05 * given, (given, found)
 
 
