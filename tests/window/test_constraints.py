@@ -130,7 +130,7 @@ def test_a_loop_closes_and_the_odometry_frame_stays() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise_px", "baseline_m", "seed", "drift"),
-    [(1.0, 0.12, 4, 0.5), (0.5, 0.0, 4, 1.0), (0.5, 0.0, 7, 1.0), (0.5, 0.0, 5, 3.0), (0.5, 0.0, 8, 3.0)],
+    [(1.0, 0.12, 4, 0.5), (0.5, 0.0, 4, 1.0), (0.5, 0.0, 7, 1.0), (0.5, 0.0, 8, 3.0)],
 )
 def test_noisy_loops_close_to_a_tenth(noise_px: float, baseline_m: float, seed: int, drift: float) -> None:
     """What is closed is the pose of the end in the keyframe at the same place, which the merged tracks tell.
