@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -22,8 +23,10 @@ from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
 from ba_node.core.problem import KeyframeFactors, Problem, State
 from ba_node.core.two_level import TwoLevel
-from ba_node.native._kernels import Kernel
-from ba_node.native._kernels import RelativePoses as CompiledPoses
+
+if TYPE_CHECKING:
+    from ba_node.native._kernels import Kernel
+    from ba_node.native._kernels import RelativePoses as CompiledPoses
 
 
 class KernelsError(ValueError):

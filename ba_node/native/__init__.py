@@ -13,13 +13,17 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import warnings
+from pathlib import Path
 from typing import Any
 
 
 def usable(module: Any) -> Any:
-    """Return the compiled kernels if they were built from this version of the sources; else None, with a warning."""
-    if hasattr(module, "use_target"):
+    """Return the compiled kernels if they have all that ``_kernels.pyi`` declares; else None, with a warning."""
+    stub = Path(__file__).with_name("_kernels.pyi").read_text(encoding="utf-8")
+    declared = re.findall(r"^(?:class|def) (\w+)(?=:|\((?!Protocol))", stub, re.MULTILINE)
+    if all(hasattr(module, name) for name in declared):
         return module
     text = f"{module.__file__} was built from another version of ba_node: install ba_node again (here: make setup)"
     warnings.warn(f"{text}; numpy does its work, some ten times slower", RuntimeWarning, stacklevel=3)
