@@ -76,21 +76,33 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     places, _ = consensus.triangulate(triangulation.rays_of(doubted, kernels), doubted.n_points, _BOUND, kernels)
     at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
     again = native_kernels.residual_norms(doubted, at, kernels)
-    again[_mismatches(doubted.observations.point, again)] = np.inf
+    again[_mismatches(doubted, again)] = np.inf
     found[found] = _leaves_more_than_noise(doubted, again, off, kernels)
     return found
 
 
-def _mismatches(point: IntArray, norms: FloatArray) -> BoolArray:
+def _mismatches(problem: Problem, norms: FloatArray) -> BoolArray:
     """Return which views are off by far more than those before and after them of the same point, (n_obs,).
 
-    A point that moves leaves its place little by little.
+    A point that moves leaves its place little by little. Nor may the views before and after by the same camera be off
+    likewise: of a rig that is not as it is said to be, one camera's views are, in every keyframe.
     """
-    same = point[1:] == point[:-1]
+    obs = problem.observations
+    track = obs.point * len(problem.cameras.model) + obs.camera
+    order = np.argsort(track, kind="stable")
+    found = _stands_out(obs.point, norms, alone=False)
+    found[order] &= _stands_out(track.take(order), norms.take(order), alone=True)
+    return found
+
+
+def _stands_out(track: IntArray, norms: FloatArray, *, alone: bool) -> BoolArray:
+    """Return which residuals are far larger than those before and after them in the same track, or ``alone``."""
+    goes_on = np.diff(track) == 0
     with np.errstate(invalid="ignore"):
         step = np.diff(norms)
-    rises, falls = np.append(False, same & (step > _LARGE)), np.append(same & (step < -_LARGE), False)
-    return np.asarray(rises & falls)
+    rises, falls = step > _LARGE, step < -_LARGE
+    rises, falls = np.where(goes_on, rises, alone), np.where(goes_on, falls, alone)
+    return np.asarray(np.append(alone, rises) & np.append(falls, alone))
 
 
 def much(problem: Problem, moves: BoolArray) -> bool:

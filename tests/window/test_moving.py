@@ -121,7 +121,7 @@ def test_mismatches_near_by_do_not_move() -> None:
     problem = dataclasses.replace(problem, observations=observations)
     again = np.where(wrong, off_px / observations.sigma_px, norms)
     found = moving(problem, again, np.zeros(problem.n_keyframes, bool))
-    assert found.mean() < 0.12, f"{found.mean():.3f}"
+    assert found.mean() < 0.15, f"{found.mean():.3f}"
 
 
 @pytest.mark.slow
