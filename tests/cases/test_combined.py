@@ -88,7 +88,7 @@ CASES = (
     Combined((("rectified_with_distortion", 0.5),), "mono", 841, {"path": "loop"}, "rectified though a distortion"),
     Combined((("steps_scaled", 0.95),), "stereo", 842, {}, "scale"),
     Combined((("baseline_reversed", None), ("stands_still", 15.0)), "stereo", 851, {}, "baseline|swapped"),
-    Combined((("swapped_midway", None), ("outliers_uniform", 0.2)), "stereo", 852, {"path": "loop"}, "on the body"),
+    Combined((("swapped_midway", None), ("outliers_uniform", 0.2)), "stereo", 852, {"path": "loop"}, "swapped"),
     Combined((("depth_mm_midway", 1000.0), ("stops_midway", 12.0)), "rgbd", 853, {}, "millimetres"),
     Combined((("extrinsics_inverted", None),), "mono", 854, {"path": "loop", "look_deg": 90.0}, "invert"),
     Combined((("clock_set_back", 7.0), ("outliers_jumping", 0.2)), "rgbd", 855, {"path": "loop"}, "stamp|clock"),
