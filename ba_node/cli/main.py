@@ -81,6 +81,7 @@ ba COMMAND --help tells more about each, with an example. Exit codes: 0 all is w
 3 results were written and something has to be looked at, 130 and 143 interrupted."""
 USAGE_ERROR = 2
 INTERRUPTED = 130
+NOBODY_READS = 141  # as a shell has it: 128 and the number of SIGPIPE
 FAULT = 1
 _ROS_PACKAGES = (
     "rclpy",
@@ -173,6 +174,8 @@ def build_parser(command: str) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code: 0, 2 for wrong input, 3 if results need a look, 130 when interrupted.
 
+    It is 141 where whoever reads the output leaves before the work is through.
+
     In a process that is there for ``ba`` alone it does not return but ends it, as a signal may come until the very end.
     """
     if argv is not None or not interrupts.begun():
@@ -200,20 +203,22 @@ def _run(argv: Sequence[str] | None) -> int:
     if "_ARGCOMPLETE" in os.environ:
         _complete()
     command = next((word for word in arguments if not word.startswith("-")), "")
+    code: int = NOBODY_READS
     try:
         args = build_parser(command).parse_args(arguments)
         asked = getattr(args, "json", None)
         require_folder(asked)
         with json_alone(asked):
-            code: int = module_of(args.command).run(args)
+            code = module_of(args.command).run(args)
             if asked is not None:
                 conclude(args, code)
         sys.stdout.flush()
         return code
     except BrokenPipeError:
-        # The reader of our output has enough. Python must not try to flush the rest when it ends.
+        # The reader of our output has enough: the code stays what it was, if the work was through. Python must not try
+        # to flush the rest when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return code
     except KeyboardInterrupt:
         return _end(INTERRUPTED, "interrupted")
     except ModuleNotFoundError as error:
