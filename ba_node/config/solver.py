@@ -178,7 +178,11 @@ class SolverOptions(SolverConfig):
         "How mu follows the gain ratio rho.",
         choices=(
             Choice("nielsen", "rho > 0: mu max(1/3, 1 - (2 rho - 1)^3); else mu nu, nu = 2, 4, 8, ...", "Alg. 6"),
-            Choice("fast", "as nielsen, but mu/5 where rho > 1/2, and mu/2 where rho > 1/4"),
+            Choice(
+                "fast",
+                "as nielsen, but mu/5 where rho > 1/2, mu/2 where rho > 1/4, and as it is where a region that bad steps"
+                " have made narrow cut the step off",
+            ),
         ),
     )
     initial_damping: float = option(1e-4, "First mu.", within=(0.0, 1e100))
