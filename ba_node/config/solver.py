@@ -264,8 +264,9 @@ class SolverOptions(SolverConfig):
 
     def check(self) -> None:
         """Raise ConfigError if a choice does not exist or contradicts another; say which, and what to do."""
-        for chosen in _CHOSEN:
-            chosen.check(getattr(self, chosen.name))
+        for chosen, names in _CHOSEN:
+            if getattr(self, chosen.name) not in names:
+                chosen.check(getattr(self, chosen.name))
         if self.loss != "squared" and not (math.isfinite(self.loss_scale_px) and self.loss_scale_px > 0.0):
             raise ConfigError(
                 f"loss = {self.loss} with loss_scale_px = {self.loss_scale_px}: a robust loss needs the residual, in"
@@ -282,4 +283,4 @@ class SolverOptions(SolverConfig):
             )
 
 
-_CHOSEN = tuple(option for option in declared(SolverOptions) if option.allowed)
+_CHOSEN = tuple((option, option.choices) for option in declared(SolverOptions) if option.allowed)
