@@ -23,6 +23,7 @@ from ba_node.config import Config, SolverOptions
 from ba_node.core import methods, solver
 from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
+from ba_node.estimate import Refinement
 from ba_node.scene.scene import Scene
 from ba_node.window import guard
 from ba_node.window.merging import Merged, outcome
@@ -51,21 +52,21 @@ class Attempt(NamedTuple):
     solve_time_s: float  # time in the solver, s
 
 
-def attempt(
-    scene: Scene,
-    config: Config,
-    end: int,
-    trust: Trust,
-    *,
-    clock: Callable[[], float],
-    on_iteration: Callable[[Iteration], bool] | None,
-) -> Attempt | str:
+class Following(NamedTuple):
+    """What follows a solve while it is made."""
+
+    clock: Callable[[], float]  # s, for the report alone
+    on_iteration: Callable[[Iteration], bool] | None = None  # ends the solve by returning False
+    on_poses: Callable[[Refinement], None] | None = None  # gets the poses of a solution as soon as it is taken
+
+
+def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Following) -> Attempt | str:
     """Solve the newest window among the first ``end`` keyframes, or return why it cannot be solved yet.
 
     The scene is not changed, but for where keyframes begin that were not refined yet.
     """
     without: tuple[int, ...] = ()
-    solve_time_s = 0.0
+    solve_time_s, (clock, on_iteration, _) = 0.0, following
     while True:
         selection = select(scene, config, end, without)
         if isinstance(selection, str):

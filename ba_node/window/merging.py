@@ -45,6 +45,7 @@ def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConf
     found = outcome(scene, selection, result, tracks, kernels)
     if found.state is None:
         return found
+    put_poses(scene, selection, found.state)
     return found._replace(norms=apply(scene, selection, found.state, found.norms, tracks, kernels))
 
 
@@ -124,23 +125,29 @@ def _noticed_m(selection: Selection, state: State) -> float:
     return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
 
 
+def put_poses(scene: Scene, selection: Selection, state: State, without: tuple[int, ...] = ()) -> None:
+    """Put the poses of a solution, in the scale of the map, into the scene; keyframes of ``without`` had none."""
+    free = ~selection.problem.fixed
+    rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
+    rows, table = selection.keyframes[free], scene.keyframes
+    table.rotation[rows] = geometry.nearest_rotation(rotation)
+    table.position[rows] = position + selection.origin
+    left_out = np.array(without, np.intp)
+    scene.moved(np.concatenate([selection.keyframes[free | ~table.refined[selection.keyframes]], left_out]))
+    table.refined[selection.keyframes] = True
+    table.refined[left_out] = False
+
+
 def apply(
     scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, kernels: str = "auto"
 ) -> FloatArray:
-    """Put a solution, in the scale of the map, into the scene and classify its observations anew.
+    """Put the points of a solution into the scene, whose poses are there, and classify its observations anew.
 
     ``norms`` (n_all,) are the sizes of its residuals, as ``Selection.norms``; they are written over, and returned.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
     """
-    free = ~selection.problem.fixed
-    rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
-    rows = selection.keyframes[free]
-    scene.keyframes.rotation[rows] = geometry.nearest_rotation(rotation)
-    scene.keyframes.position[rows] = position + selection.origin
-    scene.moved(selection.keyframes[free | ~scene.keyframes.refined[selection.keyframes]])
-    scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
     classify(scene, selection, state, norms, tracks, kernels)
