@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import TracksConfig
 from ba_node.core import geometry, native_kernels
@@ -76,14 +77,8 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
 
 def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str) -> State:
     """Return a state whose points that ran away are back where they began; their norms are written over."""
-    whole, point, n = selection.whole, selection.observations.point, selection.problem.n_points
-    limit = _noticed_m(selection, state)
-    centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
-    measured = _has_depth(whole.observations, n)
-    away, began = ((_largest(points - centre) > limit) & ~measured for points in (state.points, whole.start.points))
-    agreeing = np.bincount(point[norms <= gate], minlength=n)
-    leapt = _largest(state.points - whole.start.points) > _LEAP * _largest(whole.start.points - centre)
-    doubted = away | leapt | (2 * agreeing < np.bincount(point, minlength=n))
+    whole, point = selection.whole, selection.observations.point
+    doubted, agreeing, away, began, leapt = _doubted(selection, state, norms, gate, kernels)
     rows = np.flatnonzero(doubted.take(point))
     if not len(rows):
         return state
@@ -102,6 +97,30 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     return dataclasses.replace(state, points=points)
 
 
+def _doubted(
+    selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str
+) -> tuple[BoolArray, IntArray, BoolArray, BoolArray, BoolArray]:
+    """Return which points may have run away, (n_pt,), and how many views agree with each.
+
+    And which are too far away, which began there, and which have leapt.
+    """
+    point, n = selection.observations.point, selection.problem.n_points
+    points, start = state.points, selection.problem.start.points
+    position = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0]
+    centre, limit = position.mean(axis=0), _noticed_m(selection, position)
+    measured = _has_depth(selection.observations, n)
+    if kernels != "numpy" and native.kernels is not None:
+        limits = gate, limit, _LEAP
+        found: tuple[BoolArray, IntArray, BoolArray, BoolArray, BoolArray] = native.kernels.may_have_run_away(
+            point, norms, (points, start), (centre, measured), limits
+        )
+        return found
+    away, began = ((_largest(where - centre) > limit) & ~measured for where in (points, start))
+    agreeing = np.bincount(point[norms <= gate], minlength=n)
+    leapt = _largest(points - start) > _LEAP * _largest(start - centre)
+    return away | leapt | (2 * agreeing < np.bincount(point, minlength=n)), agreeing, away, began, leapt
+
+
 def _largest(vectors: FloatArray) -> FloatArray:
     """Return the largest coordinate of each of (n, 3) vectors, without its sign."""
     # numpy takes ten times as long for the largest of rows that are so short.
@@ -117,10 +136,13 @@ def _has_depth(observations: Observations, n: int) -> BoolArray:
     return found
 
 
-def _noticed_m(selection: Selection, state: State) -> float:
-    """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise."""
+def _noticed_m(selection: Selection, position: FloatArray) -> float:
+    """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise.
+
+    ``position`` (n_kf, 3) is that of the keyframes, m.
+    """
     cams, obs = selection.problem.cameras, selection.observations
-    spread = np.ptp(-(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0], axis=0).max()
+    spread = np.ptp(position, axis=0).max()
     spread = max(float(spread), float(np.ptp(cams.translation, axis=0).max()))
     return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
 
