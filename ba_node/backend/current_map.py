@@ -22,7 +22,7 @@ from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.calibration import Calibration
-from ba_node.estimate import Correction, Estimate, Extras, Refinement, SolveReport, Status, Transform, World
+from ba_node.estimate import Correction, Estimate, Extras, Poses, Refinement, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
 from ba_node.window import culling, full, old_keyframes, precision, quality, view
@@ -200,18 +200,20 @@ class CurrentMap:
         due = self.completion.due(self.scene)
         end = self._end(due)
         taking_part = window.rows_of(self.scene, self.config, end)
+        refined: Poses | None = None
         extra: dict[str, Any] = {}
         if wrong:
             self.hold_all(solve_count, wrong)
         else:
-            taking_part, extra = self._solve((solve_count, taking_part), end, wanted, following)
+            refined, extra = self._solve((solve_count, taking_part), end, wanted, following)
         self.scene.keyframes.solved[_reached(self.scene, due, end)] = True
-        return dataclasses.replace(self.estimate(taking_part), **extra)
+        refined = poses_of(self.scene, taking_part) if refined is None else refined
+        return dataclasses.replace(self.estimate(refined), **extra)
 
     def _solve(
         self, which: tuple[int, IntArray], end: int, wanted: Extras, following: Following
-    ) -> tuple[IntArray, dict[str, Any]]:
-        """Solve the newest window and report; return the keyframes that took part, and what is wanted of a solution.
+    ) -> tuple[Poses | None, dict[str, Any]]:
+        """Solve the newest window and report; return its poses, and what is wanted of a solution; None without one.
 
         ``which`` are the number of the solve and the keyframes of its window, oldest first.
         """
@@ -220,9 +222,11 @@ class CurrentMap:
         tried, moved = attempt(self.scene, self.config, end, self._trust, following), Move()
         if isinstance(tried, str):
             self.report = dataclasses.replace(self.base_report(count, newest), reason=tried)
-            return taking_part, {}
+            return None, {}
         selection, (norms, state, _) = tried.selection, tried.found
-        taking_part, extra = _taking_part_of(self.scene, selection), {}
+        taking_part = _taking_part_of(self.scene, selection)
+        refined: Poses | None = None
+        extra: dict[str, Any] = {}
         for stray in selection.strays:
             text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
             if text:
@@ -232,8 +236,8 @@ class CurrentMap:
         elif state is not None:
             window.put_poses(self.scene, selection, state, tried.without)
             moved = self._correct(int(taking_part[-1]))
-            if following.on_poses is not None:
-                following.on_poses(self._refinement(taking_part))
+            refined = poses_of(self.scene, taking_part)
+            following.on_poses(self._refinement(refined))
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
             rows = selection.keyframes, selection.landmarks, selection.origin
             old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
@@ -246,7 +250,7 @@ class CurrentMap:
             statistics |= {"status": Status.HELD, "reason": tried.held}
         statistics |= moved.statistics() | {"solve_time_s": tried.solve_time_s}
         self.report = dataclasses.replace(self.base_report(count, newest), **statistics)
-        return taking_part, extra
+        return refined if refined is not None else poses_of(self.scene, taking_part), extra
 
     def begun_study(self) -> precision.Study | None:
         """Return what the last solve asks of the front-end's steps; None if nothing, or if it was returned before."""
@@ -292,10 +296,9 @@ class CurrentMap:
         body = Transform(table.input_rotation[row], table.input_position[row])
         return self.correction.update(self.config.frames, found, body, int(table.stamp_ns[row]))
 
-    def _refinement(self, rows: IntArray) -> Refinement:
-        """Return the poses of some keyframes as those that a solve has refined."""
+    def _refinement(self, poses: Poses) -> Refinement:
         where = self.stamp_ns, self.config.frames.map_frame, self.session_id
-        return Refinement(*where, poses_of(self.scene, rows), self._published(), self.index)
+        return Refinement(*where, poses, self._published(), self.index)
 
     def base_report(self, solve_count: int, newest: int) -> SolveReport:
         """Return what a report tells of any solve, by the row of its newest keyframe."""
@@ -317,15 +320,15 @@ class CurrentMap:
         """
         return quality.rms_px(self.scene, self.config, state)
 
-    def estimate(self, refined: IntArray | None = None) -> Estimate:
-        """Return all that is known, the refined keyframes being those in some rows, or all."""
+    def estimate(self, refined: Poses | None = None) -> Estimate:
+        """Return all that is known, with the poses that a solve refined, or all."""
         scene = self.scene
         scene.propagate_corrections()
         trajectory = MapPoses.taken(scene)
         return Estimate(
             stamp_ns=self.stamp_ns,
             frame_id=self.config.frames.map_frame,
-            refined=trajectory if refined is None else poses_of(scene, refined),
+            refined=trajectory if refined is None else refined,
             trajectory=trajectory,
             cloud=MapCloud.taken(scene),
             report=self.report,

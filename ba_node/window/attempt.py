@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
 from ba_node.config import Config, SolverOptions
 from ba_node.core import methods, solver
 from ba_node.core.problem import Problem
@@ -57,7 +56,7 @@ class Following(NamedTuple):
 
     clock: Callable[[], float]  # s, for the report alone
     on_iteration: Callable[[Iteration], bool] | None = None  # ends the solve by returning False
-    on_poses: Callable[[Refinement], None] | None = None  # gets the poses of a solution as soon as it is taken
+    on_poses: Callable[[Refinement], None] = lambda _: None  # gets the poses of a solution as soon as it is taken
 
 
 def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Following) -> Attempt | str:
@@ -72,7 +71,7 @@ def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Fol
         if isinstance(selection, str):
             return selection
         options = methods.from_config(config.solver)
-        problem = _begun(selection.problem, selection.norms.take(selection.used), options)
+        problem = _begun(selection, options)
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True)
         solve_time_s += clock() - began
@@ -88,11 +87,12 @@ def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Fol
         without, trust.cause = verdict.keyframes, verdict.reason
 
 
-def _begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Problem:
-    """Return a problem with a better start, if its own is bad; ``norms`` (n_obs,) are the residuals there, sigmas."""
-    scale = options.loss_scale_px
+def _begun(selection: Selection, options: SolverOptions) -> Problem:
+    """Return the problem with a better start, if its own is bad."""
+    problem, scale = selection.problem, options.loss_scale_px
     if options.loss not in _FADING or problem.n_keyframes > _YOUNG:
         return problem
+    norms = selection.norms.take(selection.used)
     far = norms > _FAR * scale
     keyframe = problem.observations.keyframe
     n = np.bincount(keyframe, minlength=problem.n_keyframes)
