@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from ba_node.core import covariance, linear, native_kernels, point_priors
 from ba_node.core.annealing import Annealing
 from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.problem import Problem
+from ba_node.core.problem import Problem, State
 from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Iteration, Result, Status
 
@@ -95,8 +96,15 @@ def solve(
     with np.errstate(all="ignore"):
         result = run.run()
         if weakest and result.status.usable:
-            result = replace(result, weakest=covariance.weakest(run.kernels, problem, result.state, options))
+            result = replace(result, loosest=partial(_weakest, run.kernels, problem, result.state, options))
+            # Kernels of several ranks work it out together, or not at all.
+            return result if kernels is None else result.settled()
         return result
+
+
+def _weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
+    with np.errstate(all="ignore"):
+        return covariance.weakest(kernels, problem, state, options)
 
 
 class _Run:

@@ -121,6 +121,7 @@ class Optimization:
             result = (by or solver.solve)(
                 self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True
             )
+        result = result.settled()
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
             # After it the front-end's steps set the scale, be they factors or not.
