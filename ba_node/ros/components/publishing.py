@@ -76,7 +76,7 @@ class Publishing(Component):
     def take_poses(self, refined: Refined, _newest: bool) -> None:
         """Publish the poses of a solve, and note how old they are then."""
         wanted = {topic for topic in _POSES if self._outputs[topic].get_subscription_count()}
-        for topic, message in pose_outputs(self._factory, refined.refinement, wanted):
+        for topic, message in pose_outputs(refined.refinement, wanted):
             self._outputs[topic].publish(message)
         self._measure(refined)
 

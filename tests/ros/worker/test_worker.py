@@ -180,6 +180,7 @@ def test_poses_leave_before_the_rest_is_worked_out(early: bool, monkeypatch: pyt
             found += rig.worker.outputs()
         (poses,) = found
         assert isinstance(poses, worker.Refined)
+        assert poses.refinement.poses is not None
         assert (poses.refinement.poses.keyframe_id.tolist(), poses.arrived_s) == ([7], 0.25)
         assert rested.is_set() != early, "the solve goes on when the poses have been published"
         rig.worker.poses_left()
