@@ -290,9 +290,9 @@ class Backend:
         return full.take_snapshot(self.scene, self.config, self.extras)
 
     def copied(self) -> Callable[[], full.Optimization | str]:
-        """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called on any thread."""
-        scene, clone, config, wanted = self.scene, self.scene.clone(), self.config, self.extras
-        return lambda: full.take_snapshot(clone, config, wanted, scene)
+        """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called once, on any thread."""
+        scene, copies, config, wanted = self.scene, [self.scene.clone()], self.config, self.extras
+        return lambda: full.take_snapshot(copies.pop(), config, wanted, scene)
 
     def is_current(self, optimization: full.Optimization) -> bool:
         """Return True if a solve of everything is of the current map."""
