@@ -2,18 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learn how much more precise the front-end's steps are than stated, where nobody told their covariance.
 
-Once for so many keyframes as a window holds it is solved again without the steps. A step then differs from the
+Once for so many keyframes as a window holds it is solved again without the steps, to the end: the scale of one camera
+hardly changes the objective, and a solve that stops early finds that of the steps. A step then differs from the
 front-end's by e, of which images explain the covariance C (``core/covariance.py``) and the front-end the rest:
 ``e ~ N(0, C + s^2 sigma^2 I)``, with sigma as the parameters state it, for all steps of the window at once: images that
 tell little of each may tell much of their sum. The likelihood of the share s is added up over windows, for rotation and
 translation apart, with Student's distribution (5 degrees of freedom) of each component along the axes of C in stated
-sigmas, so that single wild steps do not decide, and older windows fade. A share below 1 is taken where it is far
-more likely than 1. So a front-end that is more precise than images holds the keyframes, in place of being spoilt by
-them; the keyframes of before follow by a solve of everything (``adjustment.py``).
+sigmas, so that single wild steps do not decide, and older windows fade.
+
+Shares below 1 are held against 1 with odds of e^6 where images tell a step as well as stated sigmas do, or better.
+Where their standard deviation is c times as large, their weight beside a step as stated is 1/c^2, so little is lost
+by a share that is too small, and the exponent is divided by c^2. One camera tells lengths so badly (c = 2 to 5) that
+what its few windows say decides. Taken is the mean of log s less its standard deviation: in doubt what came in
+stands. So a front-end that is more precise than images holds the keyframes, in place of being spoilt by them; the
+keyframes of before follow by a solve of everything (``adjustment.py``).
 
 A front-end that sees the same images has steps whose errors are not its own: with the images they agree too well, or as
-its tracks do not. So steps count as precise only where e is what C alone says, ``e' C^-1 e`` near 3 for rotation and
-translation, and where images tell less than a fifth of a stated sigma at least: where they tell more, steps as stated
+its tracks do not. So steps count as precise only where e is what C and the share say, ``z^2`` along these axes near 1,
+and where images tell less than a fifth of a stated sigma at least: where they tell more, steps as stated
 have no weight that could do harm, and none is to be had by mistake. Where the first windows tell nothing of the kind it
 is not asked any more; larger shares are odometry.py's.
 
@@ -22,7 +28,9 @@ Only where images have a scale of their own (several cameras, or depths), or two
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +45,13 @@ from ba_node.window.selection import Selection
 
 _SHARES = 0.5 ** np.arange(7)
 _FREEDOM = 5.0
-# Logarithm of how much more likely a share is than 1, to be taken; windows without one, after which that is that; and
+# Logarithm of the odds of a share of 1 before anything is known; windows without another, after which that is that; and
 # what a window counts once another has come.
 _TELLING, _ENOUGH, _FADES = 6.0, 3, 0.8
-# How many windows tell it at least; bounds of e' C^-1 e / 3; what C is of a stated sigma, at least.
-_WINDOWS, _LOW, _HIGH, _COARSE = 2, 0.5, 1.3, 0.2
+# How many windows tell it at least; bounds of z^2; what C is of a stated sigma, at least; larger shares are 1.
+_WINDOWS, _LOW, _HIGH, _COARSE, _LARGEST = 2, 0.4, 1.5, 0.2, 0.75
 _LEAST_STEPS = 5
+_TO_THE_END: dict[str, Any] = {"function_tolerance": 1e-12, "max_iterations": 60}
 
 
 @dataclass
@@ -51,7 +60,8 @@ class Precision:
 
     # (2, n_shares) of rotation and translation, logarithms
     likelihood: FloatArray = field(default_factory=lambda: np.zeros((2, len(_SHARES))))
-    fit: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,) sum over windows of e' C^-1 e / 3
+    # (2, n_shares) sum over windows of the mean of z^2
+    fit: FloatArray = field(default_factory=lambda: np.zeros((2, len(_SHARES))))
     # (2,) likewise of the standard deviation by images, in stated ones
     coarse: FloatArray = field(default_factory=lambda: np.zeros(2))
     windows: int = 0
@@ -59,12 +69,19 @@ class Precision:
 
     def shares(self) -> tuple[float, float]:
         """Return what the standard deviations of rotation and translation are to be multiplied by."""
-        fit, coarse = self.fit / max(self.windows, 1), self.coarse / max(self.windows, 1)
-        if self.windows < _WINDOWS or fit.min() < _LOW or fit.max() > _HIGH or coarse.min() < _COARSE:
+        if self.windows < _WINDOWS:
             return 1.0, 1.0
-        best = np.argmax(self.likelihood, axis=1)
-        gain = self.likelihood[[0, 1], best] - self.likelihood[:, 0]
-        rotation, translation = np.where(gain > _TELLING, _SHARES[best], 1.0).tolist()
+        each, coarse = np.arange(2), self.coarse / self.windows
+        odds = self.likelihood.copy()
+        odds[:, 0] += _TELLING / np.maximum(coarse, 1.0) ** 2
+        fit = self.fit[each, np.argmax(odds, axis=1)] / self.windows
+        odds = np.exp(odds - odds.max(axis=1, keepdims=True))
+        odds /= odds.sum(axis=1, keepdims=True)
+        logs = np.log(_SHARES)
+        mean = odds @ logs
+        spread = np.sqrt(np.maximum(odds @ logs**2 - mean**2, 0.0))
+        precise = (np.exp(mean) < _LARGEST) & (fit.min() > _LOW) & (fit < _HIGH) & (coarse > _COARSE)
+        rotation, translation = np.where(precise, np.exp(mean - spread), 1.0).tolist()
         return rotation, translation
 
     def study(self, scene: Scene, config: Config, selection: Selection, state: State) -> Study | None:
@@ -90,8 +107,8 @@ class Precision:
         if done.found is None:
             return
         scene = done.scene
-        self.likelihood = _FADES * self.likelihood + np.stack([_likelihood(*part) for part in done.found])
-        self.fit = self.fit + [_fit(*part[:2]) for part in done.found]
+        likelihood, fit = (np.stack(values) for values in zip(*(_told(*part) for part in done.found), strict=True))
+        self.likelihood, self.fit = _FADES * self.likelihood + likelihood, self.fit + fit
         self.coarse = self.coarse + [float(np.median(_spread(part[1]) / part[2])) for part in done.found]
         self.windows += 1
         before, scene.step_shares = scene.step_shares, self.shares()
@@ -116,7 +133,7 @@ class Study:
     def run(self) -> None:
         """Solve, and compare."""
         problem, options, steps, kept = self.problem, self.options, self.steps, self.kept
-        result = solver.solve(problem, options)
+        result = solver.solve(problem, dataclasses.replace(options, **_TO_THE_END))
         if not result.status.usable or not result.state.is_finite():
             return
         free = np.flatnonzero(~problem.fixed)
@@ -145,23 +162,17 @@ def _own(covariances: FloatArray) -> FloatArray:
     return covariances[at, :, at]
 
 
-def _fit(error: FloatArray, covariances: FloatArray) -> float:
-    """Return the mean of ``e' C^-1 e / 3`` over steps, each with its own C."""
-    weighted = np.linalg.solve(_own(covariances), error[:, :, None])[..., 0]
-    return float(np.mean(np.sum(error * weighted, axis=1))) / 3.0
-
-
 def _spread(covariances: FloatArray) -> FloatArray:
     """Return the standard deviation of an axis of each step, (n,)."""
     return np.asarray(np.sqrt(np.trace(_own(covariances), axis1=1, axis2=2) / 3.0))
 
 
-def _likelihood(error: FloatArray, covariances: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the logarithm of the likelihood of each share, (n_shares,), but for what is the same of all."""
+def _told(error: FloatArray, covariances: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return of each share the logarithm of its likelihood, but for what is the same of all, and the mean of z^2."""
     scale = np.repeat(sigma, 3)
     whitened = covariances.reshape(len(scale), -1) / np.outer(scale, scale)
     variance, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
     along = axes.T @ (error.ravel() / scale)
     total = np.maximum(variance, 0.0) + _SHARES[:, None] ** 2
     odd = (_FREEDOM + 1.0) * np.log1p(along**2 / (_FREEDOM * total))
-    return np.asarray(-0.5 * np.sum(np.log(total) + odd, axis=1))
+    return -0.5 * np.sum(np.log(total) + odd, axis=1), np.mean(along**2 / total, axis=1)

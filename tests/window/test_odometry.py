@@ -156,7 +156,7 @@ def test_bad_odometry_counts_less_once_images_tell() -> None:
         found.append(
             float(np.median(1.0 / move.root_information[:, 3, 3] / (config.sigma_m + config.sigma_m_per_m * length)))
         )
-    assert 2.5 < found[0] < 7.0 and found[1] == 1.0, found
+    assert 2.5 < found[0] < 7.0 and found[1] <= 1.0, found
 
 
 @pytest.mark.parametrize("rig", ["mono", "stereo"])
