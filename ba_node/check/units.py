@@ -155,8 +155,14 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             finding, causes=(*finding.causes, steps[0]), changes=("the factor from depth images to depth_m", steps[1])
         )
         return Diagnosis([both], rows=rows)
-    cause = f"depth_m {_unit(factor) or 'in another unit'}: it is {_times(factor)} what {by} tell"
-    return Diagnosis([_depth_finding(cause, evidence)], rows=rows)
+    unit = _unit(factor)
+    finding = _depth_finding(f"depth_m {unit or 'in another unit'}: it is {_times(factor)} what {by} tell", evidence)
+    if not unit:
+        # What steps tell of distances depends on the intrinsics.
+        causes = (*finding.causes, "focal length or principal point wrong (region of interest, binning)")
+        changes = (*finding.changes, "k, roi and binning in the camera_info of camera_rig")
+        finding = dataclasses.replace(finding, causes=causes, changes=changes)
+    return Diagnosis([finding], rows=rows)
 
 
 def _alike(ratio: list[float], most: float) -> bool:
