@@ -22,6 +22,7 @@ __all__ = [
     "Extras",
     "Iteration",
     "Poses",
+    "Refinement",
     "SolveReport",
     "Status",
     "Transform",
@@ -171,6 +172,19 @@ class Extras:
 
 
 @dataclass(frozen=True)
+class Refinement:
+    """The poses of a solve: they leave before all else that comes of it."""
+
+    stamp_ns: int  # stamp of the newest keyframe, ns
+    frame_id: str  # name of the map's frame
+    session_id: int
+    poses: Poses  # of the keyframes in the solve, free and fixed, oldest first; none of a solve that was not taken
+    correction: Correction | None  # of the front-end's fixed frame; None before the first usable solve of a session
+    map_index: int  # number of the map
+    replaces_map: bool = True  # see ``Estimate.replaces_map``
+
+
+@dataclass(frozen=True)
 class Estimate:
     """What is published after a solve.
 
@@ -199,3 +213,10 @@ class Estimate:
     def replaces_map(self) -> bool:
         """Return True if the map is another than before: after a solve, a held one too, and when all was forgotten."""
         return self.report.status.usable or self.report.status is Status.HELD or len(self.trajectory) == 0
+
+    @property
+    def refinement(self) -> Refinement:
+        """Return the poses that it refines."""
+        poses = self.refined if self.report.status.usable else self.refined[:0]
+        where = self.stamp_ns, self.frame_id, self.report.session_id
+        return Refinement(*where, poses, self.correction, self.map_index, self.replaces_map)

@@ -21,8 +21,6 @@ stays True until the newest is reached. Tracks that come late take part from the
 due again if it was not refined without them. A higher session id begins a new map with the same rig, and so do
 keyframes far older than the newest, as when a recording is played again; their session id stays as the front-end has
 it. One that is odd is held until others tell what it was, see ``scene/sessions.py``; then several are taken in at once.
-
-Nothing here reads a clock: the caller passes one, for the report alone.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ from ba_node.check.departure import departed
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
 from ba_node.core.problem import Cameras
-from ba_node.estimate import Estimate, Extras, Iteration, SolveReport
+from ba_node.estimate import Estimate, Extras, Iteration, Refinement, SolveReport
 from ba_node.measurements import CameraRig, Keyframe, Measurement
 from ba_node.scene import ingest
 from ba_node.scene.candidates import Admitted, Begin, Decision, refuse_lone
@@ -46,6 +44,7 @@ from ba_node.scene.map_content import MapContent
 from ba_node.scene.scene import Scene
 from ba_node.scene.sessions import Sessions
 from ba_node.window import adjustment, full, guard, joining, precision, quality
+from ba_node.window.attempt import Following
 
 Work = adjustment.Adjustment | precision.Study  # what may run beside solves
 _REFUSED_KEPT = 1000
@@ -55,7 +54,7 @@ class Backend:
     """The back-end, single-threaded. :meth:`add` and :meth:`solve` raise nothing, whatever the data."""
 
     def __init__(self, config: Config, *, clock: Callable[[], float] = lambda: 0.0) -> None:
-        """Start with an empty map. ``clock`` returns seconds and only fills ``solve_time_s``."""
+        """Start with an empty map. ``clock`` (s) only fills ``solve_time_s``: no other is read."""
         self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
         self.solve_count = 0  # solves since the beginning
         self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)  # the last keyframes that were turned away
@@ -168,17 +167,27 @@ class Backend:
         if final:
             self.scene.end_pending()
 
-    def solve(self, on_iteration: Callable[[Iteration], bool] | None = None) -> Estimate | None:
-        """Refine the newest window; None without a keyframe. ``on_iteration`` ends the solve by returning False.
+    def solve(
+        self,
+        on_iteration: Callable[[Iteration], bool] | None = None,
+        on_poses: Callable[[Refinement], None] = lambda _: None,
+    ) -> Estimate | None:
+        """Return the estimate after a solve of the newest window; None without a keyframe.
 
-        Returns:
-            The estimate. After a failed or skipped solve poses and points are as before, and the report says why.
+        If it fails, all is as before, and the report says why. ``on_iteration`` ends it by returning False;
+        ``on_poses`` gets the poses of a solution that is taken, before all else is worked out.
         """
         if len(self.scene.keyframes) == 0:
             return None
         wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
-        estimate = self.map.solve(self.solve_count, wrong, self.extras, self._clock, on_iteration)
+
+        def taken(refinement: Refinement) -> None:
+            if departed(self.scene) is None:  # else it is taken back at once
+                on_poses(refinement)
+
+        following = Following(self._clock, on_iteration, taken)
+        estimate = self.map.solve(self.solve_count, wrong, self.extras, following)
         if (study := self.map.begun_study()) is not None:
             self._work(study)
         return estimate if wrong else self.take_check(departed(self.scene)) or self.adjust() or estimate
@@ -281,9 +290,9 @@ class Backend:
         return full.take_snapshot(self.scene, self.config, self.extras)
 
     def copied(self) -> Callable[[], full.Optimization | str]:
-        """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called on any thread."""
-        scene, clone, config, wanted = self.scene, self.scene.clone(), self.config, self.extras
-        return lambda: full.take_snapshot(clone, config, wanted, scene)
+        """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called once, on any thread."""
+        scene, copies, config, wanted = self.scene, [self.scene.clone()], self.config, self.extras
+        return lambda: full.take_snapshot(copies.pop(), config, wanted, scene)
 
     def is_current(self, optimization: full.Optimization) -> bool:
         """Return True if a solve of everything is of the current map."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,12 @@ from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.calibration import Calibration
-from ba_node.core.problem import State
-from ba_node.estimate import Correction, Estimate, Extras, Iteration, SolveReport, Status, Transform, World
+from ba_node.estimate import Correction, Estimate, Extras, Poses, Refinement, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
 from ba_node.window import culling, full, old_keyframes, precision, quality, view
-from ba_node.window.attempt import attempt
-from ba_node.window.correction import MapCorrection
+from ba_node.window.attempt import Following, attempt
+from ba_node.window.correction import MapCorrection, Move
 from ba_node.window.trust import Trust
 
 # The front-end's frame where neither it nor the parameters name one.
@@ -191,69 +190,67 @@ class CurrentMap:
         solve_count: int,
         wrong: str,
         wanted: Extras,
-        clock: Callable[[], float],
-        on_iteration: Callable[[Iteration], bool] | None,
+        following: Following,
     ) -> Estimate:
         """Refine the newest window; all solutions are held if it is said what is ``wrong``.
 
-        ``wanted`` is worked out beside the estimate; the clock (s) is for the report alone; ``on_iteration`` ends the
-        solve by returning False.
+        ``wanted`` is worked out beside the estimate.
         """
         culling.cull(self.scene, self.config)
         due = self.completion.due(self.scene)
         end = self._end(due)
         taking_part = window.rows_of(self.scene, self.config, end)
+        refined: Poses | None = None
         extra: dict[str, Any] = {}
-        selection, state = None, None
         if wrong:
             self.hold_all(solve_count, wrong)
         else:
-            selection, state = self._solve((solve_count, int(taking_part[-1])), end, clock, on_iteration)
-        if selection is not None:
-            taking_part = _taking_part_of(self.scene, selection)
-            if state is not None:
-                self.correct(int(taking_part[-1]))
-                extra = view.work_out(wanted, self.scene, self.config, selection, state, taking_part)
+            refined, extra = self._solve((solve_count, taking_part), end, wanted, following)
         self.scene.keyframes.solved[_reached(self.scene, due, end)] = True
-        return dataclasses.replace(self.estimate(taking_part), **extra)
+        refined = poses_of(self.scene, taking_part) if refined is None else refined
+        return dataclasses.replace(self.estimate(refined), **extra)
 
     def _solve(
-        self,
-        which: tuple[int, int],
-        end: int,
-        clock: Callable[[], float],
-        on_iteration: Callable[[Iteration], bool] | None,
-    ) -> tuple[window.Selection | None, State | None]:
-        """Solve the newest window and report; return what was solved, and the solution if it was taken.
+        self, which: tuple[int, IntArray], end: int, wanted: Extras, following: Following
+    ) -> tuple[Poses | None, dict[str, Any]]:
+        """Solve the newest window and report; return its poses, and what is wanted of a solution; None without one.
 
-        ``which`` is the number of the solve and the row of its newest keyframe, for the report.
+        ``which`` are the number of the solve and the keyframes of its window, oldest first.
         """
-        tried = attempt(self.scene, self.config, end, self._trust, clock=clock, on_iteration=on_iteration)
+        count, taking_part = which
+        newest = int(taking_part[-1])
+        tried, moved = attempt(self.scene, self.config, end, self._trust, following), Move()
         if isinstance(tried, str):
-            self.report = dataclasses.replace(self.base_report(*which), reason=tried)
-            return None, None
+            self.report = dataclasses.replace(self.base_report(count, newest), reason=tried)
+            return None, {}
         selection, (norms, state, _) = tried.selection, tried.found
+        taking_part = _taking_part_of(self.scene, selection)
+        refined: Poses | None = None
+        extra: dict[str, Any] = {}
         for stray in selection.strays:
             text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
             if text:
                 self.scene.log.warn("stray", text)
         if tried.held:
             self.hold(tried.held)
-            state = None
         elif state is not None:
+            window.put_poses(self.scene, selection, state, tried.without)
+            moved = self._correct(int(taking_part[-1]))
+            refined = poses_of(self.scene, taking_part)
+            following.on_poses(self._refinement(refined))
             norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
-            self.scene.keyframes.refined[list(tried.without)] = False
-            self.scene.moved(np.array(tried.without, np.intp))
             rows = selection.keyframes, selection.landmarks, selection.origin
             old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
             if self._study is None:
                 self._study = self._precision.study(self.scene, self.config, selection, state)
                 self._asks = self._study is not None
+            extra = view.work_out(wanted, self.scene, self.config, selection, state, taking_part)
         statistics = quality.statistics(selection, tried.result, norms) | tried.health
         if tried.held:
             statistics |= {"status": Status.HELD, "reason": tried.held}
-        self.report = dataclasses.replace(self.base_report(*which), **statistics, solve_time_s=tried.solve_time_s)
-        return selection, state
+        statistics |= moved.statistics() | {"solve_time_s": tried.solve_time_s}
+        self.report = dataclasses.replace(self.base_report(count, newest), **statistics)
+        return refined if refined is not None else poses_of(self.scene, taking_part), extra
 
     def begun_study(self) -> precision.Study | None:
         """Return what the last solve asks of the front-end's steps; None if nothing, or if it was returned before."""
@@ -290,14 +287,18 @@ class CurrentMap:
 
     def correct(self, row: int) -> None:
         """Let the correction map -> odom follow what was found at a keyframe, and tell its size in the report."""
+        self.report = dataclasses.replace(self.report, **self._correct(row).statistics())
+
+    def _correct(self, row: int) -> Move:
         self.scene.propagate_corrections()
         table = self.scene.keyframes
         found = Transform(*self.scene.corrections(np.array(row)))
         body = Transform(table.input_rotation[row], table.input_position[row])
-        move = self.correction.update(self.config.frames, found, body, int(table.stamp_ns[row]))
-        self.report = dataclasses.replace(
-            self.report, correction_m=move.distance_m, correction_rad=move.angle_rad, correction_held=move.held
-        )
+        return self.correction.update(self.config.frames, found, body, int(table.stamp_ns[row]))
+
+    def _refinement(self, poses: Poses) -> Refinement:
+        where = self.stamp_ns, self.config.frames.map_frame, self.session_id
+        return Refinement(*where, poses, self._published(), self.index)
 
     def base_report(self, solve_count: int, newest: int) -> SolveReport:
         """Return what a report tells of any solve, by the row of its newest keyframe."""
@@ -319,15 +320,15 @@ class CurrentMap:
         """
         return quality.rms_px(self.scene, self.config, state)
 
-    def estimate(self, refined: IntArray | None = None) -> Estimate:
-        """Return all that is known, the refined keyframes being those in some rows, or all."""
+    def estimate(self, refined: Poses | None = None) -> Estimate:
+        """Return all that is known, with the poses that a solve refined, or all."""
         scene = self.scene
         scene.propagate_corrections()
         trajectory = MapPoses.taken(scene)
         return Estimate(
             stamp_ns=self.stamp_ns,
             frame_id=self.config.frames.map_frame,
-            refined=trajectory if refined is None else poses_of(scene, refined),
+            refined=trajectory if refined is None else refined,
             trajectory=trajectory,
             cloud=MapCloud.taken(scene),
             report=self.report,

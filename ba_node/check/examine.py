@@ -9,13 +9,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ba_node.check import ids, intrinsics, motion, placement, relations, units
+from ba_node.check import ids, intrinsics, motion, mounting, placement, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
 
 _RELATIONS = frozenset({"cameras", "poses"})
-_BUILD_ON_THESE = ("intrinsics", "lengths")
+_BUILD_ON_THESE = ("intrinsics", "mounting", "lengths")
 # Sizes of the image whose losses differ by no more than this factor are both named.
 _ALIKE = 1.1
 # Part of the loss as given that another size may leave where the poses alone do not tell.
@@ -47,6 +47,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "poses": lambda: _poses(tracks, related()),
         "depth": lambda: units.check_depth(tracks, related()),
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
+        "mounting": lambda: mounting.check_mounting(tracks, related()),
         "lengths": lambda: units.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
     }
     for name, test in tests.items():

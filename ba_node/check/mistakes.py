@@ -150,6 +150,29 @@ BETWEEN_CAMERAS = (
     *_AXES,
     _RIG_W_FIRST,
 )
+# Those of one camera alone, beside :func:`in_place_of`.
+OF_ONE_CAMERA = tuple(
+    Mistake(f"camera {{camera}}: {what}", _ONE, _cameras(_one(change)))
+    for what, change in (
+        ("extrinsics inverted, body_from_camera holds camera-from-body", lambda placed, _: geometry.inverse(*placed)),
+        (
+            "optical and body axes confused, body_from_camera is that of a frame that looks along x",
+            lambda placed, _: (placed[0] @ _OPTICAL, placed[1]),
+        ),
+        ("quaternion of body_from_camera with w first", lambda placed, _: _w_first(placed)),
+    )
+)
+
+
+def in_place_of(other: int) -> Mistake:
+    """Return that a camera sits where the rig says that another one does."""
+    return Mistake(
+        f"cameras {other} and {{camera}} swapped",
+        "camera_index in the feature_tracks, or the order of the cameras in camera_rig",
+        _cameras(_one(lambda placed, _: (np.repeat(placed[0][other][None], len(placed[0]), 0), placed[1]))),
+    )
+
+
 # Mistakes that show as a camera moves, beside those of pixels.
 IN_MOTION = (
     Mistake(

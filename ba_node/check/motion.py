@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ from ba_node.core import geometry
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
 # Usual angle beyond which poses are said to be wrong where a known mistake explains them, and where none does.
-_DOUBTFUL_DEG = 15.0
+DOUBTFUL_DEG = 15.0
 _ABSURD_DEG = 50.0
 # Rotations by which a hypothesis must differ to be judged by them, and the steps for which it has to.
 _DIFFERENT_DEG = 1.0
@@ -48,7 +49,7 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     test = "poses against tracks"
     now = compare(tracks, usable)
     rows = [now.row(test, "as given"), Row(test, "free", float(np.mean([one.share for one in usable])))]
-    if np.median(now.off) > _DOUBTFUL_DEG:
+    if np.median(now.off) > DOUBTFUL_DEG:
         tried = {one: compare(one.undo(tracks, 0), usable) for one in IN_MOTION}
         rows += [other.row(test, one.name) for one, other in tried.items()]
         best = min(float(np.median(other.off)) for other in tried.values())
@@ -85,7 +86,7 @@ def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
 
 def _unnamed(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis:
     """Tell of a camera that is turned against the body, or of poses that contradict the tracks."""
-    if np.median(now.off) > _DOUBTFUL_DEG and not agreed(usable):
+    if np.median(now.off) > DOUBTFUL_DEG and not agreed(usable):
         return Diagnosis(untold=["too many outliers to tell how the poses are off the tracks"], rows=rows)
     turned = _turned(tracks, usable, now, rows)
     if turned is not None:
@@ -103,7 +104,7 @@ def _turned(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row])
     """Tell of a camera that is turned against the body, or its principal point off; None if steps do not say so."""
     turn = _turn(tracks, usable)
     degrees = float(np.degrees(np.linalg.norm(geometry.so3_log(turn))))
-    least = _BESIDE_DEG if agreed(usable) else _DOUBTFUL_DEG
+    least = _BESIDE_DEG if agreed(usable) else DOUBTFUL_DEG
     if len(usable) < 2 * _PAIRS_NEEDED or degrees < least:
         return None
     turned = compare(tracks, usable, turn)
@@ -151,11 +152,16 @@ class Steps:
 
 def compare(given: Tracks, relations: list[Relation], turn: FloatArray | None = None) -> Steps:
     """Return how far a set-up is off the tracks, with its cameras turned by a rotation (3, 3) if there is one."""
+    told = [given.between_images(one.a, one.b) for one in relations]
+    if turn is not None:
+        told = [Pose(turn @ step.rotation @ turn.T, turn @ step.translation) for step in told]
+    return compare_steps(told, relations)
+
+
+def compare_steps(told: Sequence[Pose], relations: Sequence[Relation]) -> Steps:
+    """Return how far steps (n) are off those by the tracks."""
     rows, steps = [], []
-    for one in relations:
-        step = given.between_images(one.a, one.b)
-        if turn is not None:
-            step = Pose(turn @ step.rotation @ turn.T, turn @ step.translation)
+    for step, one in zip(told, relations, strict=True):
         rows.append((step.turned_from(one.pose), step.direction_from(one.pose), np.linalg.norm(step.translation)))
         steps.append((one.pair, step))
     return Steps(steps, *np.array(rows).reshape(-1, 3).T)

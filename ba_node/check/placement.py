@@ -17,14 +17,11 @@ from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding
 from ba_node.check.motion import contradicts
-from ba_node.check.relations import AGREED, Relation, of_cameras, relate, spread
+from ba_node.check.relations import AGREED, Relation, of_cameras, relate, shared_views, spread
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 from ba_node.core import geometry
 
-# Keyframes that are looked at, and rays of two cameras.
-_KEYFRAMES = 20
-_MAX_RAYS = 800
 # Keyframes from which on it is measured by how much a camera is off.
 _KEYFRAMES_TO_MEASURE = 10
 # Cameras beyond the first that are tested.
@@ -56,8 +53,7 @@ def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diag
     for camera in range(1, min(len(tracks.cameras.model), 1 + _MAX_CAMERAS)):
         relation = of_cameras(tracks, camera)
         if relation is None:
-            shared = sum(len(tracks.match((k, 0), (k, camera))[0]) for k in spread(len(tracks), _KEYFRAMES))
-            if shared:
+            if shared := shared_views(tracks, camera):
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             continue
         found = _check_camera(tracks, camera, relation, related)

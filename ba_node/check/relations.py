@@ -96,9 +96,16 @@ def of_cameras(tracks: Tracks, camera: int) -> Relation | None:
     return relate(tracks, (-1, 0), (-1, camera), (rows_a[pick], rows_b[pick]))
 
 
-def in_motion(tracks: Tracks) -> list[Relation]:
-    """Return how images of one camera stand to each other, over the recording."""
-    main = [tracks.main_camera(k) for k in range(len(tracks))]
+def shared_views(tracks: Tracks, camera: int) -> int:
+    """Return how many observations of a camera are of points that camera 0 sees in the same keyframe, of some."""
+    return sum(len(tracks.match((k, 0), (k, camera))[0]) for k in spread(len(tracks), _KEYFRAMES))
+
+
+def in_motion(tracks: Tracks, of: int | None = None) -> list[Relation]:
+    """Return how images of one camera stand to each other, over the recording; of the busiest camera by default."""
+    main = [of if (k, of) in tracks.images else None for k in range(len(tracks))]
+    if of is None:
+        main = [tracks.main_camera(k) for k in range(len(tracks))]
     found = []
     for k in spread(len(tracks) - 1, _KEYFRAMES):
         camera = main[k]

@@ -155,7 +155,6 @@ def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:
     from ba_node.config import ConfigError  # noqa: PLC0415
     from ba_node.offline.ranks import started_as_ranks  # noqa: PLC0415
     from ba_node.offline.solve_bal import solve_file  # noqa: PLC0415
-    from ba_node.offline.solve_model import DEFAULT_GROUPS, solve_model  # noqa: PLC0415
     from ba_node.offline.solver_settings import solver_options  # noqa: PLC0415
 
     assignments = [*args.set] if args.iterations is None else [*args.set, f"max_iterations={args.iterations}"]
@@ -172,6 +171,9 @@ def _solved(args: argparse.Namespace) -> Solution | ModelSolution | None:
         if on_ranks:
             return _on_ranks(args, options)
         return solve_file(args.problem, options, clock=time.perf_counter, on_iteration=_show)
+
+    from ba_node.offline.solve_model import DEFAULT_GROUPS, solve_model  # noqa: PLC0415
+
     usual = DEFAULT_GROUPS if args.problem.is_dir() else ()
     groups = [group for group in args.refine or usual if group != "none"]
     # Cameras are refined without a region, which the default has; a method that is asked for by name is not changed.

@@ -178,7 +178,11 @@ class SolverOptions(SolverConfig):
         "How mu follows the gain ratio rho.",
         choices=(
             Choice("nielsen", "rho > 0: mu max(1/3, 1 - (2 rho - 1)^3); else mu nu, nu = 2, 4, 8, ...", "Alg. 6"),
-            Choice("fast", "as nielsen, but mu/5 where rho > 1/2, and mu/2 where rho > 1/4"),
+            Choice(
+                "fast",
+                "as nielsen, but mu/5 where rho > 1/2, mu/2 where rho > 1/4, and as it is where a region that bad steps"
+                " have made narrow cut the step off",
+            ),
         ),
     )
     initial_damping: float = option(1e-4, "First mu.", within=(0.0, 1e100))
@@ -260,8 +264,9 @@ class SolverOptions(SolverConfig):
 
     def check(self) -> None:
         """Raise ConfigError if a choice does not exist or contradicts another; say which, and what to do."""
-        for chosen in _CHOSEN:
-            chosen.check(getattr(self, chosen.name))
+        for chosen, names in _CHOSEN:
+            if getattr(self, chosen.name) not in names:
+                chosen.check(getattr(self, chosen.name))
         if self.loss != "squared" and not (math.isfinite(self.loss_scale_px) and self.loss_scale_px > 0.0):
             raise ConfigError(
                 f"loss = {self.loss} with loss_scale_px = {self.loss_scale_px}: a robust loss needs the residual, in"
@@ -278,4 +283,4 @@ class SolverOptions(SolverConfig):
             )
 
 
-_CHOSEN = tuple(option for option in declared(SolverOptions) if option.allowed)
+_CHOSEN = tuple((option, option.choices) for option in declared(SolverOptions) if option.allowed)

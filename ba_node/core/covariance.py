@@ -77,6 +77,8 @@ _STATED = 2.0
 _LEAST = 0.1
 # Rows at a time whose leverage is worked out, and points whose covariance is.
 _CHUNK = 2000
+# A matrix with a larger share of its elements is multiplied as a full one.
+_FULL = 0.2
 
 
 def uncertainty_of(
@@ -134,8 +136,7 @@ def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, vari
     groups = np.unique(rows.group[rows.group > DEPTHS])
     if not len(groups):
         return
-    seen = reduced.influence.T @ scipy.sparse.diags(variance) @ reduced.influence
-    of_seen = roots.T @ (seen @ roots)
+    of_seen = roots.T @ _weighted_square(reduced.influence, variance) @ roots
     members = [np.flatnonzero(rows.group == group) for group in groups]
     slopes = [np.maximum(rows.slope[of], 0.0) for of in members]
     moved = [np.asarray(rows.keyframes[of] @ roots) for of in members]
@@ -196,6 +197,18 @@ class Reduced:
         return np.asarray(np.asarray(local).ravel() + np.concatenate(parts))
 
 
+def _weighted_square(matrix: scipy.sparse.csr_matrix, weight: FloatArray) -> FloatArray:
+    """Return ``M' diag(weight) M`` (n, n) of a matrix M (m, n): as a full one unless few of its elements are there."""
+    m, n = matrix.shape
+    if matrix.nnz < _FULL * m * n:
+        return np.asarray((matrix.T @ scipy.sparse.diags(weight) @ matrix).toarray())
+    out = np.zeros((n, n))
+    for begin in range(0, m, _CHUNK):
+        rows = matrix[begin : begin + _CHUNK].toarray()
+        out += (rows.T * weight[begin : begin + _CHUNK]) @ rows
+    return out
+
+
 def _inverse_blocks(c: scipy.sparse.bsr_matrix) -> scipy.sparse.bsr_matrix:
     """Return the inverse of a block diagonal matrix; 0 for points that nothing determines."""
     n = c.shape[0] // 3
@@ -220,9 +233,7 @@ class Uncertainty:
 
     def _meat(self, variance: FloatArray) -> FloatArray:
         """Return ``X' (sum v u'u) X``, (k, k)."""
-        influence = self.reduced.influence
-        meat = (influence.T @ scipy.sparse.diags(variance) @ influence).toarray()
-        return np.asarray(self.roots.T @ meat @ self.roots)
+        return np.asarray(self.roots.T @ _weighted_square(self.reduced.influence, variance) @ self.roots)
 
     def of(self, unknowns: IntArray) -> FloatArray:
         """Return the covariance of some unknowns beside the points, (k, k); NaN for those that are undetermined."""

@@ -84,8 +84,7 @@ class NativeKernels:
         self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf
-        self._two_level = TwoLevel(np.flatnonzero(~problem.fixed))
-        self._system = NativeSystem(self._kernel, self.size, self._two_level)
+        self._system = NativeSystem(self._kernel, self.size, problem.fixed)
         # Where steps lead, in turn: the state that a step starts from is one of them.
         self._states = [_like(problem.start), _like(problem.start)]
         self._stepped: StepResult | None = None
@@ -94,7 +93,7 @@ class NativeKernels:
 
     def linearise(self, state: State) -> float:
         """Linearise at a state and keep the normal equations; return the objective there."""
-        stepped, self._stepped, self._two_level.state = self._stepped, None, state
+        stepped, self._stepped, self._system.state = self._stepped, None, state
         self._left = None
         # The step has seen all of it where it ended.
         if stepped is not None and state is stepped.state and self._kernel.linearise_prepared():
@@ -178,8 +177,10 @@ class NativeSystem:
     side = "points"
     radius_factor = 1.0
 
-    def __init__(self, kernel: Kernel, size: int, two_level: TwoLevel) -> None:
-        self._kernel, self._size, self._two_level = kernel, size, two_level
+    def __init__(self, kernel: Kernel, size: int, fixed: BoolArray) -> None:
+        self._kernel, self._size, self._fixed = kernel, size, fixed
+        self.state: State  # of the last linearisation
+        self._two_level: TwoLevel | None = None
         n = kernel.n_free * size
         self.unknowns: int = n
         self.product = kernel.product
@@ -193,6 +194,13 @@ class NativeSystem:
         """Return the system after another reduction."""
         self._has_rhs = False
         return self
+
+    @property
+    def two_level(self) -> TwoLevel:
+        """Return the preconditioner on two levels, made at its first use."""
+        self._two_level = self._two_level or TwoLevel(np.flatnonzero(~self._fixed))
+        self._two_level.state = self.state
+        return self._two_level
 
     @property
     def rhs(self) -> FloatArray:
@@ -275,7 +283,7 @@ class NativeSystem:
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""
         if kind == "two_level":
-            return self._two_level.solve(self.sparse(), self.rhs, scale, limits)
+            return self.two_level.solve(self.sparse(), self.rhs, scale, limits)
         found, steps, on_boundary = self._kernel.pcg(scale, kind, limits, formed, self._x)
         return Solution(self._x if found else None, steps, on_boundary)
 

@@ -10,7 +10,7 @@ are weighed by the loss separately.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,12 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import cameras, columns, loss, parameterisation
 from ba_node.core.factors import FactorSum, FactorTerms
-from ba_node.core.problem import Cameras, Problem, State
+from ba_node.core.problem import Cameras, Observations, Problem, State
 
 # What a point behind its camera costs under ``constant``: as much as a residual of this norm.
 _BEHIND_NORM = 100.0
+# Observations of which the errors are summed at a time.
+_PIECE = 2**13
 
 
 @dataclass(frozen=True)
@@ -312,9 +314,13 @@ def squared_errors(problem: Problem, state: State) -> FloatArray:
 
     Sums of parts of a problem are those of the whole.
     """
-    error = reprojection_errors(problem, state)
-    error = error[~np.isnan(error[:, 0])]
-    return np.array([np.sum(error * error), error.size])
+    total = np.zeros(2)
+    for begin in range(0, len(problem.observations), _PIECE):
+        seen = (getattr(problem.observations, one.name)[begin : begin + _PIECE] for one in fields(Observations))
+        error = reprojection_errors(replace(problem, observations=Observations(*seen), factors=()), state)
+        error = error[~np.isnan(error[:, 0])]
+        total += np.sum(error * error), error.size
+    return total
 
 
 def rms_px(squares: FloatArray) -> float:

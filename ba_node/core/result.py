@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 from ba_node.core.problem import State
 
@@ -41,12 +43,16 @@ class Iteration:
     side: str = ""  # what was eliminated: points, cameras or none; empty in row 0
 
 
+def _unknown() -> tuple[float, float]:
+    return 0.0, 0.0
+
+
 @dataclass(frozen=True)
 class Result:
     """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start.
 
     ``linear_solver`` says how the reduced systems were solved, and what that takes; empty if there was none.
-    ``weakest`` is of the free poses, if it was asked for: see ``covariance.weakest``.
+    ``loosest`` works out ``weakest``.
     """
 
     state: State
@@ -55,7 +61,18 @@ class Result:
     method: str
     trace: tuple[Iteration, ...]
     linear_solver: str = ""
-    weakest: tuple[float, float] = (0.0, 0.0)
+    loosest: Callable[[], tuple[float, float]] = _unknown
+
+    @cached_property
+    def weakest(self) -> tuple[float, float]:
+        """Return what ``covariance.weakest`` has of the free poses, worked out now; 0, 0 if it was not asked for."""
+        return self.loosest()
+
+    def settled(self) -> Result:
+        """Return the same, with ``weakest`` worked out and without what that takes."""
+        # Not by the property: in Python 3.11 one thread alone may work a cached one out, and ranks do it together.
+        weakest = self.loosest()
+        return replace(self, loosest=lambda: weakest)
 
     @property
     def objective_before(self) -> float:

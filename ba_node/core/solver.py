@@ -15,7 +15,8 @@ lets mu fall by its most, a third, with the damped model alone.
 Radius (Algorithm 2): rho < 1/4: radius / 4; rho > 3/4 on the boundary: radius * 2.
 Damping: ``nielsen`` (Algorithm 6): rho > 0: mu *= max(1/3, 1 - (2 rho - 1)^3), nu = 2, else mu *= nu, nu *= 2;
 ``fast``: the same, but mu / 5 where rho > 1/2 and mu / 2 where rho > 1/4: along a flat valley rho stays a little below
-1/2, and Nielsen's mu where it is.
+1/2, and Nielsen's mu where it is. Where the step was cut off by a region that bad steps have made a tenth of the first,
+mu does not fall: along a curved valley it would go to nothing, and still no step be longer than the region.
 
 With ``inner_iterations`` > 0 each step of the keyframes is followed by that many damped Newton steps of every point
 alone; a step that was bad only because the points had not followed it is saved by them.
@@ -27,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -35,12 +37,14 @@ from ba_node.core import covariance, linear, native_kernels, point_priors
 from ba_node.core.annealing import Annealing
 from ba_node.core.kernels import Kernels
 from ba_node.core.numpy_kernels import NumpyKernels
-from ba_node.core.problem import Problem
+from ba_node.core.problem import Problem, State
 from ba_node.core.reduced import ReducedSolver
 from ba_node.core.result import Iteration, Result, Status
 
 # The gain ratio of a step that only the inner iterations made good: taken, but not much trusted.
 _SAVED_RHO = 0.3
+# Policy fast leaves mu where a region of less than this share of the first cuts steps off.
+_NARROW = 0.1
 # A loop that has rejected this many steps in a row has nothing left to gain.
 _MAX_REJECTED = 25
 # Where policy fast stops to lower mu: below, mu diag(H) is lost in rounding, and Cholesky of S begins to break down.
@@ -89,8 +93,15 @@ def solve(
     with np.errstate(all="ignore"):
         result = run.run()
         if weakest and result.status.usable:
-            result = replace(result, weakest=covariance.weakest(run.kernels, problem, result.state, options))
+            result = replace(result, loosest=partial(_weakest, run.kernels, problem, result.state, options))
+            # Kernels of several ranks work it out together, or not at all.
+            return result if kernels is None else result.settled()
         return result
+
+
+def _weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
+    with np.errstate(all="ignore"):
+        return covariance.weakest(kernels, problem, state, options)
 
 
 class _Run:
@@ -207,7 +218,8 @@ class _Run:
         if accepted:
             shrink = max(1.0 / 3.0, 1.0 - (2.0 * rho - 1.0) ** 3)
             if self.options.damping_policy == "fast" and rho > 0.25:
-                shrink = 0.2 if rho > 0.5 else 0.5
+                cut_off = solution.on_boundary and self.radius < _NARROW * self.options.initial_radius
+                shrink = 1.0 if cut_off else 0.2 if rho > 0.5 else 0.5
             self.mu, self.nu = max(self.mu * shrink, min(self.mu, _LEAST_DAMPING)), 2.0
         else:
             self.mu, self.nu = self.mu * self.nu, self.nu * 2.0

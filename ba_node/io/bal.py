@@ -17,9 +17,11 @@ import gzip
 import re
 import warnings
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -37,6 +39,8 @@ _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translati
 MAX_BYTES = 2**32
 # Text of measured numbers packs four times.
 MAX_GROWTH = 10
+# Rows of text that are written at a time.
+_ROWS = 2**13
 
 
 class BalError(ValueError):
@@ -87,17 +91,30 @@ def read_bal(path: Path | str) -> BalProblem:
 def write_bal(path: Path | str, problem: BalProblem) -> None:
     """Write ``*.txt``, ``*.bz2`` or ``*.gz``; every number reads back as the same float64."""
     path = Path(path)
-    head = f"{len(problem.cameras)} {len(problem.points)} {len(problem.observations)}"
-    columns = (problem.camera_index, problem.point_index, problem.observations[:, 0], problem.observations[:, 1])
-    rows = map("{} {} {!r} {!r}".format, *(column.tolist() for column in columns))
-    numbers = map(repr, [*problem.cameras.ravel().tolist(), *problem.points.ravel().tolist()])
-    data = ("\n".join([head, *rows, *numbers]) + "\n").encode()
+    with whole_file(path) as stream, _packing(path, stream) as out:
+        for text in _text(problem):
+            out.write(text.encode())
+
+
+def _packing(path: Path, stream: IO[bytes]) -> AbstractContextManager[IO[bytes] | gzip.GzipFile | bz2.BZ2File]:
+    """Return what packs for a stream as the name of the file says."""
     if path.suffix == ".bz2":
-        data = bz2.compress(data)
-    elif path.suffix == ".gz":
-        data = gzip.compress(data, mtime=0)
-    with whole_file(path) as stream:
-        stream.write(data)
+        return bz2.open(stream, "wb")
+    if path.suffix == ".gz":
+        return gzip.GzipFile("", "wb", fileobj=stream, mtime=0)
+    return nullcontext(stream)
+
+
+def _text(problem: BalProblem) -> Iterator[str]:
+    """Yield the text of a problem in pieces: as Python's numbers all of it would take ten times its memory."""
+    n_obs = len(problem.observations)
+    yield f"{len(problem.cameras)} {len(problem.points)} {n_obs}\n"
+    columns = (problem.camera_index, problem.point_index, problem.observations[:, 0], problem.observations[:, 1])
+    for begin in range(0, n_obs, _ROWS):
+        yield "".join(map("{} {} {!r} {!r}\n".format, *(column[begin : begin + _ROWS].tolist() for column in columns)))
+    for numbers in (problem.cameras.ravel(), problem.points.ravel()):
+        for begin in range(0, len(numbers), _ROWS):
+            yield "".join(map("{!r}\n".format, numbers[begin : begin + _ROWS].tolist()))
 
 
 def to_problem(bal: BalProblem) -> Problem:

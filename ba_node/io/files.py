@@ -16,7 +16,6 @@ import io
 import json
 import math
 import os
-import secrets
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -223,7 +222,7 @@ def _require_replaceable(path: Path) -> None:
 def _create(path: Path) -> tuple[Path, int, int]:
     """Return a new file beside a path: its name, its descriptor, and a second one that holds the lock."""
     for _ in range(_TRIES):
-        partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
+        partial = path.with_name(f".{path.name}.{os.urandom(8).hex()}.partial")
         _partials.add(partial)  # before it is there: a signal may come between
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         try:

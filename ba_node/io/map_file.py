@@ -26,7 +26,7 @@ from ba_node.io.files import opened, whole_file
 from ba_node.io.unpack import ALWAYS_ALLOWED_BYTES, limit_for
 
 FORMAT = "ba_node map"
-VERSION = 1
+VERSION = 2
 SUFFIX = ".npz"
 # Larger files are not read: such a map would not fit into the memory of most machines.
 MAX_BYTES = 2**32
@@ -119,7 +119,7 @@ def _read(stream: Any) -> MapContent:
                 raise MapFileError(f"not a map: it has no {_HEAD}, which save_map writes")
             facts = _head(file.read(_HEAD))
             names = [name for name in file.namelist() if name.endswith(_ARRAY)]
-            return MapContent({name.removesuffix(_ARRAY): _array(file.read(name)) for name in names}, facts)
+            return MapContent({_current(name.removesuffix(_ARRAY)): _array(file.read(name)) for name in names}, facts)
     except MapFileError:
         raise
     except MemoryError:
@@ -139,6 +139,11 @@ def _head(data: bytes) -> dict[str, Any]:
         writer = head.get("written_by", "a newer ba_node")
         raise MapFileError(f"format version {version}, written by {writer}; this ba_node reads up to {VERSION}: update")
     return {name: value for name, value in head.items() if name not in ("format", "version", "written_by")}
+
+
+def _current(name: str) -> str:
+    """Return the name of an array that version 1 has under another one."""
+    return name.replace("sightings/", "observations/", 1) if name.startswith("sightings/") else name
 
 
 def _array(data: bytes) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ba_node.arrays import IntArray
 from ba_node.config import OutputConfig
-from ba_node.estimate import Cloud, Estimate, World
+from ba_node.estimate import Cloud, Estimate, Refinement, World
 from ba_node.measurements import GlobalFix
 from ba_node.messages.cdr import cloud_message, path_message, pose_messages
 from ba_node.messages.conversion import input_message
@@ -35,12 +35,7 @@ def output_messages(
         (topic below the node's name, type, message) in the order to publish; one pose for each refined keyframe.
         Poses, path and points are bytes, serialised already (``cdr.py``).
     """
-    out: list[tuple[str, Any]] = []
-    if estimate.report.status.usable:
-        if "refined_keyframes" in wanted:
-            out.append(("refined_keyframes", _refined(factory, estimate)))
-        if "pose" in wanted:
-            out += [("pose", pose) for pose in pose_messages(estimate.refined, estimate.frame_id)]
+    out = pose_outputs(factory, estimate.refinement, wanted)
     if "report" in wanted:
         out.append(("report", report_message(factory, Report(estimate.report), estimate.stamp_ns, estimate.frame_id)))
     if estimate.world is not None and estimate.report.status.usable:
@@ -68,12 +63,24 @@ def point_records(cloud: Cloud, limit: int | None = None) -> NDArray[np.void]:
     return words.view(POINT_DTYPE)[:, 0]
 
 
-def _refined(factory: MessageFactory, estimate: Estimate) -> Any:
-    poses = estimate.refined
+def pose_outputs(
+    factory: MessageFactory, refinement: Refinement, wanted: Container[str] = OUTPUT_TYPES
+) -> list[tuple[str, Any]]:
+    """Return those of the messages, (topic, message), that tell the poses of a solve; none if it was not taken."""
+    out: list[tuple[str, Any]] = []
+    if len(refinement.poses) and "refined_keyframes" in wanted:
+        out.append(("refined_keyframes", _refined(factory, refinement)))
+    if "pose" in wanted:
+        out += [("pose", pose) for pose in pose_messages(refinement.poses, refinement.frame_id)]
+    return out
+
+
+def _refined(factory: MessageFactory, refinement: Refinement) -> Any:
+    poses = refinement.poses
     return factory.make(
         OUTPUT_TYPES["refined_keyframes"],
-        header=header_message(factory, estimate.stamp_ns, estimate.frame_id),
-        session_id=estimate.report.session_id,
+        header=header_message(factory, refinement.stamp_ns, refinement.frame_id),
+        session_id=refinement.session_id,
         keyframe_id=factory.array(poses.keyframe_id),
         stamp_ns=factory.array(poses.stamp_ns),
         position=factory.array(poses.position.reshape(-1)),

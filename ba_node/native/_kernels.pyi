@@ -209,6 +209,27 @@ def move_more_than_noise(
 ) -> NDArray[np.bool_]:
     """Return which points move, see window.moving; limits are the first five constants there."""
 
+def may_have_run_away(
+    point: Ints,
+    norms: Doubles,
+    points: tuple[Doubles, Doubles],
+    of: tuple[Doubles, NDArray[np.bool_]],
+    limits: tuple[float, float, float],
+) -> tuple[NDArray[np.bool_], Ints, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which points may have run away, views that agree, and which are far away, began there, have leapt.
+
+    See window.merging. ``points`` are where they are and began, ``of`` the centre and what is far away in no case, (0,)
+    for none; limits are the gate, how far that is, m, and the share of a leap.
+    """
+
+def stand_out(observations: object, norms: Doubles, n_cameras: int, far: float) -> NDArray[np.bool_]:
+    """Return which views are off by more than those before and after them, see window.moving."""
+
+def seen_by_keyframe(
+    observations: object, used: NDArray[np.bool_], marked: NDArray[np.bool_], n_keyframes: int
+) -> tuple[Ints, Ints]:
+    """Return how many of some observations each keyframe has, and how many of them are of marked points."""
+
 def explained(
     problem: Problem,
     views: tuple[Ints, Ints, Doubles],

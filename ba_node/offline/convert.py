@@ -184,7 +184,7 @@ def of_map(content: MapContent) -> Reconstruction:
         raise ModelError("nothing in it can be used: it has no keyframes, or no cameras")
     rotation, translation = inverse(a["keyframes/rotation"], a["keyframes/position"])
     known = a["landmarks/has_position"]
-    rows = known[a["sightings/landmark"]] & ~a["sightings/outlier"]
+    rows = known[a["observations/landmark"]] & ~a["observations/outlier"]
     number = np.cumsum(known) - 1
     kinds, params = a["cameras/model"], a["cameras/params"]
     return Reconstruction(
@@ -195,10 +195,10 @@ def of_map(content: MapContent) -> Reconstruction:
         translation,
         a["landmarks/position"][known],
         np.full((int(known.sum()), 3), 255),
-        a["sightings/keyframe"][rows].astype(np.intp),
-        a["sightings/camera"][rows].astype(np.intp),
-        number[a["sightings/landmark"][rows]],
-        a["sightings/uv"][rows].astype(np.float64),
+        a["observations/keyframe"][rows].astype(np.intp),
+        a["observations/camera"][rows].astype(np.intp),
+        number[a["observations/landmark"][rows]],
+        a["observations/uv"][rows].astype(np.float64),
         a["keyframes/stamp_ns"],
     )
 

@@ -208,6 +208,13 @@ def middle_if_far(points: FloatArray) -> FloatArray:
     """Return the middle of points (m, 3) if the origin is far from all of them, otherwise zeros."""
     if not len(points):
         return np.zeros(3)
-    middle = np.median(points, axis=0)
-    extent = float(np.median(np.linalg.norm(points - middle, axis=1)))
+    middle = _median(points)
+    extent = float(_median(np.linalg.norm(points - middle, axis=1)))
     return middle if float(np.linalg.norm(middle)) > _FAR * extent > 0.0 else np.zeros(3)
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Return the median over the first axis; np.median loads what numpy has for masked arrays (7 ms, 2 MB)."""
+    n = len(values)
+    middle: FloatArray = np.partition(values, ((n - 1) // 2, n // 2), axis=0)[[(n - 1) // 2, n // 2]].mean(axis=0)
+    return middle

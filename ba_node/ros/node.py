@@ -25,7 +25,6 @@ from rclpy.clock import Clock, ClockType
 
 from ba_node.backend import Backend
 from ba_node.config import Config
-from ba_node.estimate import Estimate
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.components.definitions import Definitions
 from ba_node.ros.components.diagnostics import Diagnostics
@@ -43,7 +42,7 @@ from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode, RefusedError
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.kept_map import KeptMap, KeptMapError
-from ba_node.ros.worker.worker import Notice, Outcome, Worker
+from ba_node.ros.worker.worker import Notice, Outcome, Refined, Worker
 
 NODE_NAME = "ba_node"
 # In the order in which they are made and get estimates; destroyed in reverse. What feeds the worker comes last.
@@ -204,21 +203,28 @@ class BaNode(ManagedNode):
         if host is None:
             return
         outputs = host.worker.outputs()
-        estimates = [output.estimate for output in outputs if isinstance(output, Outcome)]
-        newest = next((e for e in reversed(estimates) if e is not None and e.replaces_map), None)
+        newest = [
+            next((one for one in reversed(outputs) if isinstance(one, kind) and _replaces_map(one)), None)
+            for kind in (Refined, Outcome)
+        ]
         for output in outputs:
             if isinstance(output, Notice):
                 self._log(output)
             elif host.active:
                 for component in self._components:
-                    self._deliver(component, output, newest)
+                    self._deliver(component, output, any(output is one for one in newest))
+            if isinstance(output, Refined):
+                host.worker.poses_left()
 
-    def _deliver(self, component: Component, outcome: Outcome, newest: Estimate | None) -> None:
+    def _deliver(self, component: Component, output: Refined | Outcome, newest: bool) -> None:
         """Give a component what came out; a fault in one must not keep it from the others."""
         try:
-            component.take_report(outcome)
-            if outcome.estimate is not None:
-                component.take(outcome.estimate, outcome.estimate is newest)
+            if isinstance(output, Refined):
+                component.take_poses(output, newest)
+                return
+            component.take_report(output)
+            if output.estimate is not None:
+                component.take(output.estimate, newest)
         except Exception as error:
             if not self.context.ok():
                 return  # a signal ended the context between two messages
@@ -230,3 +236,9 @@ class BaNode(ManagedNode):
         """Log a notice, the same one not more often than every few seconds."""
         if self._throttle.passes(notice.key, time.monotonic()):
             log(self, Severity.ERROR if notice.is_error else Severity.WARNING, notice.text)
+
+
+def _replaces_map(output: Refined | Outcome) -> bool:
+    if isinstance(output, Refined):
+        return output.refinement.replaces_map
+    return output.estimate is not None and output.estimate.replaces_map

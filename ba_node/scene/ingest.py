@@ -43,18 +43,30 @@ class Pose:
 def keyframe_pose(keyframe: Keyframe, log: RejectionLog) -> Pose | None:
     """Return the pose of a keyframe message, or None (counted) if it is not one."""
     name = f"keyframe {keyframe.keyframe_id}"
+    wrong, what = _wrong_pose(keyframe)
+    if wrong:
+        log.reject(wrong, f"{name}: {what}")
+        return None
     position, quaternion = np.asarray(keyframe.position, float), np.asarray(keyframe.orientation, float)
-    if position.shape != (3,) or quaternion.shape != (4,):
-        log.reject("malformed", f"{name}: pose of shape {position.shape}, {quaternion.shape}, expected (3,), (4,)")
-        return None
-    if not _STAMP.min <= keyframe.stamp_ns <= _STAMP.max:
-        log.reject("malformed", f"{name}: stamp {keyframe.stamp_ns} ns, expected 64 bits")
-        return None
-    if not _within(position, MAX_POSITION_M) or not is_rotation(quaternion):
-        log.reject("bad_pose", f"{name}: position {position} m, quaternion {quaternion}, expected finite and not zero")
-        return None
     _check_distance(name, keyframe.frame_id, position, log)
     return Pose(geometry.matrix_from_quaternion(quaternion), position)
+
+
+def has_pose(keyframe: Keyframe) -> bool:
+    """Return True if a keyframe message has a pose."""
+    return not _wrong_pose(keyframe)[0]
+
+
+def _wrong_pose(keyframe: Keyframe) -> tuple[str, str]:
+    """Return why a keyframe is turned away, and what is wrong with it, in words; empty if nothing is."""
+    position, quaternion = np.asarray(keyframe.position, float), np.asarray(keyframe.orientation, float)
+    if position.shape != (3,) or quaternion.shape != (4,):
+        return "malformed", f"pose of shape {position.shape}, {quaternion.shape}, expected (3,), (4,)"
+    if not _STAMP.min <= keyframe.stamp_ns <= _STAMP.max:
+        return "malformed", f"stamp {keyframe.stamp_ns} ns, expected 64 bits"
+    if not _within(position, MAX_POSITION_M) or not is_rotation(quaternion):
+        return "bad_pose", f"position {position} m, quaternion {quaternion}, expected finite and not zero"
+    return "", ""
 
 
 def plain_name(frame_id: str) -> str:

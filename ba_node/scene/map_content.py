@@ -62,7 +62,7 @@ class MapContent:
         columns = {
             "keyframes": "keyframes/keyframe_id",
             "landmarks": "landmarks/track_id",
-            "observations": "sightings/keyframe",
+            "observations": "observations/keyframe",
         }
         return {name: len(self.arrays[column]) for name, column in columns.items()}
 

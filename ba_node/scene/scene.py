@@ -111,9 +111,9 @@ class Scene(MapTables):
 
     def usable(self, measurement: Keyframe | OfSession) -> bool:
         """Return True if anything of a measurement passes the checks it can be given by itself; count nothing."""
-        log = RejectionLog()
         if isinstance(measurement, Keyframe):
-            return ingest.keyframe_pose(measurement, log) is not None
+            return ingest.has_pose(measurement)
+        log = RejectionLog()
         if isinstance(measurement, FeatureTracks):
             return ingest.clean_tracks(measurement, log) is not None
         return not isinstance(measurement, LandmarkGuesses) or ingest.clean_guesses(measurement, log) is not None

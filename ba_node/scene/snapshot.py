@@ -34,9 +34,7 @@ from ba_node.scene.scene import Scene
 from ba_node.scene.tables import Column, Table
 
 _DERIVED = ("last", "views", "previous")
-_TABLES: dict[str, type[Table]] = {"keyframes": Keyframes, "landmarks": Landmarks, "sightings": ObservationTable}
-# The table of a scene where the format has another name for it.
-_TABLE_OF = {"sightings": "observations"}
+_TABLES: dict[str, type[Table]] = {"keyframes": Keyframes, "landmarks": Landmarks, "observations": ObservationTable}
 _CAMERAS = {
     "rotation": Column(np.float64, (3, 3)),
     "translation": Column(np.float64, (3,)),
@@ -58,7 +56,7 @@ def take(scene: Scene) -> MapContent:
     """Return a copy of all that a scene holds; later changes of the scene do not reach it."""
     arrays: dict[str, NDArray[Any]] = {}
     for group, kind in _TABLES.items():
-        arrays |= prefixed(group, ((name, getattr(_table(scene, group), name)) for name in _saved(kind)))
+        arrays |= prefixed(group, ((name, getattr(getattr(scene, group), name)) for name in _saved(kind)))
     for group, cameras in (("cameras", scene.cameras), ("next_cameras", scene.next_cameras)):
         if cameras is not None:
             arrays |= prefixed(group, ((name, getattr(cameras, name)) for name in _CAMERAS))
@@ -92,20 +90,15 @@ def build(content: MapContent, config: SceneConfig) -> Scene:
     n = {group: len(next(iter(found.values()))) for group, found in columns.items()}
     _check_keyframes(columns["keyframes"])
     _check_landmarks(columns["landmarks"])
-    _check_observations(columns["sightings"], n, 0 if scene.cameras is None else len(scene.cameras.model))
+    _check_observations(columns["observations"], n, 0 if scene.cameras is None else len(scene.cameras.model))
     for group, found in columns.items():
-        _table(scene, group).append(n[group], **found)
-    scene.blocks = _blocks(content, columns["sightings"], n)
+        getattr(scene, group).append(n[group], **found)
+    scene.blocks = _blocks(content, columns["observations"], n)
     scene.pending = _pending(content, session_id)
     _restore_log(content, scene)
     saved_constraints.restore(content, scene.constraints)
     scene.index()
     return scene
-
-
-def _table(scene: Scene, group: str) -> Table:
-    table: Table = getattr(scene, _TABLE_OF.get(group, group))
-    return table
 
 
 def _saved(kind: type[Table]) -> dict[str, Column]:
@@ -144,28 +137,34 @@ def _check_landmarks(found: Mapping[str, NDArray[Any]]) -> None:
 
 def _check_observations(found: Mapping[str, NDArray[Any]], n: Mapping[str, int], n_cameras: int) -> None:
     for name, limit in (("keyframe", n["keyframes"]), ("landmark", n["landmarks"]), ("camera", n_cameras)):
-        require_index(found[name], limit, f"sightings/{name}")
-    require_all(within(found["uv"], ingest.MAX_PIXEL), "sightings/uv", found["uv"], f"at most {ingest.MAX_PIXEL:g} px")
+        require_index(found[name], limit, f"observations/{name}")
+    require_all(
+        within(found["uv"], ingest.MAX_PIXEL), "observations/uv", found["uv"], f"at most {ingest.MAX_PIXEL:g} px"
+    )
     sigma, depth = found["sigma_px"], found["depth_m"]
-    require_all((sigma > 0) & np.isfinite(sigma), "sightings/sigma_px", sigma, "a number > 0")
-    require_all(np.isnan(depth) | ((depth > 0) & np.isfinite(depth)), "sightings/depth_m", depth, "NaN or a number > 0")
+    require_all((sigma > 0) & np.isfinite(sigma), "observations/sigma_px", sigma, "a number > 0")
+    require_all(
+        np.isnan(depth) | ((depth > 0) & np.isfinite(depth)), "observations/depth_m", depth, "NaN or a number > 0"
+    )
     where = found["keyframe"].astype(np.int64) * max(n_cameras, 1) + found["camera"]
-    require_unique(where * max(n["landmarks"], 1) + found["landmark"], "sightings: keyframe, camera and landmark")
+    require_unique(where * max(n["landmarks"], 1) + found["landmark"], "observations: keyframe, camera and landmark")
 
 
 def _blocks(content: MapContent, seen: Mapping[str, NDArray[Any]], n: Mapping[str, int]) -> list[list[Block]]:
     found = content.columns("blocks", _BLOCKS)
     require_index(found["keyframe"], n["keyframes"], "blocks/keyframe")
     begin, end = found["begin"], found["end"]
-    require_all((begin >= 0) & (begin <= end) & (end <= n["sightings"]), "blocks/begin", begin, "rows of sightings")
+    require_all(
+        (begin >= 0) & (begin <= end) & (end <= n["observations"]), "blocks/begin", begin, "rows of observations"
+    )
     order = np.argsort(begin, kind="stable")
     order = order[end[order] > begin[order]]
     length = (end - begin)[order]
     whole = len(order) == 0 or (begin[order[0]] == 0 and bool((begin[order[1:]] == end[order[:-1]]).all()))
-    require(whole and length.sum() == n["sightings"], "blocks do not cover the rows of sightings once each")
+    require(whole and length.sum() == n["observations"], "blocks do not cover the rows of observations once each")
     for name in ("keyframe", "camera"):
         stored = np.repeat(found[name][order], length)
-        require(np.array_equal(stored, seen[name]), f"blocks/{name} contradicts sightings/{name}")
+        require(np.array_equal(stored, seen[name]), f"blocks/{name} contradicts observations/{name}")
     blocks: list[list[Block]] = [[] for _ in range(n["keyframes"])]
     for row, *block in zip(*(found[name].tolist() for name in _BLOCKS), strict=True):
         blocks[row].append(Block(*block))

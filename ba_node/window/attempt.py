@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
 from ba_node.config import Config, SolverOptions
 from ba_node.core import methods, solver
 from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
+from ba_node.estimate import Refinement
 from ba_node.scene.scene import Scene
 from ba_node.window import guard
 from ba_node.window.merging import Merged, outcome
@@ -51,27 +51,27 @@ class Attempt(NamedTuple):
     solve_time_s: float  # time in the solver, s
 
 
-def attempt(
-    scene: Scene,
-    config: Config,
-    end: int,
-    trust: Trust,
-    *,
-    clock: Callable[[], float],
-    on_iteration: Callable[[Iteration], bool] | None,
-) -> Attempt | str:
+class Following(NamedTuple):
+    """What follows a solve while it is made."""
+
+    clock: Callable[[], float]  # s, for the report alone
+    on_iteration: Callable[[Iteration], bool] | None = None  # ends the solve by returning False
+    on_poses: Callable[[Refinement], None] = lambda _: None  # gets the poses of a solution as soon as it is taken
+
+
+def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Following) -> Attempt | str:
     """Solve the newest window among the first ``end`` keyframes, or return why it cannot be solved yet.
 
     The scene is not changed, but for where keyframes begin that were not refined yet.
     """
     without: tuple[int, ...] = ()
-    solve_time_s = 0.0
+    solve_time_s, (clock, on_iteration, _) = 0.0, following
     while True:
         selection = select(scene, config, end, without)
         if isinstance(selection, str):
             return selection
         options = methods.from_config(config.solver)
-        problem = _begun(selection.problem, selection.norms.take(selection.used), options)
+        problem = _begun(selection, options)
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True)
         solve_time_s += clock() - began
@@ -87,11 +87,12 @@ def attempt(
         without, trust.cause = verdict.keyframes, verdict.reason
 
 
-def _begun(problem: Problem, norms: FloatArray, options: SolverOptions) -> Problem:
-    """Return a problem with a better start, if its own is bad; ``norms`` (n_obs,) are the residuals there, sigmas."""
-    scale = options.loss_scale_px
+def _begun(selection: Selection, options: SolverOptions) -> Problem:
+    """Return the problem with a better start, if its own is bad."""
+    problem, scale = selection.problem, options.loss_scale_px
     if options.loss not in _FADING or problem.n_keyframes > _YOUNG:
         return problem
+    norms = selection.norms.take(selection.used)
     far = norms > _FAR * scale
     keyframe = problem.observations.keyframe
     n = np.bincount(keyframe, minlength=problem.n_keyframes)

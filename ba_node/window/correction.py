@@ -18,6 +18,7 @@ agree with it (within the gate, at their own newest keyframe). Smoothing moves a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,10 @@ class Move:
     distance_m: float = 0.0
     angle_rad: float = 0.0
     held: bool = False
+
+    def statistics(self) -> dict[str, Any]:
+        """Return it by the names of a report."""
+        return {"correction_m": self.distance_m, "correction_rad": self.angle_rad, "correction_held": self.held}
 
 
 class MapCorrection:

@@ -22,7 +22,8 @@ drifts, the map has another scale at each of its ends.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,7 +41,7 @@ from ba_node.scene.scene import Scene
 from ba_node.window import quality
 from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
-from ba_node.window.problems import problem_of
+from ba_node.window.problems import joined_observations, problem_of, some_observations
 from ba_node.window.selection import Selection, select
 
 # What solves a problem in place of solver.solve, as where many processes work on it.
@@ -115,9 +116,12 @@ class Optimization:
         chosen = options(config, method, max_iterations)
         if self.refine.wanted:
             self._calibrate(chosen)
-        result = (by or solver.solve)(
-            self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True
-        )
+        # Refined cameras may take other pixels.
+        with nullcontext() if self.refine.wanted else self._without_inliers():
+            result = (by or solver.solve)(
+                self.selection.problem, chosen, clock=clock, on_iteration=on_iteration, weakest=True
+            )
+        result = result.settled()
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
             # After it the front-end's steps set the scale, be they factors or not.
@@ -125,6 +129,19 @@ class Optimization:
             state = scaled(self.selection, self.position, result.state)
             selection = dataclasses.replace(self.selection, problem=problem)
             self.covariances = covariances(selection, state, self.position, chosen, points=self.wanted.points)
+
+    @contextmanager
+    def _without_inliers(self) -> Iterator[None]:
+        """Keep of all observations those alone that the problem leaves out, until it is solved."""
+        selection, inlier = self.selection, self.selection.inlier
+        left_out = some_observations(selection.whole, np.flatnonzero(~inlier)).observations
+        self.selection = dataclasses.replace(selection, observations=left_out)
+        del selection
+        try:
+            yield
+        finally:
+            whole = joined_observations(inlier, self.selection.problem.observations, left_out)
+            self.selection = dataclasses.replace(self.selection, observations=whole)
 
     def _calibrate(self, chosen: SolverOptions) -> None:
         """Let the problem begin at the solution for refined cameras."""

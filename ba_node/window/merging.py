@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import TracksConfig
 from ba_node.core import geometry, native_kernels
@@ -45,6 +46,7 @@ def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConf
     found = outcome(scene, selection, result, tracks, kernels)
     if found.state is None:
         return found
+    put_poses(scene, selection, found.state)
     return found._replace(norms=apply(scene, selection, found.state, found.norms, tracks, kernels))
 
 
@@ -75,14 +77,8 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
 
 def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str) -> State:
     """Return a state whose points that ran away are back where they began; their norms are written over."""
-    whole, point, n = selection.whole, selection.observations.point, selection.problem.n_points
-    limit = _noticed_m(selection, state)
-    centre = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0].mean(axis=0)
-    measured = _has_depth(whole.observations, n)
-    away, began = ((_largest(points - centre) > limit) & ~measured for points in (state.points, whole.start.points))
-    agreeing = np.bincount(point[norms <= gate], minlength=n)
-    leapt = _largest(state.points - whole.start.points) > _LEAP * _largest(whole.start.points - centre)
-    doubted = away | leapt | (2 * agreeing < np.bincount(point, minlength=n))
+    whole, point = selection.whole, selection.observations.point
+    doubted, agreeing, away, began, leapt = _doubted(selection, state, norms, gate, kernels)
     rows = np.flatnonzero(doubted.take(point))
     if not len(rows):
         return state
@@ -101,6 +97,30 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     return dataclasses.replace(state, points=points)
 
 
+def _doubted(
+    selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str
+) -> tuple[BoolArray, IntArray, BoolArray, BoolArray, BoolArray]:
+    """Return which points may have run away, (n_pt,), and how many views agree with each.
+
+    And which are too far away, which began there, and which have leapt.
+    """
+    point, n = selection.observations.point, selection.problem.n_points
+    points, start = state.points, selection.problem.start.points
+    position = -(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0]
+    centre, limit = position.mean(axis=0), _noticed_m(selection, position)
+    measured = _has_depth(selection.observations, n)
+    if kernels != "numpy" and native.kernels is not None:
+        limits = gate, limit, _LEAP
+        found: tuple[BoolArray, IntArray, BoolArray, BoolArray, BoolArray] = native.kernels.may_have_run_away(
+            point, norms, (points, start), (centre, measured), limits
+        )
+        return found
+    away, began = ((_largest(where - centre) > limit) & ~measured for where in (points, start))
+    agreeing = np.bincount(point[norms <= gate], minlength=n)
+    leapt = _largest(points - start) > _LEAP * _largest(start - centre)
+    return away | leapt | (2 * agreeing < np.bincount(point, minlength=n)), agreeing, away, began, leapt
+
+
 def _largest(vectors: FloatArray) -> FloatArray:
     """Return the largest coordinate of each of (n, 3) vectors, without its sign."""
     # numpy takes ten times as long for the largest of rows that are so short.
@@ -116,31 +136,40 @@ def _has_depth(observations: Observations, n: int) -> BoolArray:
     return found
 
 
-def _noticed_m(selection: Selection, state: State) -> float:
-    """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise."""
+def _noticed_m(selection: Selection, position: FloatArray) -> float:
+    """Return how far away a point may be: farther, the steps of the whole window move it by less than its noise.
+
+    ``position`` (n_kf, 3) is that of the keyframes, m.
+    """
     cams, obs = selection.problem.cameras, selection.observations
-    spread = np.ptp(-(np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0], axis=0).max()
+    spread = np.ptp(position, axis=0).max()
     spread = max(float(spread), float(np.ptp(cams.translation, axis=0).max()))
     return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
+
+
+def put_poses(scene: Scene, selection: Selection, state: State, without: tuple[int, ...] = ()) -> None:
+    """Put the poses of a solution, in the scale of the map, into the scene; keyframes of ``without`` had none."""
+    free = ~selection.problem.fixed
+    rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
+    rows, table = selection.keyframes[free], scene.keyframes
+    table.rotation[rows] = geometry.nearest_rotation(rotation)
+    table.position[rows] = position + selection.origin
+    left_out = np.array(without, np.intp)
+    scene.moved(np.concatenate([selection.keyframes[free | ~table.refined[selection.keyframes]], left_out]))
+    table.refined[selection.keyframes] = True
+    table.refined[left_out] = False
 
 
 def apply(
     scene: Scene, selection: Selection, state: State, norms: FloatArray, tracks: TracksConfig, kernels: str = "auto"
 ) -> FloatArray:
-    """Put a solution, in the scale of the map, into the scene and classify its observations anew.
+    """Put the points of a solution into the scene, whose poses are there, and classify its observations anew.
 
     ``norms`` (n_all,) are the sizes of its residuals, as ``Selection.norms``; they are written over, and returned.
 
     Returns:
         (n_all,) sizes of the residuals, as ``Selection.norms``.
     """
-    free = ~selection.problem.fixed
-    rotation, position = geometry.inverse(state.rotation[free], state.translation[free])
-    rows = selection.keyframes[free]
-    scene.keyframes.rotation[rows] = geometry.nearest_rotation(rotation)
-    scene.keyframes.position[rows] = position + selection.origin
-    scene.moved(selection.keyframes[free | ~scene.keyframes.refined[selection.keyframes]])
-    scene.keyframes.refined[selection.keyframes] = True
     scene.landmarks.position[selection.landmarks] = state.points + selection.origin
     scene.landmarks.has_position[selection.landmarks] = True
     classify(scene, selection, state, norms, tracks, kernels)

@@ -76,18 +76,21 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     places, _ = consensus.triangulate(triangulation.rays_of(doubted, kernels), doubted.n_points, _BOUND, kernels)
     at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
     again = native_kernels.residual_norms(doubted, at, kernels)
-    again[_mismatches(doubted, again)] = np.inf
+    again[_mismatches(doubted, again, kernels)] = np.inf
     found[found] = _leaves_more_than_noise(doubted, again, off, kernels)
     return found
 
 
-def _mismatches(problem: Problem, norms: FloatArray) -> BoolArray:
+def _mismatches(problem: Problem, norms: FloatArray, kernels: str) -> BoolArray:
     """Return which views are off by far more than those before and after them of the same point, (n_obs,).
 
     A point that moves leaves its place little by little. Nor may the views before and after by the same camera be off
     likewise: of a rig that is not as it is said to be, one camera's views are, in every keyframe.
     """
     obs = problem.observations
+    if kernels != "numpy" and native.kernels is not None:
+        found: BoolArray = native.kernels.stand_out(obs, norms, len(problem.cameras.model), _LARGE)
+        return found
     track = obs.point * len(problem.cameras.model) + obs.camera
     order = np.argsort(track, kind="stable")
     found = _stands_out(obs.point, norms, alone=False)

@@ -8,8 +8,10 @@ All observations of a problem are sorted by point, keyframe, camera. A part keep
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
@@ -83,6 +85,19 @@ def _taken(
         obs.depth_m.take(rows) if has_depth else obs.depth_m,
         obs.depth_sigma_m.take(rows) if has_depth else obs.depth_sigma_m,
     )
+
+
+def joined_observations(inlier: BoolArray, part: Observations, rest: Observations) -> Observations:
+    """Return the observations of which ``part`` has those that ``inlier`` (n,) marks, and ``rest`` all others."""
+
+    def join(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
+        if len(one) + len(other) < len(inlier):
+            return one  # none has a depth
+        out = np.empty((len(inlier), *one.shape[1:]), one.dtype)
+        out[inlier], out[~inlier] = one, other
+        return out
+
+    return Observations(*map(join, vars(part).values(), vars(rest).values()))
 
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.

@@ -33,7 +33,7 @@ def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
 
     One that is farther off than ``BOUND_PX`` counts as that: a point in the plane of a camera is anywhere.
     """
-    error = norms.take(selection.used) * selection.observations.sigma_px.take(selection.used)
+    error = norms.take(selection.used) * selection.problem.observations.sigma_px
     if not np.isfinite(error).all():
         error = error[np.isfinite(error)]
     error = np.minimum(error, BOUND_PX)

@@ -123,13 +123,15 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
         return reason
     scene.propagate_corrections()
     known = old_keyframes.memory(scene, config, window)
-    told = () if known is None else known.keyframe_id
     part, norms, strays = _arrived(scene, window, config, without)
     usable = _usable(scene, part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     moves = _moving(scene, part, norms, config)
     much_moves = moving.much(part.problem, moves)
-    least = _least_points(part.problem, config, np.isin(scene.keyframes.keyframe_id[part.keyframes], told))
+    told = np.zeros(len(part.keyframes), bool)
+    if known is not None:
+        told = np.isin(scene.keyframes.keyframe_id[part.keyframes], known.keyframe_id)
+    least = _least_points(part.problem, config, told)
     kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Problem
@@ -108,8 +109,11 @@ def find(problem: Problem, rows: IntArray, used: BoolArray, placed: BoolArray) -
     (n_pt,) points have a place. The problem's start is not looked at.
     """
     obs, n = problem.observations, problem.n_keyframes
-    every = np.bincount(obs.keyframe[used], minlength=n)
-    well = np.bincount(obs.keyframe[used & placed.take(obs.point)], minlength=n)
+    if native.kernels is not None:
+        every, well = native.kernels.seen_by_keyframe(obs, used, placed, n)
+    else:
+        every = np.bincount(obs.keyframe[used], minlength=n)
+        well = np.bincount(obs.keyframe[used & placed.take(obs.point)], minlength=n)
     weak = (well < _FEW_POINTS) & (every >= _LEAST_SHARED)
     weak[:1] = False
     if not weak.any():

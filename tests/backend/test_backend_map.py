@@ -127,7 +127,7 @@ def test_it_knows_all_of_that(known: Backend) -> None:
     content = known.snapshot()
     assert len(content.arrays["pending/keyframe_id"]) == 1
     assert content.facts["session_id"] == 1
-    assert len(content.arrays["sightings/uv"]) > 100
+    assert len(content.arrays["observations/uv"]) > 100
 
 
 def test_a_snapshot_does_not_change_any_more(known: Backend) -> None:
@@ -182,15 +182,18 @@ def put(at: int, value: Any) -> Callable[[np.ndarray], None]:
         (spoil("keyframes/rotation", put(1, 0.5)), "keyframes/rotation of row 1 .*expected a rotation"),
         (spoil("keyframes/input_position", put(2, np.nan)), "keyframes/input_position of row 2 .*finite"),
         (spoil("landmarks/position", lambda a: np.full_like(a, np.inf)), "landmarks/position of row .* has_position"),
-        (spoil("sightings/keyframe", put(3, 5)), "sightings/keyframe of row 3 = 5: expected an index below 5"),
-        (spoil("sightings/landmark", put(0, -1)), "sightings/landmark of row 0 = -1"),
-        (spoil("sightings/camera", put(9, 2)), "sightings/camera of row 9 = 2: expected an index below 2"),
-        (spoil("sightings/uv", put(4, np.nan)), "sightings/uv of row 4"),
-        (spoil("sightings/sigma_px", put(4, 0.0)), "sightings/sigma_px of row 4 = 0.0: expected a number > 0"),
-        (spoil("sightings/depth_m", put(4, -1.0)), "sightings/depth_m of row 4"),
-        (lambda c: c.arrays["sightings/landmark"].__setitem__(1, c.arrays["sightings/landmark"][0]), "more than once"),
-        (spoil("blocks/camera", lambda a: 1 - a), "blocks/camera contradicts sightings/camera"),
-        (spoil("blocks/begin", put(1, 0)), "blocks do not cover the rows of sightings once each"),
+        (spoil("observations/keyframe", put(3, 5)), "observations/keyframe of row 3 = 5: expected an index below 5"),
+        (spoil("observations/landmark", put(0, -1)), "observations/landmark of row 0 = -1"),
+        (spoil("observations/camera", put(9, 2)), "observations/camera of row 9 = 2: expected an index below 2"),
+        (spoil("observations/uv", put(4, np.nan)), "observations/uv of row 4"),
+        (spoil("observations/sigma_px", put(4, 0.0)), "observations/sigma_px of row 4 = 0.0: expected a number > 0"),
+        (spoil("observations/depth_m", put(4, -1.0)), "observations/depth_m of row 4"),
+        (
+            lambda c: c.arrays["observations/landmark"].__setitem__(1, c.arrays["observations/landmark"][0]),
+            "more than once",
+        ),
+        (spoil("blocks/camera", lambda a: 1 - a), "blocks/camera contradicts observations/camera"),
+        (spoil("blocks/begin", put(1, 0)), "blocks do not cover the rows of observations once each"),
         (spoil("blocks/end", put(-1, 10**6)), "blocks/begin of row"),
         (spoil("cameras/model", put(0, 9)), r"cameras/model of row 0 = 9: expected one of \[0, 1\]"),
         (spoil("cameras/params", put(0, 0.0)), "cameras/params of row 0"),

@@ -32,7 +32,7 @@ def sizes(backend: Backend) -> dict[str, int]:
     """Return how much the back-end holds: rows in use, rows of memory, and what waits."""
     scene = backend.scene
     tables: dict[str, Table] = {
-        "keyframes": scene.keyframes, "landmarks": scene.landmarks, "sightings": scene.observations
+        "keyframes": scene.keyframes, "landmarks": scene.landmarks, "observations": scene.observations
     }  # fmt: skip
     rows = {name: len(table) for name, table in tables.items()}
     room = {f"room for {name}": max(map(len, table._buffers.values())) for name, table in tables.items()}
@@ -68,9 +68,9 @@ def test_sizes_stay_within_bounds_over_thousands_of_keyframes() -> None:
     assert rejected > ROUNDS * LENGTH / 2, f"{rejected} messages turned away: the test is to have many"
     n_obs = 2 * 40 * LIMITS["scene.max_keyframes"]
     bounds = {
-        "keyframes": 120, "landmarks": 2000, "sightings": n_obs, "ids": 2000, "keyframe rows": 120, "blocks": 2 * 120,
-        "pending": 20, "notes": 50, "room for keyframes": 4 * 120,
-        "room for landmarks": 4 * 2000, "room for sightings": 4 * n_obs,
+        "keyframes": 120, "landmarks": 2000, "observations": n_obs, "ids": 2000, "keyframe rows": 120,
+        "blocks": 2 * 120, "pending": 20, "notes": 50, "room for keyframes": 4 * 120,
+        "room for landmarks": 4 * 2000, "room for observations": 4 * n_obs,
     }  # fmt: skip
     for name, bound in bounds.items():
         most = max(size[name] for size in largest)

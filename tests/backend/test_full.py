@@ -268,6 +268,24 @@ def test_there_is_a_reason_where_there_is_nothing_to_solve() -> None:
     assert backend.estimate().trajectory.keyframe_id.tolist() == []
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_observations_are_the_same_bits_after_a_solve_that_did_without_them(kind: str) -> None:
+    backend = Backend(CONFIG)
+    feed(backend, cut(recording(**KINDS[kind], outlier_share=0.1), 12)[0])
+    taken = everything(backend)
+    whole, during = taken.selection.observations, []
+    assert 0 < np.count_nonzero(~taken.selection.inlier) < 0.5 * len(whole)
+
+    def look(_row: Iteration) -> bool:
+        during.append(len(taken.selection.observations))
+        return True
+
+    taken.solve(backend.config.solver, max_iterations=2, on_iteration=look)
+    assert set(during) == {np.count_nonzero(~taken.selection.inlier)}
+    for was, now in zip(vars(whole).values(), vars(taken.selection.observations).values(), strict=True):
+        np.testing.assert_array_equal(now, was)
+
+
 def test_a_solve_is_stopped_after_an_iteration() -> None:
     backend = Backend(CONFIG)
     feed(backend, [m for _, _, m in recording(keyframes=8, landmarks=600, tracks=60).timeline()])

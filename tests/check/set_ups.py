@@ -105,6 +105,12 @@ def _reversed(rotation: FloatArray, position: FloatArray) -> tuple[FloatArray, F
     return rotation, position
 
 
+def all_turned(degrees: float, axis: tuple[float, float, float]) -> Wrong:
+    """Return what turns cameras that look alike by some degrees about an axis of the first."""
+    turn = geometry.so3_exp(np.radians(degrees) * np.array(axis))
+    return rig(lambda rotation, position: (rotation @ turn, position))
+
+
 def turned(degrees: float, axis: tuple[float, float, float]) -> Wrong:
     """Return what turns the second camera about an axis of its own."""
 
@@ -205,6 +211,8 @@ WRONG: dict[str, Wrong] = {
     "turned 1 about x": turned(1.0, (1.0, 0.0, 0.0)),
     "turned 2 about z": turned(2.0, (0.0, 0.0, 1.0)),
     "turned 0.5 about x": turned(0.5, (1.0, 0.0, 0.0)),
+    "all turned 5 about z": all_turned(5.0, (0.0, 0.0, 1.0)),
+    "all turned 4 about x": all_turned(4.0, (1.0, 0.0, 0.0)),
     "focal 1.2": intrinsics(lambda k: k * [1.2, 1.2, 1.0, 1.0]),
     "focal 0.8": intrinsics(lambda k: k * [0.8, 0.8, 1.0, 1.0]),
     "focal 0.5": intrinsics(lambda k: k * [0.5, 0.5, 1.0, 1.0]),

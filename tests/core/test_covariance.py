@@ -86,13 +86,16 @@ def worst_difference(got: np.ndarray, expected: np.ndarray) -> float:
     return float(np.max(np.abs(got - expected) / scale))
 
 
+@pytest.mark.parametrize("full", [0.0, 2.0], ids=["full", "sparse"])
 @pytest.mark.parametrize("loss", ["squared", "huber"])
 @pytest.mark.parametrize(
     "fields", [{"stereo": True}, {"stereo": True, "depth": True}, {"fixed": 2}], ids=["stereo", "depth", "mono"]
 )
 def test_it_is_the_sandwich_of_the_whole_jacobian(
-    make_problem: MakeProblem, loss: str, fields: dict[str, object]
+    make_problem: MakeProblem, monkeypatch: pytest.MonkeyPatch, loss: str, fields: dict[str, object], full: float
 ) -> None:
+    monkeypatch.setattr(covariance, "_FULL", full)
+    monkeypatch.setattr(covariance, "_CHUNK", 100)
     problem, _ = make_problem(noise_px=1.0, **fields)
     chosen = options(loss)
     state = solved(problem, chosen)

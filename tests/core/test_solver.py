@@ -242,3 +242,19 @@ class TestLadybug:
 def test_small_real_problems_stop_with_a_reason(method: str, name: str, shared_data: Path) -> None:
     problem = bal.to_problem(bal.read_bal(shared_data / "gtsam-dubrovnik-small" / name))
     check(solve(problem, methods.options(method)))
+
+
+def test_curved_valleys_end_at_their_floor_from_any_start(shared_data: Path) -> None:
+    """dubrovnik-3-7 has fewer equations than unknowns, so that its minimum is 0, at the end of a curved valley."""
+    problem = bal.to_problem(bal.read_bal(shared_data / "gtsam-dubrovnik-small" / "dubrovnik-3-7-pre.txt"))
+    options = dataclasses.replace(methods.options("auto"), max_iterations=100, function_tolerance=1e-8)
+    rng = np.random.default_rng(1)
+    for scale in (0.0, *[1.0] * 8):
+        start = dataclasses.replace(
+            problem.start,
+            translation=problem.start.translation + scale * rng.normal(0.0, 0.02, problem.start.translation.shape),
+            points=problem.start.points + scale * rng.normal(0.0, 0.05, problem.start.points.shape),
+        )
+        result = solve(dataclasses.replace(problem, start=start), options)
+        check(result)
+        assert result.objective_after < 1e-9, (result.objective_after, result.reason)

@@ -107,6 +107,17 @@ def test_what_numpy_writes_compressed_is_read(folder: Path, data: bytes, content
     assert same(loaded(path), content)
 
 
+def test_version_1_is_read(folder: Path, content: MapContent) -> None:
+    path = folder / "first.npz"
+    before = {name.replace("observations/", "sightings/"): array for name, array in content.arrays.items()}
+    np.savez(path, **before)  # type: ignore[arg-type]
+    head = {"format": "ba_node map", "version": 1, "written_by": "ba_node 0.2.0", **content.facts}
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("map.json", json.dumps(head))
+    assert "sightings/uv" in before
+    assert same(loaded(path), content)
+
+
 @settings(max_examples=300)
 @given(st.data())
 def test_damage_is_noticed_or_harmless(folder: Path, data: bytes, content: MapContent, draw: st.DataObject) -> None:
@@ -137,8 +148,8 @@ def test_a_file_that_is_cut_off_is_refused(folder: Path, data: bytes, draw: st.D
         ({"map_json": b"["}, "damaged: Expecting value"),
         ({"map_json": b'{"format": "ba_node map", "version": "1"}'}, "version = '1', expected a number"),
         (
-            {"map_json": b'{"format": "ba_node map", "version": 2, "written_by": "ba_node 9"}'},
-            r"format version 2, written by ba_node 9; this ba_node reads up to 1: update",
+            {"map_json": b'{"format": "ba_node map", "version": 3, "written_by": "ba_node 9"}'},
+            r"format version 3, written by ba_node 9; this ba_node reads up to 2: update",
         ),
         ({"map_json": b'{"format": "ba_node map", "version": 1}'}, "damaged: session_id = None, expected int or None"),
         ({"keyframes_position_npy": None}, "damaged: keyframes/position is missing"),

@@ -304,7 +304,7 @@ class Peer:
 def solve_until_stopped() -> None:
     """Have solves go on until they are stopped, and say when one has begun."""
 
-    def solve(self: Any, on_iteration: Callable[[Any], bool]) -> None:  # noqa: ARG001
+    def solve(self: Any, on_iteration: Callable[[Any], bool], on_poses: object) -> None:  # noqa: ARG001
         print("solving", flush=True)
         while on_iteration(None):
             time.sleep(0.01)

@@ -340,11 +340,11 @@ def fail_in_the_second_solve() -> None:
     backend: Any = Backend
     solve, calls = Backend.solve, []
 
-    def sometimes(self: Any, on_iteration: Any) -> Any:
+    def sometimes(self: Any, on_iteration: Any, on_poses: Any) -> Any:
         calls.append(1)
         if len(calls) == 2:
             raise RuntimeError("a fault nobody thought of")
-        return solve(self, on_iteration)
+        return solve(self, on_iteration, on_poses)
 
     backend.solve = sometimes
 

@@ -39,7 +39,7 @@ from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
 from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.worker.inbox import Inbox
-from ba_node.ros.worker.worker import Notice, Outcome, Worker
+from ba_node.ros.worker.worker import Notice, Outcome, Refined, Worker
 
 
 @dataclass
@@ -81,6 +81,9 @@ class Component:
 
     def deactivate(self) -> None:
         """Pause: nothing may be published until :meth:`activate`. ``host.active`` is False already."""
+
+    def take_poses(self, refined: Refined, newest: bool) -> None:
+        """Take the poses of a solve, which come before the report on it; only while active. ``newest`` as below."""
 
     def take_report(self, outcome: Outcome) -> None:
         """Take what the worker reports, of every solve and on what was turned away; only while active."""

@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-from ba_node.estimate import Estimate
+from ba_node.estimate import Refinement
 from ba_node.messages.cdr import tf_message
 from ba_node.messages.topics import TF, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.log import Severity, log
+from ba_node.ros.worker.worker import Refined
 
 _DEPTH = 100
 _NS = 1e9
@@ -26,7 +27,7 @@ class MapTransform(Component):
     def __init__(self, host: Host) -> None:
         """Advertise /tf; without tf2_msgs say that there is none."""
         super().__init__(host)
-        self._estimate: Estimate | None = None
+        self._taken: Refinement | None = None
         self._taken_ns = 0
         self._last_stamp_ns: int | None = None
         try:
@@ -42,20 +43,21 @@ class MapTransform(Component):
 
     def deactivate(self) -> None:
         """Say nothing any more; what was said grows old."""
-        self._estimate = None
+        self._taken = None
 
-    def take(self, estimate: Estimate, newest: bool) -> None:
+    def take_poses(self, refined: Refined, newest: bool) -> None:
         """Take the newest correction; that of another map ends with it, though the new one has none yet."""
-        if self._estimate is not None and self._estimate.map_index != estimate.map_index:
-            self._estimate = self._last_stamp_ns = None
+        taken = refined.refinement
+        if self._taken is not None and self._taken.map_index != taken.map_index:
+            self._taken = self._last_stamp_ns = None
         if not newest:
             return
-        if estimate.correction is None:  # all was forgotten
-            self._estimate = self._last_stamp_ns = None
+        if taken.correction is None:  # all was forgotten
+            self._taken = self._last_stamp_ns = None
             return
-        if self._estimate is None:
+        if self._taken is None:
             self._last_stamp_ns = None
-        self._estimate, self._taken_ns = estimate, self._now_ns()
+        self._taken, self._taken_ns = taken, self._now_ns()
         self._send(news=True)
 
     def _repeat(self) -> None:
@@ -63,24 +65,24 @@ class MapTransform(Component):
 
     def _send(self, *, news: bool) -> None:
         """Publish the correction with the time that the data has now."""
-        estimate = self._estimate
-        if estimate is None or estimate.correction is None or self._publisher is None:
+        taken = self._taken
+        if taken is None or taken.correction is None or self._publisher is None:
             return
         if not self.host.config.frames.publish_tf:
             self._say("off: frames.publish_tf = false")
             return
-        if estimate.correction.odom_frame == estimate.frame_id:
-            self._say(f"off: keyframes are in {estimate.frame_id!r} too; give frames.map_frame another name")
+        if taken.correction.odom_frame == taken.frame_id:
+            self._say(f"off: keyframes are in {taken.frame_id!r} too; give frames.map_frame another name")
             return
         elapsed_ns = max(0, self._now_ns() - self._taken_ns)
-        stamp_ns = estimate.stamp_ns + elapsed_ns + int(self.host.config.frames.transform_tolerance * _NS)
+        stamp_ns = taken.stamp_ns + elapsed_ns + int(self.host.config.frames.transform_tolerance * _NS)
         if self._last_stamp_ns is not None and stamp_ns <= self._last_stamp_ns:
             if not news:
                 return
             stamp_ns = self._last_stamp_ns + 1
         self._last_stamp_ns = stamp_ns
-        self._publisher.publish(tf_message(estimate.correction, estimate.frame_id, stamp_ns))
-        self._say(f"{estimate.frame_id} -> {estimate.correction.odom_frame}")
+        self._publisher.publish(tf_message(taken.correction, taken.frame_id, stamp_ns))
+        self._say(f"{taken.frame_id} -> {taken.correction.odom_frame}")
 
     def _now_ns(self) -> int:
         return int(self.host.node.get_clock().now().nanoseconds)

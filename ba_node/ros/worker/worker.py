@@ -19,21 +19,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ba_node.backend import Backend, Check, Work
-from ba_node.estimate import Estimate, Iteration, SolveReport, Status
+from ba_node.estimate import Estimate, Iteration, Refinement, SolveReport, Status
 from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
 from ba_node.ros.worker.inbox import Arrival, Command, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
 from ba_node.ros.worker.latency import Budget, Lag
 
-# Estimates that wait for a busy executor; the next one replaces it.
-_MAX_OUTPUTS = 20
+# Poses and outcomes that wait for a busy executor; the next one replaces it.
+_MAX_OUTPUTS = 40
 # A report on what was turned away goes out without a solve, but not more often.
 _REPORT_PERIOD_S = 1.0
 # For so long a step of a check waits for a solve to end: where solves follow each other at once it must get on too.
 _GIVES_WAY_S = 0.2
 # Texts that begin alike say the same.
 _HEAD = 40
+# For so long at most the rest of a solve waits for its poses to leave: two threads at once hinder each other.
+_LEAVING_S = 0.005
 # Falling behind for this long is warned about.
 _PATIENCE_S = 5.0
 
@@ -55,10 +57,17 @@ class Outcome:
     queue: QueueReport  # what has become of keyframes so far
     stamp_ns: int  # of the newest keyframe, ns
     estimate: Estimate | None = None  # what the solve gave; None without one
-    arrived_s: float = 0.0  # when its newest keyframe came in, by the worker's clock, s
 
 
-Output = Outcome | Notice
+@dataclass(frozen=True)
+class Refined:
+    """The poses of a solve, before the outcome."""
+
+    refinement: Refinement
+    arrived_s: float  # as of Outcome
+
+
+Output = Outcome | Refined | Notice
 
 
 class Worker:
@@ -95,6 +104,8 @@ class Worker:
         self._settled = True
         self._behind = False
         self._failures: Counter[str] = Counter()
+        self._left = threading.Event()  # set when poses have left
+        self._has_left = True
         self._resting = threading.Event()  # set while there is nothing to do
         self._thread = threading.Thread(target=self._run, name="solver", daemon=True)
 
@@ -149,6 +160,10 @@ class Worker:
             taken.append(self._outputs.popleft())
         return taken
 
+    def poses_left(self) -> None:
+        """Go on, as the poses of a solve have been published."""
+        self._left.set()
+
     def _run(self) -> None:
         while True:
             self._resting.set()
@@ -183,6 +198,7 @@ class Worker:
         if callable(arrival.content):
             estimate, now_s = arrival.content(self._backend), self._clock()
             if estimate is not None and not self._inbox.closed:
+                self._put(Refined(estimate.refinement, now_s))
                 self._put(self._finished(estimate, now_s, now_s))
             return
         content, backend = arrival.content, self._backend
@@ -202,8 +218,8 @@ class Worker:
         before = self._backend.map.solved_count
         arrived_s = self._arrival_s(start_s)
         self._budget.begin(arrived_s, 1e-3 * self._backend.config.node.latency_budget_ms)
-        estimate = self._backend.solve(on_iteration=self._goes_on)
-        self._budget.end()
+        self._has_left = False
+        estimate = self._backend.solve(self._goes_on, functools.partial(self._leave, arrived_s))
         n_solved = self._backend.map.solved_count - before
         lag = self._lag.update(start_s, self._clock(), n_solved, estimate, self._backend.config)
         if lag:
@@ -211,7 +227,20 @@ class Worker:
         # More keyframes than a window holds take several solves; without progress the next try waits for new data.
         self._behind = n_solved > 0 and self._backend.ready
         if estimate is not None and not self._inbox.closed:
+            if not self._has_left:
+                self._leave(arrived_s, estimate.refinement)
             self._put(self._finished(estimate, start_s, arrived_s))
+
+    def _leave(self, arrived_s: float, refinement: Refinement) -> None:
+        """Let the poses of a solve be published before the rest of it is worked out."""
+        self._budget.end()
+        if self._inbox.closed:
+            return
+        self._has_left = True
+        self._left.clear()
+        self._put(Refined(refinement, arrived_s))
+        if self._thread is threading.current_thread():
+            self._left.wait(_LEAVING_S)
 
     def _arrival_s(self, now_s: float) -> float:
         """Return when the keyframe came in that the next solve is for; now if it was solved before."""
@@ -232,7 +261,7 @@ class Worker:
             budget_ms = self._backend.config.node.latency_budget_ms
             spent = f"the latency budget of {budget_ms:g} ms was spent after {report.iterations} iterations"
             report = dataclasses.replace(report, reason=spent)
-        return Outcome(report, self._queue(start_s - arrived_s), estimate.stamp_ns, estimate, arrived_s)
+        return Outcome(report, self._queue(start_s - arrived_s), estimate.stamp_ns, estimate)
 
     def _queue(self, wait_s: float = 0.0) -> QueueReport:
         """Return what has become of keyframes so far; with it all is reported that was turned away."""

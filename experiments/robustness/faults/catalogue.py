@@ -288,6 +288,15 @@ FAULTS: dict[str, Fault] = {
     ),
     "odometry_freezes": Fault("odometry freezes, keyframes", midway.odometry_freezes, amounts=(3.0, 10.0), rigs=_ALL),
     "numbered_anew": Fault("keyframe ids begin anew, from", midway.numbered_anew, amounts=(1000.0,)),
+    "all_turned": Fault(
+        "cameras rolled on the body, deg",
+        setup.all_turned,
+        amounts=(10.0, 5.0),
+        rigs=_ALL,
+        named=("camera 0 does not fit its place on the body",),
+        codes=_LOOK,
+        changes={"path": "loop", "length_m": 30.0, "keyframes": 60},
+    ),
 }
 
 

@@ -67,6 +67,21 @@ def camera_turned(recording: Recording, amount: float, rng: np.random.Generator)
     return recording.changed(CameraRig, change)
 
 
+def all_turned(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Turn all cameras of the rig message by some degrees about the axis that the first looks along."""
+    turn = geometry.so3_exp(np.radians([0.0, 0.0, amount]))
+
+    def change(rig: CameraRig) -> CameraRig:
+        rotation, position = geometry.matrix_from_quaternion(rig.orientation), rig.position
+        about = rotation[0] @ turn @ rotation[0].T
+        orientation = geometry.quaternion_from_matrix(about @ rotation)
+        return dataclasses.replace(
+            rig, orientation=orientation, position=position[:1] + (position - position[:1]) @ about.T
+        )
+
+    return recording.changed(CameraRig, change)
+
+
 def poses_w_first(recording: Recording, _amount: float, _rng: np.random.Generator) -> Recording:
     """Write the quaternions of the poses with w first."""
     return recording.changed(

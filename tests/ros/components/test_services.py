@@ -122,7 +122,7 @@ def test_a_saved_map_goes_on_in_another_node(
     assert saved.message == f"{path}: 5 keyframes, {saved.landmarks} landmarks, {saved.observations} observations"
     with np.load(path) as arrays:
         assert len(arrays["keyframes/position"]) == saved.keyframes == 5
-        assert len(arrays["sightings/uv"]) == saved.observations > 500
+        assert len(arrays["observations/uv"]) == saved.observations > 500
         positions = arrays["keyframes/position"]
     assert first.stop() == 0
 

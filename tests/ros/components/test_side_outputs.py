@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ba_node.messages.factory import stamp_ns_from_message
-from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components import publishing
@@ -39,14 +38,17 @@ def tell_of_work() -> None:
 
     for name in ("covariances", "view"):
         setattr(view, name, telling(name))
-    build = output_messages
 
-    def tell_topics(*arguments: Any) -> Any:
-        built = build(*arguments)
-        print("builds", *sorted({topic for topic, _, _ in built}), flush=True)
-        return built
+    def telling_topics(build: Callable[..., Any]) -> Callable[..., Any]:
+        def tell(*arguments: Any) -> Any:
+            built = build(*arguments)
+            print("builds", *sorted({one[0] for one in built}), flush=True)
+            return built
 
-    vars(publishing)["output_messages"] = tell_topics
+        return tell
+
+    for name in ("output_messages", "pose_outputs"):
+        vars(publishing)[name] = telling_topics(vars(publishing)[name])
 
 
 @pytest.fixture(scope="module")

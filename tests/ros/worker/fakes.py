@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from ba_node.config import Config
-from ba_node.estimate import Cloud, Estimate, Poses, SolveReport, Status
+from ba_node.estimate import Cloud, Estimate, Poses, Refinement, SolveReport, Status
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.messages.report import Report
 from ba_node.ros.worker.inbox import Inbox
-from ba_node.ros.worker.worker import Outcome, Output, Worker
+from ba_node.ros.worker.worker import Outcome, Output, Refined, Worker
 
 
 class FakeMap:
@@ -66,6 +66,8 @@ class FakeBackend:
         self.status = Status.CONVERGED
         self.config = Config()
         self.map = FakeMap(self)
+        self.early = False
+        self.after_poses: Callable[[], None] = lambda: None
         self.while_solving: Callable[[Callable[[Any], bool]], None] = lambda _: None
 
     @property
@@ -101,7 +103,7 @@ class FakeBackend:
         self.complete = True
         self.flushed += 1
 
-    def solve(self, on_iteration: Callable[[Any], bool]) -> Estimate | None:
+    def solve(self, on_iteration: Callable[[Any], bool], on_poses: Callable[[Refinement], None]) -> Estimate | None:
         if self.fail == "solve":
             raise RuntimeError("broken solve")
         self.while_solving(on_iteration)
@@ -116,7 +118,11 @@ class FakeBackend:
         )
         empty = Cloud(np.empty(0, np.uint64), np.empty((0, 3)), np.empty(0, np.float32), np.empty(0, np.int32))
         report = SolveReport(newest_keyframe_id=newest.keyframe_id, status=self.status)
-        return Estimate(newest.stamp_ns, "odom", poses, poses, empty, report)
+        estimate = Estimate(newest.stamp_ns, "odom", poses, poses, empty, report)
+        if self.early:
+            on_poses(estimate.refinement)
+        self.after_poses()
+        return estimate
 
 
 class Rig:
@@ -139,9 +145,12 @@ class Rig:
         return self.worker.outputs()
 
     def wait_for_output(self) -> list[Output]:
-        assert self.new.wait(10.0), "nothing came out of the worker in 10 s"
-        self.new.clear()
-        return self.worker.outputs()
+        found: list[Output] = []
+        while all(isinstance(one, Refined) for one in found):
+            assert self.new.wait(10.0), "nothing came out of the worker in 10 s"
+            self.new.clear()
+            found += self.worker.outputs()
+        return found
 
 
 def reports(outputs: list[Output], *, of_solves: bool = True) -> list[Any]:

@@ -204,6 +204,73 @@ inline void leave_more_than_noise(const ResidualsView& seen, std::int64_t n_poin
   }
 }
 
+// Views sorted by point; norms in sigmas.
+struct NormsByPoint {
+  std::int64_t n, n_points;
+  const std::int64_t* point;
+  const double* norms;
+};
+
+// As in window/merging.py: of norms, m, and a share.
+struct ReturnLimits {
+  double gate, far, leap;
+};
+
+// Of points (n, 3) that began at others: which are far away from a centre, which began there, which have leapt.
+struct AwaySpan {
+  bool *away, *began, *leapt, *doubted;
+  std::int64_t* agreeing;  // views within the gate
+};
+
+// Which points may have run away: those that are far away, have leapt, or have few views that agree. measured: null, or
+// points whose distance was, which are nowhere far away.
+inline void may_have_run_away(const NormsByPoint& seen, const double* points, const double* start, const double* centre,
+                              const bool* measured, const ReturnLimits& at, const AwaySpan& out) {
+  std::vector<std::int64_t> views(seen.n_points);
+  std::fill_n(out.agreeing, seen.n_points, 0);
+  for (std::int64_t o = 0; o < seen.n; ++o) {
+    ++views[seen.point[o]];
+    out.agreeing[seen.point[o]] += seen.norms[o] <= at.gate;
+  }
+  const auto apart = [](const double* a, const double* b) {
+    return std::max({std::abs(a[0] - b[0]), std::abs(a[1] - b[1]), std::abs(a[2] - b[2])});
+  };
+  for (std::int64_t p = 0; p < seen.n_points; ++p) {
+    const double *now = points + 3 * p, *before = start + 3 * p, from = apart(before, centre);
+    const bool may = measured == nullptr || !measured[p];
+    out.away[p] = may && apart(now, centre) > at.far;
+    out.began[p] = may && from > at.far;
+    out.leapt[p] = apart(now, before) > at.leap * from;
+    out.doubted[p] = out.away[p] || out.leapt[p] || 2 * out.agreeing[p] < views[p];
+  }
+}
+
+// Which views are off by more than a norm `far` from those before and after them of the same point, and from those of
+// the same camera; an end counts as far from its one neighbour alone, and views of a camera that has one as far from
+// all. As _mismatches in window/moving.py, for views sorted by point.
+inline void stand_out(const NormsByPoint& seen, const std::int64_t* camera, std::int64_t n_cameras, double far,
+                      bool* found) {
+  std::vector<std::int64_t> last(n_cameras, -1);
+  const auto rises = [&](std::int64_t from, std::int64_t to) { return seen.norms[to] - seen.norms[from] > far; };
+  std::vector<char> before(seen.n, 1), after(seen.n, 1);
+  for (std::int64_t o = 0; o < seen.n; ++o) {
+    const bool goes_on = o > 0 && seen.point[o] == seen.point[o - 1];
+    if (!goes_on) std::fill(last.begin(), last.end(), -1);
+    found[o] = goes_on && rises(o - 1, o);
+    if (o + 1 < seen.n && seen.point[o + 1] == seen.point[o])
+      found[o] = found[o] && rises(o + 1, o);
+    else
+      found[o] = false;
+    const std::int64_t own = last[camera[o]];
+    if (own >= 0) {
+      before[o] = rises(own, o);
+      after[own] = rises(o, own);
+    }
+    last[camera[o]] = o;
+  }
+  for (std::int64_t o = 0; o < seen.n; ++o) found[o] = found[o] && before[o] && after[o];
+}
+
 // As in window/initial_points.py; rad, and standard deviations.
 struct AgreementLimits {
   double gate, min_parallax, least_parallax, two_views, least_support;

@@ -208,6 +208,45 @@ Array<bool> move_more_than_noise(const py::object& observations, const Doubles& 
   return found;
 }
 
+// points: where they are and began, (n, 3) m; of: the centre (3,) and what may not be far away, (n,) or (0,). limits:
+// as ReturnLimits.
+py::tuple may_have_run_away_of(const Ints& point, const Doubles& norms, const std::pair<Doubles, Doubles>& points,
+                               const std::pair<Doubles, Array<bool>>& of, const std::array<double, 3>& limits) {
+  const py::ssize_t n = points.first.shape(0);
+  Array<bool> away({n}), began({n}), leapt({n}), doubted({n});
+  Ints agreeing({n});
+  may_have_run_away({point.size(), n, point.data(), norms.data()}, points.first.data(), points.second.data(),
+                    of.first.data(), of.second.size() ? of.second.data() : nullptr, {limits[0], limits[1], limits[2]},
+                    {away.mutable_data(), began.mutable_data(), leapt.mutable_data(), doubted.mutable_data(),
+                     agreeing.mutable_data()});
+  return py::make_tuple(doubted, agreeing, away, began, leapt);
+}
+
+Array<bool> stand_out_of(const py::object& observations, const Doubles& norms, std::int64_t n_cameras, double far) {
+  const Ints camera = array_of<std::int64_t>(observations, "camera"),
+             point = array_of<std::int64_t>(observations, "point");
+  Array<bool> found({norms.size()});
+  stand_out({norms.size(), 0, point.data(), norms.data()}, camera.data(), n_cameras, far, found.mutable_data());
+  return found;
+}
+
+// Of each keyframe, how many of some observations it has, and how many of them are of points that are marked.
+py::tuple seen_by_keyframe(const py::object& observations, const Array<bool>& used, const Array<bool>& marked,
+                           py::ssize_t n_keyframes) {
+  const Ints keyframe = array_of<std::int64_t>(observations, "keyframe"),
+             point = array_of<std::int64_t>(observations, "point");
+  Ints every({n_keyframes}), well({n_keyframes});
+  std::int64_t *to_every = every.mutable_data(), *to_well = well.mutable_data();
+  std::fill_n(to_every, n_keyframes, 0);
+  std::fill_n(to_well, n_keyframes, 0);
+  for (py::ssize_t o = 0; o < point.size(); ++o) {
+    if (!used.data()[o]) continue;
+    ++to_every[keyframe.data()[o]];
+    to_well[keyframe.data()[o]] += marked.data()[point.data()[o]];
+  }
+  return py::make_tuple(every, well);
+}
+
 // rows: views of the tracks, and which of these each is of; seen: of each, as in rays. limits: as TrialLimits.
 py::object explained(const py::object& problem, const std::tuple<Ints, Ints, Doubles>& views,
                      const std::pair<std::int64_t, std::int64_t>& tracks, const std::array<Doubles, 4>& poses,
@@ -257,6 +296,9 @@ void bind_window(py::module_& m) {
   m.def("rays", &rays);
   m.def("determined", &determined_of);
   m.def("move_more_than_noise", &move_more_than_noise);
+  m.def("may_have_run_away", &may_have_run_away_of);
+  m.def("stand_out", &stand_out_of);
+  m.def("seen_by_keyframe", &seen_by_keyframe);
 }
 
 }  // namespace ba
