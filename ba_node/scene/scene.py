@@ -145,7 +145,7 @@ class Scene(MapTables):
         self.pending = []
         stamps = self.keyframes.stamp_ns
         span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
-        self.constraints.end(self.keyframes.keyframe_id, span, self.log)
+        self.constraints.end(self.keyframes.keyframe_id, self.landmarks.track_id, span, self.log)
 
     def take_out(self, keyframes: IntArray) -> None:
         """Take keyframes (rows, oldest first; not the oldest nor the newest) out of the map; steps lead over them."""
