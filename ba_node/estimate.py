@@ -178,7 +178,7 @@ class Refinement:
     stamp_ns: int  # stamp of the newest keyframe, ns
     frame_id: str  # name of the map's frame
     session_id: int
-    poses: Poses  # of the keyframes in the solve, free and fixed, oldest first; none of a solve that was not taken
+    poses: Poses | None  # of the keyframes in the solve, free and fixed, oldest first; None if it was not taken
     correction: Correction | None  # of the front-end's fixed frame; None before the first usable solve of a session
     map_index: int  # number of the map
     replaces_map: bool = True  # see ``Estimate.replaces_map``
@@ -217,6 +217,6 @@ class Estimate:
     @property
     def refinement(self) -> Refinement:
         """Return the poses that it refines."""
-        poses = self.refined if self.report.status.usable else self.refined[:0]
+        poses = self.refined if self.report.status.usable else None
         where = self.stamp_ns, self.frame_id, self.report.session_id
         return Refinement(*where, poses, self.correction, self.map_index, self.replaces_map)

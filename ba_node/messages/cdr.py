@@ -58,7 +58,7 @@ class Cdr:
         self.text(frame_id)
 
     def sequence(self, rows: NDArray[Any]) -> None:
-        """Append a sequence of rows of little-endian numbers of one kind, (n, k)."""
+        """Append a sequence of little-endian numbers, or of rows of them, of one kind, (n, ...)."""
         self.pack("I", len(rows))
         if len(rows):
             self._align(rows.dtype.itemsize)
@@ -88,6 +88,18 @@ def _kinds(layout: str) -> tuple[struct.Struct, ...]:
     """Return the numbers of a layout one by one."""
     letters = re.sub(r"(\d+)(.)", lambda found: found[2] * int(found[1]), layout)
     return tuple(struct.Struct(f"<{letter}") for letter in letters)
+
+
+def refined_message(poses: Poses, stamp_ns: int, frame_id: str, session_id: int) -> bytes:
+    """Return a ``ba_msgs/RefinedKeyframes``."""
+    out = Cdr()
+    out.header(stamp_ns, frame_id)
+    out.pack("I", session_id)
+    out.sequence(poses.keyframe_id.astype("<u8"))
+    out.sequence(poses.stamp_ns.astype("<i8"))
+    out.sequence(poses.position.astype("<f8").ravel())
+    out.sequence(poses.orientation.astype("<f8").ravel())
+    return out.data()
 
 
 def pose_messages(poses: Poses, frame_id: str) -> list[bytes]:

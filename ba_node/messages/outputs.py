@@ -14,7 +14,7 @@ from ba_node.arrays import IntArray
 from ba_node.config import OutputConfig
 from ba_node.estimate import Cloud, Estimate, Refinement, World
 from ba_node.measurements import GlobalFix
-from ba_node.messages.cdr import cloud_message, path_message, pose_messages
+from ba_node.messages.cdr import cloud_message, path_message, pose_messages, refined_message
 from ba_node.messages.conversion import input_message
 from ba_node.messages.factory import MessageFactory, float32, header_message, pose_message
 from ba_node.messages.report import Report, report_message
@@ -33,9 +33,9 @@ def output_messages(
 
     Returns:
         (topic below the node's name, type, message) in the order to publish; one pose for each refined keyframe.
-        Poses, path and points are bytes, serialised already (``cdr.py``).
+        All but the report and the world are bytes, serialised already (``cdr.py``).
     """
-    out = pose_outputs(factory, estimate.refinement, wanted)
+    out = pose_outputs(estimate.refinement, wanted)
     if "report" in wanted:
         out.append(("report", report_message(factory, Report(estimate.report), estimate.stamp_ns, estimate.frame_id)))
     if estimate.world is not None and estimate.report.status.usable:
@@ -63,29 +63,15 @@ def point_records(cloud: Cloud, limit: int | None = None) -> NDArray[np.void]:
     return words.view(POINT_DTYPE)[:, 0]
 
 
-def pose_outputs(
-    factory: MessageFactory, refinement: Refinement, wanted: Container[str] = OUTPUT_TYPES
-) -> list[tuple[str, Any]]:
+def pose_outputs(refinement: Refinement, wanted: Container[str] = OUTPUT_TYPES) -> list[tuple[str, Any]]:
     """Return those of the messages, (topic, message), that tell the poses of a solve; none if it was not taken."""
-    out: list[tuple[str, Any]] = []
-    if len(refinement.poses) and "refined_keyframes" in wanted:
-        out.append(("refined_keyframes", _refined(factory, refinement)))
-    if "pose" in wanted:
-        out += [("pose", pose) for pose in pose_messages(refinement.poses, refinement.frame_id)]
+    poses, out = refinement.poses, list[tuple[str, Any]]()
+    if poses is not None and "refined_keyframes" in wanted:
+        where = refinement.stamp_ns, refinement.frame_id, refinement.session_id
+        out.append(("refined_keyframes", refined_message(poses, *where)))
+    if poses is not None and "pose" in wanted:
+        out += [("pose", pose) for pose in pose_messages(poses, refinement.frame_id)]
     return out
-
-
-def _refined(factory: MessageFactory, refinement: Refinement) -> Any:
-    poses = refinement.poses
-    return factory.make(
-        OUTPUT_TYPES["refined_keyframes"],
-        header=header_message(factory, refinement.stamp_ns, refinement.frame_id),
-        session_id=refinement.session_id,
-        keyframe_id=factory.array(poses.keyframe_id),
-        stamp_ns=factory.array(poses.stamp_ns),
-        position=factory.array(poses.position.reshape(-1)),
-        orientation=factory.array(poses.orientation.reshape(-1)),
-    )
 
 
 def _world(factory: MessageFactory, estimate: Estimate, world: World) -> Iterator[tuple[str, Any]]:

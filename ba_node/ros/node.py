@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Put the node together: parameters, worker and components, made and destroyed with the states of a managed node.
 
-Everything in this file runs on the executor's thread.
+Everything in this file runs on the executor's thread, but for what leaves as soon as it is known (`_leave`).
 
 ============  ==========================================================================================
 configure     a new back-end with an empty map, its worker, and all components with their topics
@@ -18,13 +18,15 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
 from ba_node.backend import Backend
 from ba_node.config import Config
+from ba_node.estimate import Refinement
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.components.definitions import Definitions
 from ba_node.ros.components.diagnostics import Diagnostics
@@ -42,7 +44,7 @@ from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.rclpy_compat.lifecycle import ManagedNode, RefusedError
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.kept_map import KeptMap, KeptMapError
-from ba_node.ros.worker.worker import Notice, Outcome, Refined, Worker
+from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 NODE_NAME = "ba_node"
 # In the order in which they are made and get estimates; destroyed in reverse. What feeds the worker comes last.
@@ -126,7 +128,13 @@ class BaNode(ManagedNode):
         except KeptMapError as error:
             raise RefusedError(str(error)) from error
         deferred = DeferredAnswers(self, lambda: worker.alive)
-        worker = Worker(backend, inbox, config.node.settle_time_s, lambda: deferred.call(self._distribute))
+        worker = Worker(
+            backend,
+            inbox,
+            config.node.settle_time_s,
+            lambda: deferred.call(self._distribute),
+            lambda *poses: self._leave(host, *poses),
+        )
         backend.setup.elsewhere = worker.check_elsewhere
         backend.elsewhere = worker.work_elsewhere
         self._host = host = Host(self, config, inbox, worker, deferred, self._log)
@@ -151,7 +159,8 @@ class BaNode(ManagedNode):
     def deactivate(self) -> None:
         """Hold the map, and ignore data."""
         host = self._configured()
-        host.active = False
+        with host.leaving:
+            host.active = False
         host.ignoring.add("inactive")
         for component in reversed(self._components):
             component.deactivate()
@@ -161,7 +170,8 @@ class BaNode(ManagedNode):
         if self._host is None:
             return
         host, self._host = self._host, None
-        host.active = False
+        with host.leaving:
+            host.active = False
         self._components.clear()
         self._lingering = host.after_cleanup
         self._linger_timer.reset()
@@ -203,28 +213,30 @@ class BaNode(ManagedNode):
         if host is None:
             return
         outputs = host.worker.outputs()
-        newest = [
-            next((one for one in reversed(outputs) if isinstance(one, kind) and _replaces_map(one)), None)
-            for kind in (Refined, Outcome)
-        ]
+        estimates = [output.estimate for output in outputs if isinstance(output, Outcome)]
+        newest = next((e for e in reversed(estimates) if e is not None and e.replaces_map), None)
         for output in outputs:
             if isinstance(output, Notice):
                 self._log(output)
             elif host.active:
                 for component in self._components:
-                    self._deliver(component, output, any(output is one for one in newest))
-            if isinstance(output, Refined):
-                host.worker.poses_left()
+                    with self._surviving(component):
+                        component.take_report(output)
+                        if output.estimate is not None:
+                            component.take(output.estimate, output.estimate is newest)
 
-    def _deliver(self, component: Component, output: Refined | Outcome, newest: bool) -> None:
+    def _leave(self, host: Host, refinement: Refinement, arrived_s: float) -> None:
+        """Give the components the poses of a solve, on the solver's thread: another would have to wake up first."""
+        with host.leaving:
+            for component in self._components if host.active else ():
+                with self._surviving(component):
+                    component.take_poses(refinement, arrived_s)
+
+    @contextmanager
+    def _surviving(self, component: Component) -> Iterator[None]:
         """Give a component what came out; a fault in one must not keep it from the others."""
         try:
-            if isinstance(output, Refined):
-                component.take_poses(output, newest)
-                return
-            component.take_report(output)
-            if output.estimate is not None:
-                component.take(output.estimate, newest)
+            yield
         except Exception as error:
             if not self.context.ok():
                 return  # a signal ended the context between two messages
@@ -236,9 +248,3 @@ class BaNode(ManagedNode):
         """Log a notice, the same one not more often than every few seconds."""
         if self._throttle.passes(notice.key, time.monotonic()):
             log(self, Severity.ERROR if notice.is_error else Severity.WARNING, notice.text)
-
-
-def _replaces_map(output: Refined | Outcome) -> bool:
-    if isinstance(output, Refined):
-        return output.refinement.replaces_map
-    return output.estimate is not None and output.estimate.replaces_map

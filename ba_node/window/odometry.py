@@ -123,7 +123,9 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
     table, place = scene.keyframes, scene.places()[keyframes]
     poses = table.input_rotation, table.input_position
     rotation, translation = _relative(*poses, keyframes[first], keyframes[first + 1])
-    length, turn = _travelled(scene, place[first], place[first + 1] - place[first])
+    gap = place[first + 1] - place[first]
+    steps = (rotation, translation) if (gap == 1).all() else None
+    length, turn = _travelled(scene, place[first], gap, steps)
     sigma_rad = config.sigma_rad + config.sigma_rad_per_m * length + config.sigma_rad_per_rad * turn
     sigma_m = config.sigma_m + config.sigma_m_per_m * length
     return Steps(
@@ -176,12 +178,19 @@ def _relative(
     return back @ rotation[second], (back @ moved)[..., 0]
 
 
-def _travelled(scene: Scene, place: IntArray, gap: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far (m) and by how much (rad) the front-end moves from some places in time over so many steps each."""
+def _travelled(
+    scene: Scene, place: IntArray, gap: IntArray, steps: tuple[FloatArray, FloatArray] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return how far (m) and by how much (rad) the front-end moves from some places in time over so many steps each.
+
+    ``steps`` are these, rotations and translations, where they are single ones.
+    """
     factor = np.repeat(np.arange(len(place)), gap)
-    at = np.arange(len(factor)) + (place - (np.cumsum(gap) - gap))[factor]
-    table, order = scene.keyframes, scene.order
-    rotation, translation = _relative(table.input_rotation, table.input_position, order[at], order[at + 1])
+    if steps is None:
+        at = np.arange(len(factor)) + (place - (np.cumsum(gap) - gap))[factor]
+        table, order = scene.keyframes, scene.order
+        steps = _relative(table.input_rotation, table.input_position, order[at], order[at + 1])
+    rotation, translation = steps
     cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0)
     turn = np.arccos(np.clip(cosine, -1.0, 1.0))
     length = np.sqrt(np.sum(translation * translation, axis=1))

@@ -57,6 +57,7 @@ class Comparison:
     sigmas: FloatArray  # (n,) the larger of the error of the move and of the turn, each by its standard deviation
     move_m: FloatArray  # (n,) error of the move
     turn_rad: FloatArray  # (n,) error of the turn
+    turned_rad: FloatArray  # (n,) angle of the front-end's turn
     sigma_m: FloatArray  # (n,) what the front-end's move is worth
     sigma_rad: FloatArray  # (n,) what its turn is worth
 
@@ -68,7 +69,7 @@ def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
     sigma_rad = config.turn_sigma_rad + config.turn_sigma_share * turned + config.turn_sigma_rad_per_m * length
     move = np.sqrt(np.sum((steps.move - measured.move) ** 2, axis=1))
     turn = angle_of(np.swapaxes(measured.turn, 1, 2) @ steps.turn)
-    return Comparison(np.maximum(move / sigma_m, turn / sigma_rad), move, turn, sigma_m, sigma_rad)
+    return Comparison(np.maximum(move / sigma_m, turn / sigma_rad), move, turn, turned, sigma_m, sigma_rad)
 
 
 def scale_error(steps: Steps, measured: Steps, found: Comparison) -> float:
@@ -78,7 +79,7 @@ def scale_error(steps: Steps, measured: Steps, found: Comparison) -> float:
 
 def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     """Return by what factor all turns are larger than the front-end's; 1 where that cannot be told from its errors."""
-    telling = angle_of(measured.turn) > found.sigma_rad
+    telling = found.turned_rad > found.sigma_rad
     if np.count_nonzero(telling) < _FEW:
         return 1.0
     turns, wanted = (_axes(one.turn[telling]) for one in (steps, measured))

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the node with a timer of 10 ms that notes how late it is called: so long is the executor blocked.
 
-Time on the processor is counted by thread, from when a window was refined: starting is another matter.
+Time on the processor is counted by thread, from when a window was refined: starting is another matter. And before the
+first keyframe: so much the timer takes, what else the benchmark asks, and the node where nothing comes.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from ba_node.ros.node import BaNode
 _PERIOD_S = 0.01
 _WINDOW = 20
 _SAMPLE_S = 0.5
+_IDLE_SAMPLES = 5
 
 
 class ProbedNode(BaNode):
@@ -36,6 +38,7 @@ class ProbedNode(BaNode):
         self._last_s = time.monotonic()
         self._began: tuple[float, Counter[str]] | None = None
         self._spent: tuple[float, Counter[str]] = (0.0, Counter())
+        self._idle: deque[tuple[float, Counter[str]]] = deque(maxlen=_IDLE_SAMPLES)
         self._probe = self.create_timer(_PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _tick(self) -> None:
@@ -46,6 +49,11 @@ class ProbedNode(BaNode):
             # Threads that have ended tell nothing any more.
             self._spent = now, cpu_ns()
             self._began = self._began or self._spent
+        elif not self._heard() and (not self._idle or now > self._idle[-1][0] + _SAMPLE_S):
+            self._idle.append((now, cpu_ns()))
+
+    def _heard(self) -> bool:
+        return self._host is None or self._host.arrived["keyframes"] > 0
 
     def destroy_node(self) -> None:
         """Say what was noted."""
@@ -54,9 +62,14 @@ class ProbedNode(BaNode):
         times: dict[str, Any] = {
             "cpu_s": {name: 1e-9 * ns for name, ns in (spent - before).items()},
             "wall_s": now_s - began_s,
+            "idle_share": self._idle_share(),
         }
         print(json.dumps({"late_ms": [round(ms, 2) for ms in self.late_ms[20:]], **times}), flush=True)
         super().destroy_node()
+
+    def _idle_share(self) -> float:
+        (began_s, before), (ended_s, after) = self._idle[0], self._idle[-1]
+        return 1e-9 * (after - before).total() / max(ended_s - began_s, 1e-9)
 
 
 def cpu_ns() -> Counter[str]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ba_node.estimate import Correction, Poses
 from ba_node.io.ros_types import ROSBAGS_FACTORY as F
 from ba_node.io.ros_types import encode
-from ba_node.messages.cdr import cloud_message, path_message, pose_messages, tf_message
+from ba_node.messages.cdr import cloud_message, path_message, pose_messages, refined_message, tf_message
 from ba_node.messages.factory import ConversionError, header_message, pose_message
 from ba_node.messages.outputs import POINT_DTYPE
 
@@ -45,6 +45,22 @@ def test_poses(stamps: list[int], frame_id: str) -> None:
     poses = poses_of(stamps)
     expected = [encode("geometry_msgs/msg/PoseStamped", message) for message in stamped(poses, frame_id)]
     assert pose_messages(poses, frame_id) == expected
+
+
+@given(st.lists(st.integers(-(2**63), 2**63 - 1), max_size=4), STAMPS, FRAMES, st.integers(0, 2**32 - 1))
+def test_refined_keyframes(stamps: list[int], stamp_ns: int, frame_id: str, session_id: int) -> None:
+    poses = poses_of(stamps)
+    message = F.make(
+        "ba_msgs/msg/RefinedKeyframes",
+        header=header_message(F, stamp_ns, frame_id),
+        session_id=session_id,
+        keyframe_id=poses.keyframe_id,
+        stamp_ns=poses.stamp_ns,
+        position=poses.position.ravel(),
+        orientation=poses.orientation.ravel(),
+    )
+    found = refined_message(poses, stamp_ns, frame_id, session_id)
+    assert found == encode("ba_msgs/msg/RefinedKeyframes", message)
 
 
 @given(st.lists(STAMPS, max_size=4), STAMPS, FRAMES)

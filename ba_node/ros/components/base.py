@@ -3,9 +3,9 @@
 """What a part of the node is, and what it gets to work with.
 
 The node (``node.py``) is a list of components. A component makes its publishers, subscriptions, services and timers
-when the node is configured, and they are destroyed when the node is cleaned up. All its methods, and all callbacks of
-the entities that it made, run on the executor's thread; what is to run on the solver's thread goes through
-``host.inbox.post(command)``, and comes back with the next estimate, or as a Notice.
+when the node is configured, and they are destroyed when the node is cleaned up. All its methods but ``take_poses``, and
+all callbacks of the entities that it made, run on the executor's thread; what is to run on the solver's thread goes
+through ``host.inbox.post(command)``, and comes back with the next estimate, or as a Notice.
 
 To add one: a class derived from :class:`Component` in a file of its own, its name in ``node.COMPONENTS``, and its topic
 in ``messages/topics.py``::
@@ -22,6 +22,7 @@ in ``messages/topics.py``::
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -31,7 +32,7 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 
 from ba_node.config import Config
-from ba_node.estimate import Estimate
+from ba_node.estimate import Estimate, Refinement
 from ba_node.measurements import CameraRig
 from ba_node.messages.report import Report
 from ba_node.messages.topics import Topic
@@ -39,7 +40,7 @@ from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
 from ba_node.ros.rclpy_compat.deferred import DeferredAnswers
 from ba_node.ros.worker.inbox import Inbox
-from ba_node.ros.worker.worker import Notice, Outcome, Refined, Worker
+from ba_node.ros.worker.worker import Notice, Outcome, Worker
 
 
 @dataclass
@@ -53,6 +54,7 @@ class Host:
     deferred: DeferredAnswers  # brings work to the executor's thread, and knows the answers that clients wait for
     log: Callable[[Notice], None]  # log a Notice, the same one not more often than every few seconds
     active: bool = False  # True between activate and deactivate
+    leaving: threading.RLock = field(default_factory=threading.RLock)  # held while poses leave
     # why data is ignored now, in words that serve as a key ("inactive"); empty when it is taken
     ignoring: set[str] = field(default_factory=lambda: {"inactive"})
     # what this side of the inbox turned away, by reason; it goes into the report
@@ -82,8 +84,12 @@ class Component:
     def deactivate(self) -> None:
         """Pause: nothing may be published until :meth:`activate`. ``host.active`` is False already."""
 
-    def take_poses(self, refined: Refined, newest: bool) -> None:
-        """Take the poses of a solve, which come before the report on it; only while active. ``newest`` as below."""
+    def take_poses(self, refinement: Refinement, arrived_s: float) -> None:
+        """Take the poses of a solve, before there is a report on it; only while active.
+
+        On the solver's thread, which holds ``host.leaving``: what the executor's thread works with too needs it there.
+        ``arrived_s`` is when its newest keyframe came in, s.
+        """
 
     def take_report(self, outcome: Outcome) -> None:
         """Take what the worker reports, of every solve and on what was turned away; only while active."""

@@ -10,7 +10,6 @@ from ba_node.messages.topics import TF, TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components.base import Component, Host
 from ba_node.ros.log import Severity, log
-from ba_node.ros.worker.worker import Refined
 
 _DEPTH = 100
 _NS = 1e9
@@ -45,12 +44,11 @@ class MapTransform(Component):
         """Say nothing any more; what was said grows old."""
         self._taken = None
 
-    def take_poses(self, refined: Refined, newest: bool) -> None:
+    def take_poses(self, taken: Refinement, _arrived_s: float) -> None:
         """Take the newest correction; that of another map ends with it, though the new one has none yet."""
-        taken = refined.refinement
         if self._taken is not None and self._taken.map_index != taken.map_index:
             self._taken = self._last_stamp_ns = None
-        if not newest:
+        if not taken.replaces_map:
             return
         if taken.correction is None:  # all was forgotten
             self._taken = self._last_stamp_ns = None
@@ -61,7 +59,8 @@ class MapTransform(Component):
         self._send(news=True)
 
     def _repeat(self) -> None:
-        self._send(news=False)
+        with self.host.leaving:
+            self._send(news=False)
 
     def _send(self, *, news: bool) -> None:
         """Publish the correction with the time that the data has now."""

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from typing import Any
 
-from ba_node.estimate import Estimate, Status
+from ba_node.estimate import Estimate, Refinement, Status
 from ba_node.messages.outputs import output_messages, pose_outputs
 from ba_node.messages.report import LatencyReport, Report, report_message
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, TOPICS, WHOLE_MAP
@@ -16,7 +16,7 @@ from ba_node.ros.components.base import Component, Host
 from ba_node.ros.log import Severity, Throttle, log
 from ba_node.ros.message_factory import RclpyFactory
 from ba_node.ros.worker.latency import Sliding
-from ba_node.ros.worker.worker import Outcome, Refined
+from ba_node.ros.worker.worker import Outcome
 
 _LOG_PERIOD_S = 5.0
 # Leave first; their age is in the report that follows.
@@ -73,12 +73,14 @@ class Publishing(Component):
             matched = self._catch_up if topic in LATCHED_OUTPUTS else None
             self._outputs[topic] = self.publisher(TOPICS[topic], matched=matched)
 
-    def take_poses(self, refined: Refined, _newest: bool) -> None:
+    def take_poses(self, refinement: Refinement, arrived_s: float) -> None:
         """Publish the poses of a solve, and note how old they are then."""
         wanted = {topic for topic in _POSES if self._outputs[topic].get_subscription_count()}
-        for topic, message in pose_outputs(self._factory, refined.refinement, wanted):
+        for topic, message in pose_outputs(refinement, wanted):
             self._outputs[topic].publish(message)
-        self._measure(refined)
+        arrival, stamp = self._ages
+        age_ns = self.host.node.get_clock().now().nanoseconds - refinement.stamp_ns
+        self._latency = LatencyReport(*arrival.add(time.monotonic() - arrived_s), *stamp.add(1e-9 * age_ns))
 
     def take_report(self, outcome: Outcome) -> None:
         """Publish the report, which says how old the poses were when they left."""
@@ -125,11 +127,6 @@ class Publishing(Component):
             return
         for topic, _, message in output_messages(self._factory, estimate, self.host.config.output, wanted):
             self._outputs[topic].publish(message)
-
-    def _measure(self, refined: Refined) -> None:
-        arrival, stamp = self._ages
-        age_ns = self.host.node.get_clock().now().nanoseconds - refined.refinement.stamp_ns
-        self._latency = LatencyReport(*arrival.add(time.monotonic() - refined.arrived_s), *stamp.add(1e-9 * age_ns))
 
     def _log_report(self, report: Report) -> None:
         """Say how it goes, and why a solve gave nothing: that the first keyframes are not enough is no warning."""

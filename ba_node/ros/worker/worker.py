@@ -26,16 +26,14 @@ from ba_node.ros.worker.inbox import Arrival, Command, Inbox
 from ba_node.ros.worker.keyframe_accounts import KeyframeAccounts
 from ba_node.ros.worker.latency import Budget, Lag
 
-# Poses and outcomes that wait for a busy executor; the next one replaces it.
-_MAX_OUTPUTS = 40
+# Estimates that wait for a busy executor; the next one replaces it.
+_MAX_OUTPUTS = 20
 # A report on what was turned away goes out without a solve, but not more often.
 _REPORT_PERIOD_S = 1.0
 # For so long a step of a check waits for a solve to end: where solves follow each other at once it must get on too.
 _GIVES_WAY_S = 0.2
 # Texts that begin alike say the same.
 _HEAD = 40
-# For so long at most the rest of a solve waits for its poses to leave: two threads at once hinder each other.
-_LEAVING_S = 0.005
 # Falling behind for this long is warned about.
 _PATIENCE_S = 5.0
 
@@ -59,22 +57,17 @@ class Outcome:
     estimate: Estimate | None = None  # what the solve gave; None without one
 
 
-@dataclass(frozen=True)
-class Refined:
-    """The poses of a solve, before the outcome."""
-
-    refinement: Refinement
-    arrived_s: float  # as of Outcome
-
-
-Output = Outcome | Refined | Notice
+Output = Outcome | Notice
+# Gets the poses of a solve, and when its newest keyframe came in, by the worker's clock, s.
+Leave = Callable[[Refinement, float], None]
 
 
 class Worker:
     """The solver's thread; from :meth:`start` on the back-end is its alone.
 
     ``settle_time_s`` is the silence after which the newest keyframe is complete; ``notify`` is called, on this thread,
-    when :meth:`outputs` has something new; the clock (s) is a steady one.
+    when :meth:`outputs` has something new, and ``leave``, on this thread too, with the poses of a solve before the rest
+    of it is worked out; the clock (s) is a steady one.
     """
 
     def __init__(
@@ -83,12 +76,13 @@ class Worker:
         inbox: Inbox,
         settle_time_s: float,
         notify: Callable[[], None],
+        leave: Leave,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._backend = backend
         self._inbox = inbox
         self._settle_time_s = settle_time_s
-        self._notify = notify
+        self._notify, self._leave = notify, leave
         self._clock = clock
         self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
         self._budget = Budget(clock)
@@ -104,7 +98,6 @@ class Worker:
         self._settled = True
         self._behind = False
         self._failures: Counter[str] = Counter()
-        self._left = threading.Event()  # set when poses have left
         self._has_left = True
         self._resting = threading.Event()  # set while there is nothing to do
         self._thread = threading.Thread(target=self._run, name="solver", daemon=True)
@@ -160,10 +153,6 @@ class Worker:
             taken.append(self._outputs.popleft())
         return taken
 
-    def poses_left(self) -> None:
-        """Go on, as the poses of a solve have been published."""
-        self._left.set()
-
     def _run(self) -> None:
         while True:
             self._resting.set()
@@ -198,7 +187,7 @@ class Worker:
         if callable(arrival.content):
             estimate, now_s = arrival.content(self._backend), self._clock()
             if estimate is not None and not self._inbox.closed:
-                self._put(Refined(estimate.refinement, now_s))
+                self._poses_leave(now_s, estimate.refinement)
                 self._put(self._finished(estimate, now_s, now_s))
             return
         content, backend = arrival.content, self._backend
@@ -219,7 +208,7 @@ class Worker:
         arrived_s = self._arrival_s(start_s)
         self._budget.begin(arrived_s, 1e-3 * self._backend.config.node.latency_budget_ms)
         self._has_left = False
-        estimate = self._backend.solve(self._goes_on, functools.partial(self._leave, arrived_s))
+        estimate = self._backend.solve(self._goes_on, functools.partial(self._poses_leave, arrived_s))
         n_solved = self._backend.map.solved_count - before
         lag = self._lag.update(start_s, self._clock(), n_solved, estimate, self._backend.config)
         if lag:
@@ -228,19 +217,14 @@ class Worker:
         self._behind = n_solved > 0 and self._backend.ready
         if estimate is not None and not self._inbox.closed:
             if not self._has_left:
-                self._leave(arrived_s, estimate.refinement)
+                self._poses_leave(arrived_s, estimate.refinement)
             self._put(self._finished(estimate, start_s, arrived_s))
 
-    def _leave(self, arrived_s: float, refinement: Refinement) -> None:
-        """Let the poses of a solve be published before the rest of it is worked out."""
+    def _poses_leave(self, arrived_s: float, refinement: Refinement) -> None:
         self._budget.end()
-        if self._inbox.closed:
-            return
         self._has_left = True
-        self._left.clear()
-        self._put(Refined(refinement, arrived_s))
-        if self._thread is threading.current_thread():
-            self._left.wait(_LEAVING_S)
+        if not self._inbox.closed:
+            self._leave(refinement, arrived_s)
 
     def _arrival_s(self, now_s: float) -> float:
         """Return when the keyframe came in that the next solve is for; now if it was solved before."""

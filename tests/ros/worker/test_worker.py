@@ -166,28 +166,16 @@ def test_stops_a_long_solve_after_an_iteration() -> None:
 
 
 @pytest.mark.parametrize("early", [True, False])
-def test_poses_leave_before_the_rest_is_worked_out(early: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "_LEAVING_S", 60.0)
-    rig, rested = Rig(), threading.Event()
-    rig.backend.early, rig.backend.after_poses = early, rested.set
-    rig.worker.start()
-    try:
-        rig.keyframe(7, time_s=0.25)
-        found: list[Any] = []
-        while not found:
-            assert rig.new.wait(10.0)
-            rig.new.clear()
-            found += rig.worker.outputs()
-        (poses,) = found
-        assert isinstance(poses, worker.Refined)
-        assert (poses.refinement.poses.keyframe_id.tolist(), poses.arrived_s) == ([7], 0.25)
-        assert rested.is_set() != early, "the solve goes on when the poses have been published"
-        rig.worker.poses_left()
-        (report,) = reports(rig.wait_for_output())
-        assert (report.newest_keyframe_id, rested.is_set()) == (7, True)
-    finally:
-        rig.worker.poses_left()
-        assert rig.worker.stop()
+def test_poses_leave_once_and_before_the_rest_is_worked_out(early: bool) -> None:
+    rig, left_before_rest = Rig(), []
+    rig.backend.early = early
+    rig.backend.after_poses = lambda: left_before_rest.append(len(rig.left))
+    rig.keyframe(7, time_s=0.25)
+    (report,) = reports(rig.step())
+    ((refinement, arrived_s),) = rig.left
+    assert left_before_rest == [int(early)]
+    assert refinement.poses is not None
+    assert (refinement.poses.keyframe_id.tolist(), arrived_s, report.newest_keyframe_id) == ([7], 0.25, 7)
 
 
 def test_outputs_nobody_fetches_are_bounded() -> None:
