@@ -31,7 +31,8 @@ class Threads(Alone):
     """Ranks that are threads of this process."""
 
     def __init__(self, rank: int, meeting: Meeting) -> None:
-        self.rank, self.size = rank, len(meeting.board)
+        self.rank = rank
+        self.size = self.neighbours = len(meeting.board)
         self._board, self._barrier, self._letters = meeting.board, meeting.barrier, meeting.letters
 
     def gather(self, value: Any) -> list[Any] | None:

@@ -22,8 +22,9 @@ from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.watch import Check
 from ba_node.scene.scene import Scene
 
-# Factor beyond which lengths are said to differ, so many standard errors from 1: rigs and wheels are known better.
-_FACTOR, _ERRORS = 1.025, 5.0
+# Factors beyond which lengths are said to differ, each if it is so many standard errors from 1: rigs and wheels are
+# known better, and odometry that shows a smaller factor so clearly is precise.
+_FACTORS = ((1.025, 5.0), (1.012, 8.0))
 # Steps that are needed, and keyframes up to which a map is young.
 _STEPS, _YOUNG = 15, 120
 # It is asked once in so many keyframes.
@@ -43,7 +44,7 @@ def departed(scene: Scene) -> Check | None:
     if len(ratio) < _STEPS:
         return None
     mean, error = _trimmed_mean(np.log(ratio))
-    if abs(mean) < max(np.log(_FACTOR), _ERRORS * error):
+    if not any(abs(mean) >= max(np.log(factor), errors * error) for factor, errors in _FACTORS):
         return None
     factor = float(np.exp(mean))
     evidence = f"refined steps are {factor:.3g} times as long as the front-end's, over {len(ratio)} of them"

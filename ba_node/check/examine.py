@@ -40,6 +40,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
 
     tests: dict[str, Callable[[], Diagnosis]] = {
         _PIXELS: lambda: units.check_pixels(tracks),
+        "image size": lambda: units.check_image_size(tracks),
         "stamps": lambda: units.check_stamps(tracks),
         "sigma": lambda: units.check_sigma(tracks),
         "ids": lambda: ids.check_ids(tracks),

@@ -43,6 +43,7 @@ class Tracks:
     uv: FloatArray  # (n_obs, 2) px
     sigma_px: FloatArray  # (n_obs,)
     depth_m: FloatArray  # (n_obs,) NaN for none
+    image_size: IntArray | None = None  # (n_cam, 2) px, as given; 0 or None for unknown
 
     def __len__(self) -> int:
         return len(self.position)
@@ -141,6 +142,7 @@ def tracks_of(scene: Scene, newest: int | None = None) -> Tracks | None:
         table.uv[rows].astype(float),
         table.sigma_px[rows].astype(float),
         table.depth_m[rows].astype(float),
+        scene.image_size,
     )
 
 

@@ -48,6 +48,8 @@ _STEPS = "the position in the keyframes, expected metres"
 # Image coordinates no larger than this are no pixels, where the focal length is at least this.
 _NO_PIXEL = 3.0
 _FOCAL = 30.0
+# Share of the observations that may lie outside the image, by so much and more, px.
+_MOST_OUTSIDE, _ASIDE_PX = 0.05, 4.0
 # Values of sigma_px that are not looked at; the factor by which others are wrong, and the least noise of tracks, px.
 _USUAL_SIGMA_PX = (0.05, 5.0)
 _SIGMA_FACTOR, _LEAST_NOISE_PX = 8.0, 0.01
@@ -68,6 +70,22 @@ def check_pixels(tracks: Tracks) -> Diagnosis:
     cause = f"image coordinates are not in pixels: nearly all of them are below {reach:.2g}"
     change = "u and v in the feature_tracks, expected pixels of the image, not normalised coordinates"
     return Diagnosis([Finding((cause,), f"the focal length is {focal:.0f} px", (change,), usual=True)])
+
+
+def check_image_size(tracks: Tracks) -> Diagnosis:
+    """Look whether observations lie within the images that the rig speaks of."""
+    outcome = Diagnosis()
+    for camera, size in enumerate(() if tracks.image_size is None else tracks.image_size):
+        uv = tracks.uv[tracks.camera == camera]
+        if not size.all() or not len(uv):
+            continue
+        outside = float(np.mean(((uv < -_ASIDE_PX) | (uv > size - 1.0 + _ASIDE_PX)).any(axis=1)))
+        if outside > _MOST_OUTSIDE:
+            cause = f"image size of camera {camera} is not that of the images that were tracked"
+            evidence = f"{outside:.0%} of its observations lie outside {size[0]} x {size[1]} px"
+            change = "width and height in the camera_info of camera_rig, and k if it is that of another size"
+            outcome.findings.append(Finding((cause,), evidence, (change,), harmful=False, usual=True))
+    return outcome
 
 
 def check_sigma(tracks: Tracks) -> Diagnosis:
@@ -137,8 +155,14 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             finding, causes=(*finding.causes, steps[0]), changes=("the factor from depth images to depth_m", steps[1])
         )
         return Diagnosis([both], rows=rows)
-    cause = f"depth_m {_unit(factor) or 'in another unit'}: it is {_times(factor)} what {by} tell"
-    return Diagnosis([_depth_finding(cause, evidence)], rows=rows)
+    unit = _unit(factor)
+    finding = _depth_finding(f"depth_m {unit or 'in another unit'}: it is {_times(factor)} what {by} tell", evidence)
+    if not unit:
+        # What steps tell of distances depends on the intrinsics.
+        causes = (*finding.causes, "focal length or principal point wrong (region of interest, binning)")
+        changes = (*finding.changes, "k, roi and binning in the camera_info of camera_rig")
+        finding = dataclasses.replace(finding, causes=causes, changes=changes)
+    return Diagnosis([finding], rows=rows)
 
 
 def _alike(ratio: list[float], most: float) -> bool:

@@ -16,6 +16,7 @@ class Communicator(Protocol):
 
     rank: int  # of this process, from 0
     size: int  # number of ranks
+    neighbours: int  # ranks on the machine of this one, itself included
 
     def sum(self, values: FloatArray) -> FloatArray:
         """Return the sum over ranks, bit by bit the same on all."""
@@ -45,7 +46,7 @@ class Communicator(Protocol):
 class Alone:
     """The only rank."""
 
-    rank, size = 0, 1
+    rank, size, neighbours = 0, 1, 1
 
     def sum(self, values: FloatArray) -> FloatArray:
         """Return the values."""

@@ -34,6 +34,7 @@ class LinearSolver(NamedTuple):
     kind: str
     text: str
     preconditioner: str = "schur_block"  # of PCG, which goes to the boundary of a region for exact solvers too
+    two_level_bytes: float = 0.0  # memory that two levels would take; 0 where that is not known
 
 
 class System(Protocol):

@@ -101,15 +101,17 @@ def pcg_s(sizes: Sizes, products: float) -> float:
 
 
 def preconditioner(sizes: Sizes, schur_blocks: int) -> str:
-    """Return which preconditioner of PCG costs less; S has so many blocks on and above its diagonal.
-
-    With two levels S is formed, and is there as a whole beside its upper half, each with a copy while it is made.
-    """
-    size = 2.0 * 8.0 * sizes.block**2 * schur_blocks
-    if sizes.unknowns <= DENSE_LIMIT or 3.0 * size > MAX_BYTES:
+    """Return which preconditioner of PCG costs less; S has so many blocks on and above its diagonal."""
+    size = two_level_bytes(sizes, schur_blocks)
+    if sizes.unknowns <= DENSE_LIMIT or size > MAX_BYTES:
         return "schur_block"
-    two_level = _form_s(sizes) + (_TWO_LEVEL_STEPS + 3) * 2.0 * size / _BYTES
+    two_level = _form_s(sizes) + (_TWO_LEVEL_STEPS + 3) * 2.0 / 3.0 * size / _BYTES
     return "two_level" if two_level < _PCG_STEPS * _pcg_step_s(sizes) else "schur_block"
+
+
+def two_level_bytes(sizes: Sizes, schur_blocks: int) -> float:
+    """Return the memory of two levels: S as a whole beside its upper half, each with a copy while it is made."""
+    return 3.0 * 2.0 * 8.0 * sizes.block**2 * schur_blocks
 
 
 def pcg_tries(sizes: Sizes) -> int:

@@ -264,7 +264,9 @@ class NativeSystem:
 
     def _pcg(self, sizes: Sizes) -> LinearSolver:
         text = linear_costs.describe("pcg", sizes.unknowns, None, None)
-        return LinearSolver("pcg", text, linear_costs.preconditioner(sizes, len(self._kernel.schur_pattern()[0])))
+        blocks = len(self._kernel.schur_pattern()[0])
+        of_two_levels = linear_costs.two_level_bytes(sizes, blocks)
+        return LinearSolver("pcg", text, linear_costs.preconditioner(sizes, blocks), of_two_levels)
 
     def pcg_tries(self) -> int:
         """Return how many steps of PCG to try before an exact solution."""

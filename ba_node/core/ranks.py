@@ -184,7 +184,10 @@ class RankSystem:
         if asked in ("auto", "cholesky"):
             asked = "dense" if n <= DENSE_LIMIT else "pcg" if asked == "auto" else "sparse"
         text = linear_costs.describe(asked, n, None, None)
-        choices = self._communicator.gather(self.local.choose("pcg").preconditioner)
+        own = self.local.choose("pcg")
+        # Ranks on one machine share its memory.
+        fits = self._communicator.neighbours * own.two_level_bytes <= linear_costs.MAX_BYTES
+        choices = self._communicator.gather(own.preconditioner if fits else "schur_block")
         preconditioner = self._communicator.broadcast(None if choices is None else min(choices))
         return LinearSolver(asked, f"{text}, on {self._communicator.size} ranks", preconditioner)
 

@@ -115,7 +115,7 @@ class ReducedSolver:
 
     def _choose(self, system: System) -> None:
         """Settle on a linear solver."""
-        self.kind, self.text, preconditioner = system.choose(self._options.linear_solver)
+        self.kind, self.text, preconditioner, _ = system.choose(self._options.linear_solver)
         if self._preconditioner == "auto":
             self._preconditioner = preconditioner
         if self.kind == "pcg" and self._preconditioner == "two_level":

@@ -42,6 +42,7 @@ class MpiCommunicator:
         self._sum: Any = mpi.SUM
         self._finalise: Callable[[], None] = mpi.Finalize
         self.rank, self.size = int(self._world.Get_rank()), int(self._world.Get_size())
+        self.neighbours = int(self._world.Split_type(mpi.COMM_TYPE_SHARED).Get_size())
 
     def sum(self, values: FloatArray) -> FloatArray:
         """Return the sum over ranks, bit by bit the same on all: made on one, and sent from there."""

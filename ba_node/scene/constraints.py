@@ -224,6 +224,9 @@ class Constraints:
         if not _finite(place) or abs(place[0]) > 90.0 or abs(place[1]) > 180.0:
             log.reject("bad_factor", f"{name}: latitude, longitude, altitude {place}, expected within 90, 180 deg")
             return
+        if not place[:2].any():
+            log.reject("bad_factor", f"{name}: latitude 0, longitude 0: the receiver has no place yet")
+            return
         told = np.asarray(fix.covariance, float)
         covariance = positive_covariance(name, told, 3, log) if told.any() else np.zeros((3, 3))
         if covariance is None or not self._same_world(name, ENU, log):
@@ -269,9 +272,10 @@ class Constraints:
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
         self.adjusted_at = max(0, self.adjusted_at - len(gone))
 
-    def end(self, keyframes: IdArray, span_ns: tuple[int, int], log: RejectionLog) -> None:
-        """Give up what names keyframes that never came; count what lies outside the time of all keyframes."""
+    def end(self, keyframes: IdArray, tracks: IdArray, span_ns: tuple[int, int], log: RejectionLog) -> None:
+        """Give up what names keyframes that never came; count what lies outside the time of all, or has no track."""
         log.notice("unpaired", sum(not span_ns[0] <= one.stamp_ns <= span_ns[1] for one in self.absolute))
+        log.notice("unpaired", len(set(self.landmarks).difference(tracks.tolist())) if self.landmarks else 0)
         known = set(keyframes.tolist())
         never = [key for key in self.relative if not known.issuperset(key)]
         for key in never:

@@ -59,6 +59,7 @@ class Scene(MapTables):
         self.cameras: Cameras | None = None  # the rig, None before it came
         self.given_cameras: Cameras | None = None  # the rig as it came, where it was refined since
         self.next_cameras: Cameras | None = None
+        self.image_size: IntArray | None = None  # (n_cam, 2) width and height as the rig has them, px; 0 for unknown
         self.refused_rig = ""  # why the last rig that was refused was, empty if none was
         self.log = RejectionLog()  # what was turned away
         self.memory: object | None = None  # what windows know of keyframes that left them, see window/old_keyframes.py
@@ -144,7 +145,7 @@ class Scene(MapTables):
         self.pending = []
         stamps = self.keyframes.stamp_ns
         span = (int(stamps.min()), int(stamps.max())) if len(stamps) else (0, 0)
-        self.constraints.end(self.keyframes.keyframe_id, span, self.log)
+        self.constraints.end(self.keyframes.keyframe_id, self.landmarks.track_id, span, self.log)
 
     def take_out(self, keyframes: IntArray) -> None:
         """Take keyframes (rows, oldest first; not the oldest nor the newest) out of the map; steps lead over them."""
@@ -189,7 +190,7 @@ class Scene(MapTables):
             self.next_cameras = cameras
             self.log.reject("rig_changed", f"another camera rig ({len(rig)} cameras) in session {self.session_id}")
             return
-        self.cameras = cameras
+        self.cameras, self.image_size = cameras, np.asarray(rig.image_size, dtype=np.intp)
         self.log.notice("adjusted_camera", len(rig.notes))
         self._place_pending()
 

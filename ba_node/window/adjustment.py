@@ -48,6 +48,8 @@ _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
 _ITERATIONS = 30
+# Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
+_BESIDE, _CONTRADICTING = 10.0, 0.6
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ class Adjustment:
         known = self.scene.constraints
         known.adjusted_at = len(self.scene.keyframes)
         if not why:
+            constraints.say_contradicted(self.scene, self.config.factors)
             return
         if self.due.key is not None:
             known.refused.add(self.due.key)
@@ -175,6 +178,11 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
     bent = float(np.sqrt(np.mean(steps.residuals(state) ** 2)))
     if bent > _BENT:
         return f"steps would have to be bent by {bent:.1f} of their standard deviations"
+    if world:
+        wrong = np.linalg.norm(world[0].residuals(state)[:, 3:], axis=1) > _BESIDE
+        if np.count_nonzero(wrong) > _CONTRADICTING * len(wrong):
+            count = f"{np.count_nonzero(wrong)} of {len(wrong)} priors would lie beside it"
+            return f"{count}: they contradict each other, or their covariance is too small"
     rotation, position = geometry.inverse(state.rotation, state.translation)
     _move(scene, geometry.nearest_rotation(rotation)[place], (position + origin)[place])
     # Where the world holds them they need no images.

@@ -36,10 +36,15 @@ _LEVEL_RAD = 0.05
 UNKNOWN = 1e6
 # Pairs that map and world are aligned by, spread over all.
 _ALIGNED = 2000
-# Minimal sets that are tried, pairs in each, pairs that score them, rounds of weighting.
+# Minimal sets that are tried, pairs in each, pairs that score them, rounds of weighting; what share of pairs is right.
+_SURE = 0.3
 _SETS, _IN_SET, _SCORED, _ROUNDS = 60, 5, 300, 10
 # The path has to spread so many times the noise of positions, and the heading to be known to so much (rad).
 _SPREAD, _HEADING_RAD = 5.0, 0.03
+# What a relative pose is sure of to less than this (1/rad, 1/m) it does not measure.
+_NOTHING = 0.01
+# Pairs so many standard deviations beside the map contradict it; it is said if so many do, and this share.
+_BESIDE, _MANY, _TOO_MANY = 5.0, 5, 0.2
 
 # What a program that embeds the back-end adds: (scene, problem, rows of its keyframes in the scene) -> factors.
 Source = Callable[[Scene, Problem, IntArray], tuple[KeyframeFactors, ...]]
@@ -186,7 +191,8 @@ def aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArr
             best, lowest = found, cost
     assert best is not None
     for _ in range(_ROUNDS):
-        off = _off(best, there, pairs.position, sigma) / max(1.0, np.median(_off(best, there, pairs.position, sigma)))
+        off = _off(best, there, pairs.position, sigma)
+        off = off / max(1.0, float(np.quantile(off, _SURE)))
         weight = 1.0 / (sigma**2 * (1.0 + off**2))
         best = _kabsch(there, pairs.position, weight, turned, turn_rad)
     share = weight / weight.sum()
@@ -195,6 +201,27 @@ def aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArr
     heading = sigma_m / (max(spread, 1e-9) * np.sqrt(len(pairs)))
     enough = spread >= max(config.align_m, _SPREAD * sigma_m) and heading <= _HEADING_RAD
     return best if enough or told <= _HEADING_RAD else None
+
+
+def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
+    """Say that many absolute measurements lie beside the map, where the others, or images, have outvoted them."""
+    known, log = scene.constraints, scene.log
+    log.warnings.pop("contradicted", None)
+    pairs = every_pair(scene, config)
+    if known.map_from_world is None or not len(pairs):
+        return
+    rotation, translation = known.map_from_world
+    off_m = np.linalg.norm(pairs.position @ rotation.T + translation - pairs.points(scene), axis=1)
+    wrong = off_m > _BESIDE * np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2))
+    count = int(np.count_nonzero(wrong))
+    if count >= _MANY and count > _TOO_MANY * len(pairs):
+        stamps = scene.keyframes.stamp_ns[pairs.row[wrong]]
+        log.warn(
+            "contradicted",
+            f"{count} of {len(pairs)} priors in frame {known.world_frame!r} lie {np.median(off_m[wrong]):.1f} m beside"
+            f" the map (median), from {stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s: they contradict the"
+            " others, or images and odometry, or their covariance is too small. Did their source change its reference?",
+        )
 
 
 def _kabsch(
@@ -328,14 +355,18 @@ def _keys(scene: Scene, number: IntArray) -> list[tuple[int, int]]:
 
 
 def in_place(steps: tuple[RelativePoses, ...], others: list[KeyframeFactors]) -> tuple[KeyframeFactors, ...]:
-    """Return all factors, without the front-end's own steps where something else was measured between keyframes."""
-    told = [kind.keyframes for kind in others if isinstance(kind, RelativePoses)]
-    if told:
-        pairs = {tuple(sorted(ends)) for ends in np.concatenate(told).tolist()}
-        keep = [np.array([tuple(ends) not in pairs for ends in kind.keyframes.tolist()], bool) for kind in steps]
-        same = np.arange(1 + max(int(kind.keyframes.max(initial=0)) for kind in steps)) if steps else np.arange(0)
-        steps = tuple(kind.take(kept, same) for kind, kept in zip(steps, keep, strict=True) if kept.any())
-    return (*steps, *others)
+    """Return all factors, without the front-end's own turns and moves where others measured these between keyframes."""
+    told = [kind for kind in others if isinstance(kind, RelativePoses)]
+    left = []
+    for part, kind in enumerate(steps):
+        pairs = set()
+        for one in told:
+            known = np.linalg.norm(one.root_information[:, :, 3 * part : 3 * part + 3], axis=(1, 2)) > _NOTHING
+            pairs |= {tuple(sorted(ends)) for ends in one.keyframes[known].tolist()}
+        keep = np.array([tuple(ends) not in pairs for ends in kind.keyframes.tolist()], bool)
+        if keep.any():
+            left.append(kind.take(keep, np.arange(1 + int(kind.keyframes.max()))))
+    return (*left, *others)
 
 
 def _gravity(scene: Scene, config: Config, number: IntArray, free: BoolArray) -> list[KeyframeFactors]:

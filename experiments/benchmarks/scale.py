@@ -32,7 +32,7 @@ class Counted:
     """Ranks that count what they tell each other; time spent waiting is not that of work."""
 
     def __init__(self, ranks: Communicator) -> None:
-        self._ranks, self.rank, self.size = ranks, ranks.rank, ranks.size
+        self._ranks, self.rank, self.size, self.neighbours = ranks, ranks.rank, ranks.size, ranks.neighbours
         self.bytes, self.calls, self.busy_s, self.wall_s = 0, 0, 0.0, 0.0
         self.send, self.receive, self.abort, self.finish = ranks.send, ranks.receive, ranks.abort, ranks.finish
 

@@ -28,6 +28,8 @@ class Combined:
     pending: bool = False  # it does harm still
 
 
+LOOP = {"path": "loop", "length_m": 30.0, "keyframes": 60}
+GOOD = {"drift_rotation_deg": 0.02, "drift_translation": 0.002}
 CASES = (
     Combined((("focal_slightly_off", 1.05), ("outliers_uniform", 0.2)), "stereo", 801, {}, "scale of focal"),
     Combined((("focal_slightly_off", 0.95), ("outliers_moving", 0.2)), "mono", 802, {"path": "loop"}, "focal"),
@@ -95,6 +97,26 @@ CASES = (
     Combined((("camera_turned", 2.0), ("outliers_moving", 0.2)), "stereo", 856, {"path": "loop"}, "camera 1"),
     Combined((("one_stamp_zero", None), ("one_keyframe_far", 20.0)), "rgbd", 857, {}, "stamp"),
     Combined((("stands_still", 25.0), ("depth_in_mm", 1000.0)), "rgbd", 858, {"look_deg": -60.0}, "millimetres"),
+    Combined((("camera_turned", 0.5),), "stereo", 902, {"baseline_m": 0.6}, "camera 1"),
+    Combined((("baseline_reversed", None),), "stereo", 903, {"baseline_m": 0.05, "look_deg": 90.0}, "baseline|swapped"),
+    Combined((("extrinsics_inverted", None),), "rgbd", 904, {"look_deg": 45.0, **LOOP}, "invert"),
+    Combined(
+        (("clock_set_back", 11.0),),
+        "mono",
+        905,
+        {"ids": "random64", "distortion": "equidistant", "fov_deg": 120.0},
+        "stamp|clock",
+    ),
+    Combined((("all_turned", 5.0),), "rgbd", 906, GOOD, "camera 0 does not fit"),
+    Combined((("all_turned", -8.0), ("outliers_uniform", 0.1)), "mono", 907, {}, "camera 0 does not fit"),
+    Combined((("depth_slightly_off", 1.02),), "rgbd", 908, GOOD, "scale of depth_m"),
+    Combined((("steps_scaled", 1.04),), "stereo", 909, GOOD, "scale of the front-end's steps"),
+    Combined((("outliers_moving", 0.65),), "mono", 904, {}, ""),
+    Combined((("pure_rotation", 6.0),), "mono", 904, {"distortion": "equidistant", "fov_deg": 120.0}, ""),
+    Combined((("ids_reused", None), ("outliers_uniform", 0.15)), "rgbd", 906, {}, r"\bids?\b"),
+    Combined((("few_points", 5.0),), "rgbd", 903, {"outlier_share": 0.1, **LOOP}, ""),
+    Combined((("wrong_ids", 8.0),), "mono", 903, {"ids": "random64"}, ""),
+    Combined((("stands_still", 35.0),), "mono", 902, {"keyframes": 60, "path": "loop", "length_m": 30.0}, ""),
     # The odometry of seed 0 is better than most.
     Combined((("few_points", 12.0),), "mono", 0, {}, ""),
     Combined((("few_points", 20.0),), "mono", 1, {"drift_rotation_deg": 1.5, "drift_translation": 0.06}, ""),

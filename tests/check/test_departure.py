@@ -19,11 +19,13 @@ from tests.check.set_ups import recording, scene_of
 STEP_NOISE_M = 0.02
 
 
-def refined(data: SyntheticData, factor: float, keyframes: int = 30, seed: int = 0) -> Scene:
+def refined(
+    data: SyntheticData, factor: float, keyframes: int = 30, seed: int = 0, noise_m: float = STEP_NOISE_M
+) -> Scene:
     """Return a scene whose keyframes count as refined: poses as given, stretched by a factor and with noise."""
     scene = scene_of(data, keyframes)
     table, rng = scene.keyframes, np.random.default_rng(seed)
-    noise = np.cumsum(STEP_NOISE_M * rng.normal(size=(keyframes, 3)), axis=0)
+    noise = np.cumsum(noise_m * rng.normal(size=(keyframes, 3)), axis=0)
     table.position[:] = factor * table.input_position + noise
     table.rotation[:] = geometry.so3_exp(np.array([0.1, 0.0, 0.4])) @ table.input_rotation
     table.position[:] = table.position @ geometry.so3_exp(np.array([0.1, 0.0, 0.4])).T
@@ -54,6 +56,15 @@ def test_noise_is_no_factor(mode: str) -> None:
     for seed in range(40):
         for factor in (0.99, 1.0, 1.01):
             assert departed(refined(data, factor, seed=seed)) is None, f"seed {seed}, factor {factor}"
+
+
+@pytest.mark.parametrize("mode", ["stereo", "rgbd"])
+def test_precise_odometry_tells_small_factors(mode: str) -> None:
+    data = recording(4, mode=mode)
+    for factor, noise_m, told in ((1.016, 0.001, True), (0.984, 0.001, True), (1.016, STEP_NOISE_M, False)):
+        found = departed(refined(data, factor, noise_m=noise_m))
+        assert (found is not None) == told, f"factor {factor}, noise {noise_m} m"
+    assert departed(refined(data, 1.008, noise_m=0.001)) is None, "rigs and wheels are known no better"
 
 
 def test_where_it_cannot_be_asked() -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from typing import Any
@@ -214,6 +215,13 @@ def test_points_at_the_limit_of_two_cameras_do_not_shorten_the_baseline(seed: in
     assert not found.findings, found.summary()
     told = next(row.hypothesis for row in found.rows if row.test == "lengths")
     assert abs(float(told.rpartition(" ")[2]) - 1.0) < 0.025, told
+
+
+def test_observations_outside_the_image_are_named() -> None:
+    tracks = dataclasses.replace(seen(recording(mode="mono"), 10), image_size=np.array([[480, 640]]))
+    found = examine(tracks)
+    assert not found.harmful and "image size of camera 0 is not that of the images" in found.summary()
+    assert re.search(r"\d+% of its observations lie outside 480 x 640 px", found.summary())
 
 
 def test_same_tracks_give_the_same_numbers() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from ba_node import native
 from ba_node.config import ConfigError, SolverOptions
-from ba_node.core import methods, native_kernels
+from ba_node.core import linear_costs, methods, native_kernels
 from ba_node.core.communicator import Alone, Communicator
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.ranks import RankKernels, deal
@@ -125,3 +125,18 @@ def test_ranks_take_the_same_steps_on_two_levels(kernels: str) -> None:
     results, _ = on_ranks(problem, chosen, 3)
     assert "two levels" in results[0].linear_solver
     assert results[0].objective_after == pytest.approx(alone.objective_after, rel=1e-9)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+@pytest.mark.parametrize(("share", "two_levels"), [(2.5, True), (1.5, False)])
+def test_two_levels_have_to_fit_for_all_ranks_of_a_machine(
+    share: float, two_levels: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = case_problem(loop(400, 12000))
+    options = dataclasses.replace(methods.options("auto"), max_iterations=1)
+    part, _ = deal(problem, 0, 2)
+    alone = native_kernels.make(part, options)
+    alone.linearise(part.start)
+    monkeypatch.setattr(linear_costs, "MAX_BYTES", share * alone.damp("diag", 1e-4).choose("pcg").two_level_bytes)
+    results, _ = on_ranks(problem, options, 2)
+    assert [result.linear_solver.endswith("on two levels") for result in results] == [two_levels] * 2

@@ -224,6 +224,13 @@ class TestLadybug:
         check(result)
         assert result.objective_after <= 13344.246 * 1.001
 
+    @pytest.mark.parametrize(("loss", "lowest"), [("squared", 13344.2405), ("huber", 7647.9357)])
+    def test_points_that_creep_do_not_keep_the_last_digits_waiting(
+        self, loss: str, lowest: float, problem: Problem
+    ) -> None:
+        options = dataclasses.replace(methods.options("auto"), loss=loss, max_iterations=14, function_tolerance=0.0)
+        assert solve(problem, options).objective_after <= lowest * (1.0 + 1e-6)
+
     @pytest.mark.parametrize("loss", ["squared", "huber"])
     def test_the_region_saves_steps_that_cholesky_cannot_solve(self, loss: str, problem: Problem) -> None:
         """Near the end damping alone falls until S breaks down; the region holds steps back in its place."""

@@ -1,0 +1,115 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is known beside pixels and wrong: it is counted, named or outvoted, and the map does not jump."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+import pytest
+
+from ba_node.arrays import FloatArray
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.core import geometry
+from ba_node.estimate import Estimate
+from ba_node.measurements import GlobalFix, Keyframe, LandmarkPriors, Measurement, PosePrior, RelativePose
+from ba_node.synthetic import SyntheticData
+from tests.window.street import ANTENNA, ORIGIN, aligned_rms, first, fixes, pymap3d, stream, street_data, wheels
+
+KILOMETRE = np.array([600.0, -800.0, 0.0])
+
+
+def moved(fix: Measurement, by: FloatArray) -> GlobalFix:
+    """Return a fix that is so far off, m east, north, up."""
+    assert isinstance(fix, GlobalFix)
+    place = np.array(pymap3d.geodetic2enu(*fix.geodetic, *ORIGIN)) + by
+    return dataclasses.replace(fix, geodetic=np.array(pymap3d.enu2geodetic(*place, *ORIGIN), float))
+
+
+def played(
+    data: SyntheticData, more: Callable[[int, Keyframe], Iterable[Measurement]], **values: float
+) -> tuple[Backend, Estimate, float]:
+    """Return a back-end, its last estimate, and the largest move of a keyframe from one estimate to the next, m."""
+    backend, jump = Backend(Config().with_values(values)), 0.0
+    last: Estimate | None = None
+    for event in backend.replay(stream(data, more)):
+        if isinstance(event, Estimate):
+            if last is not None:
+                there, here = (one.trajectory.position[: len(last.trajectory)] for one in (event, last))
+                jump = max(jump, float(np.linalg.norm(there - here, axis=1).max()))
+            last = event
+    assert last is not None
+    return backend, last, jump
+
+
+@pytest.fixture(scope="module")
+def street() -> SyntheticData:
+    return street_data()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        pytest.param(lambda k: k < 5, False, id="first_fixes", marks=pytest.mark.slow),
+        pytest.param(lambda k: 40 <= k < 55, False, id="burst", marks=pytest.mark.slow),
+        pytest.param(lambda k: k >= 50, True, id="from_midway"),
+    ],
+)
+def test_fixes_that_are_a_kilometre_off_move_nothing(
+    street: SyntheticData, wrong: Callable[[int], bool], said: bool
+) -> None:
+    right, steps = fixes(street, 0.0), wheels(street)
+
+    def more(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        yield from (moved(one, KILOMETRE * wrong(k)) for one in right(k, keyframe))
+        yield from steps(k, keyframe)
+
+    backend, last, jump = played(street, more, **ANTENNA)
+    assert jump < 2.0
+    assert aligned_rms(last.trajectory.position, street.truth.position) < 0.4
+    told = [line for line in backend.report.warnings if "50 of 100 priors in frame 'enu' lie 1001" in line]
+    assert len(backend.report.warnings) == len(told) == said, backend.report.warnings
+
+
+def test_a_receiver_without_a_place_yet_begins_no_frame(street: SyntheticData) -> None:
+    nowhere = GlobalFix(0, "gps", np.zeros(3), np.eye(3).ravel(), is_fix=True)
+    backend, _, _ = played(first(street, 5), lambda k, _: [nowhere] if k == 0 else [])
+    assert backend.report.rejected["bad_factor"] == 1
+    assert backend.scene.constraints.origin is None
+
+
+def test_priors_of_which_no_two_agree_leave_the_map_where_it_is(street: SyntheticData) -> None:
+    data, rng = first(street, 50), np.random.default_rng(0)
+    rotation = geometry.matrix_from_quaternion(street.truth.orientation)
+
+    def more(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        place = street.truth.position[k] + rng.normal(0.0, 50.0, 3)
+        told = geometry.quaternion_from_matrix(rotation[k]), np.diag([1e-2] * 3 + [1e-4] * 3).ravel()
+        yield PosePrior(keyframe.stamp_ns, "map", place, *told)
+
+    backend, last, jump = played(data, more)
+    assert jump < 0.5
+    assert aligned_rms(last.trajectory.position, street.truth.position[:50]) < 0.15
+    assert any("49 of 50 priors would lie beside it" in line for line in backend.report.warnings)
+
+
+def test_a_measurement_that_says_nothing_takes_no_place(street: SyntheticData) -> None:
+    """A covariance of ten kilometres leaves the front-end's steps in; places of tracks that never come are counted."""
+    data = first(street, 12)
+    unit = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    unseen = LandmarkPriors(0, "map", np.array([2**60], np.uint64), np.zeros((1, 3)), np.eye(3)[None])
+
+    def more(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        if k:
+            before = int(data.keyframes[k - 1].keyframe_id)
+            yield RelativePose(0, before, keyframe.keyframe_id, False, *unit, 1e8 * np.eye(6).ravel())
+        else:
+            yield unseen
+
+    backend, last, _ = played(data, more)
+    _, plain, _ = played(data, lambda *_: ())
+    assert backend.scene.log.notices["unpaired"] == 1
+    np.testing.assert_allclose(last.trajectory.position, plain.trajectory.position, atol=1e-3)
