@@ -243,7 +243,7 @@ class SolverOptions(SolverConfig):
     )
     inner_iterations: int = option(
         3,
-        "Newton steps of every point alone after a step of the keyframes, twice as many from the fifth on; 0 for none.",
+        "Newton steps of every point alone after a step of the keyframes, twice as many from the 11th on; 0 for none.",
         within=(0, 1000),
         aliases=("polish_steps",),
     )

@@ -19,7 +19,7 @@ Damping: ``nielsen`` (Algorithm 6): rho > 0: mu *= max(1/3, 1 - (2 rho - 1)^3), 
 mu does not fall: along a curved valley it would go to nothing, and still no step be longer than the region.
 
 With ``inner_iterations`` > 0 each step of the keyframes is followed by that many damped Newton steps of every point
-alone, and from the fifth step on by twice as many: few points still move then, and those creep along flat valleys of
+alone, and from the 11th step on by twice as many: few points still move then, and those creep along flat valleys of
 their own. A step that was bad only because the points had not followed it is saved by them.
 
 A step that is not finite, or that could not be computed, counts as a rejected one.
@@ -45,7 +45,7 @@ from ba_node.core.result import Iteration, Result, Status
 # The gain ratio of a step that only the inner iterations made good: taken, but not much trusted.
 _SAVED_RHO = 0.3
 # Steps after which points get twice as many inner iterations.
-_EARLY = 4
+_EARLY = 10
 # Policy fast leaves mu where a region of less than this share of the first cuts steps off.
 _NARROW = 0.1
 # A loop that has rejected this many steps in a row has nothing left to gain.

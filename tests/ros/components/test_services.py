@@ -170,7 +170,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
     good = tmp_path / "good.npz"
     assert _save(peer, "good").message.startswith(f"{good}: 3 keyframes")
     assert _save(peer, good).success, "a map may be replaced"
-    newer = good.read_bytes().replace(b'"version": 1', b'"version": 2')
+    newer = good.read_bytes().replace(b'"version": 2', b'"version": 3')
     (tmp_path / "newer.npz").write_bytes(newer)
     (tmp_path / "cut.npz").write_bytes(good.read_bytes()[:-1000])
     np.savez(tmp_path / "foreign.npz", a=np.zeros(3))
@@ -182,7 +182,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
         (tmp_path / "text", "not a map: expected an .npz file"),
         (tmp_path / "foreign.npz", "not a map: it has no map.json"),
         (tmp_path / "cut.npz", "cut off or damaged"),
-        (tmp_path / "newer.npz", "damaged: Bad CRC-32|format version 2"),
+        (tmp_path / "newer.npz", "damaged: Bad CRC-32|format version 3"),
         ("/dev/zero", "leads elsewhere"),
         ("", "expected the name of a file"),
     ):
