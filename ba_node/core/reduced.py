@@ -80,8 +80,8 @@ class ReducedSolver:
         """Return the share of a step that lies inside the region, 1 if all of it does."""
         if not np.isfinite(radius):
             return 1.0
-        scaled = self._scale(system, hessian) * x
-        length2 = float(np.einsum("i,i", scaled, scaled))
+        squares = scaling.squares(self._options.scaled_space, hessian(of_points=system.side != "points"))
+        length2 = float(np.einsum("i,i,i", system.gather(*squares), x, x))
         return 1.0 if length2 <= radius * radius else radius / float(np.sqrt(length2))
 
     def _worth_trying(self, system: System) -> int:

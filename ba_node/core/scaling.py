@@ -31,7 +31,7 @@ def diagonals(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatA
     if kind == "identity":
         return np.ones_like(d_c), np.ones_like(d_p)
     if kind == "diag":
-        return np.maximum(d_c, _MIN_DIAGONAL), np.maximum(d_p, _MIN_DIAGONAL)
+        return np.maximum(d_c, _MIN_DIAGONAL), np.maximum(d_p, _MIN_DIAGONAL) if len(d_p) else d_p
     if kind == "inc":
         steps = INC_STEPS
         row = [steps["rotation"]] * 3 + [steps["translation"]] * 3 + [steps["f"], steps["k1"], steps["k2"]]
@@ -52,3 +52,11 @@ def scaled_space(
         kind = "identity"
     d_c, d_p = diagonals(kind, hessian)
     return (np.sqrt(d_c), np.sqrt(d_p)) if kind == "diag" and not literal else (d_c, d_p)
+
+
+def squares(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return D^2 of :func:`scaled_space`: the length of a step is asked in every iteration, and needs no roots."""
+    if kind == "diag":
+        return diagonals(kind, hessian)
+    d_c, d_p = scaled_space(kind, hessian)
+    return d_c * d_c, d_p * d_p

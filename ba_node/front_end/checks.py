@@ -26,6 +26,8 @@ _USUAL = 3
 _OFF_CENTRE = 0.25
 # A pair of which so few features have a partner is looked at with left and right exchanged.
 _FEW_PARTNERS = 0.25
+# No depth camera sees so far, m.
+_FAR_M = 200.0
 # Share of an image that is found in any other by chance.
 _STRANGERS = 0.02
 # Corners that are tried, their distance from the border and the side of their patches, px.
@@ -130,7 +132,19 @@ class ImageWatch:
                 notes,
             )
             return dataclasses.replace(images, depth_m=None)
+        if images.depth_m is not None:
+            self._look_at_depth(images.depth_m, images.stamp_ns, notes)
         return images
+
+    def _look_at_depth(self, depth_m: Floats, stamp_ns: int, notes: list[str]) -> None:
+        """Say that a depth image is empty, or that its unit seems to be another."""
+        some = depth_m[::4, ::4]
+        known = some[np.isfinite(some) & (some > 0.0)]
+        if not len(known):
+            self.say("no_depth", f"depth image at {stamp_ns} ns has no depth (all 0 or NaN): check its topic", notes)
+        elif np.median(known) > _FAR_M:
+            text = f"depths of {np.median(known):.0f} m (median): 32FC1 is in m, 16UC1 in mm; are these millimetres?"
+            self.say("depth_unit", text, notes)
 
     def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
         """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""

@@ -248,3 +248,6 @@ def is_sound(problem: Problem) -> bool:
 
 def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, float]:
     """Return what core.covariance.weakest does, of blocks (n, 6, 6) of S and positions (n, 3)."""
+
+def numbers(text: bytes) -> Doubles | None:
+    """Return the numbers between white space, None where something is no finite number as C++ reads them."""

@@ -62,13 +62,13 @@ class Solved:
     setup_s: float = 0.0  # time to read and prepare it, s
     solve_s: float = 0.0  # time in the solver, s
 
-    def told(self, behind: tuple[int, int], meaning: str) -> tuple[list[str], bool]:
+    def told(self, behind: tuple[int, int], count: int, meaning: str) -> tuple[list[str], bool]:
         """Return what a user has to know, one sentence each, and whether the result has to be looked at for it.
 
-        ``behind`` are the observations of points behind their cameras at the start and at the end, ``meaning`` what
-        becomes of them.
+        ``behind`` are the observations, of ``count``, of points behind their cameras at the start and at the end,
+        ``meaning`` what becomes of them.
         """
-        count, result, lines = len(self.problem.observations), self.result, []
+        result, lines = self.result, list[str]()
         grave = max(behind) > _MANY_BEHIND * count
         if any(behind):
             lines.append(
@@ -147,7 +147,7 @@ class Solution(Solved):
 
     def attention(self) -> tuple[list[str], bool]:
         """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
-        lines, grave = self.told(self.totals.behind, "they are not in the rms")
+        lines, grave = self.told(self.totals.behind, len(self.bal.observations), "they are not in the rms")
         focal = self.bal.cameras[:, 6]
         bad = np.flatnonzero(focal <= 0.0)
         if len(bad):

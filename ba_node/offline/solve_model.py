@@ -68,7 +68,8 @@ class ModelSolution(Solved):
         """Return what a user has to know, one sentence each, and whether the result has to be looked at for it."""
         before, after = (int(np.isnan(reprojection_errors(*end)[:, 0]).sum()) for end in self._ends())
         dropped = self.options.cheirality == "drop"
-        return self.told((before, after), f"those at the start {'are left out' if dropped else 'count'}")
+        meaning = f"those at the start {'are left out' if dropped else 'count'}"
+        return self.told((before, after), len(self.problem.observations), meaning)
 
     def as_dict(self) -> dict[str, Any]:
         """Return statistics, options and trace for JSON."""

@@ -76,13 +76,12 @@ def track(
 
 
 def _poses(path: Path) -> OdometryBuffer:
-    """Return the poses of an odometry, fixed frame from body, in a TUM file."""
+    """Return the poses of an odometry, fixed frame from body, in a TUM file, whose lines may be in any order."""
     poses = read_tum(path)
     buffer = OdometryBuffer(len(poses))
-    for stamp_ns, *pose in zip(
-        poses.stamp_ns.tolist(), geometry.matrix_from_quaternion(poses.orientation), poses.position, strict=True
-    ):
-        buffer.add(stamp_ns, Transform(*pose))
+    rotation = geometry.matrix_from_quaternion(poses.orientation)
+    for row in np.argsort(poses.stamp_ns, kind="stable"):
+        buffer.add(int(poses.stamp_ns[row]), Transform(rotation[row], poses.position[row]))
     return buffer
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -17,10 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ba_node.config import SolverOptions
 from ba_node.core.communicator import Alone
+from ba_node.core.ranks import deal
 from ba_node.io.bal import BalProblem, write_bal
 from ba_node.offline.ranks import RanksError, started_as_ranks, world
-from ba_node.offline.solve_bal import solve_file
+from ba_node.offline.solve_bal import Totals, read, solve_file
 from ba_node.offline.solve_ranks import Checkpoint, solve_on_ranks
 from ba_node.offline.solver_settings import solver_options
 
@@ -209,6 +212,15 @@ def test_ranks_without_an_mpi_library_are_told_what_to_install(monkeypatch: pyte
 def test_ranks_are_known_by_what_started_them() -> None:
     assert not started_as_ranks({}) and not started_as_ranks({"OMPI_COMM_WORLD_SIZE": "1"})
     assert started_as_ranks({"OMPI_COMM_WORLD_SIZE": "2"}) and started_as_ranks({"PMI_SIZE": "4"})
+
+
+def test_observations_behind_are_those_of_all_ranks(file: Path) -> None:
+    whole = read(file, SolverOptions())
+    part, _ = deal(whole.problem, 0, 2)
+    solution = dataclasses.replace(whole, problem=part, summed=Totals((1.0, 1.0), (15, 0)))
+    lines, grave = solution.attention()
+    assert len(lines) == 1 and lines[0].startswith(f"15 of {len(whole.problem.observations)} observations are")
+    assert not grave  # 15 are more than 1 % of the part, not of the whole
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ba_node import native
 from ba_node.config import SolverOptions
 from ba_node.core.objective import Objective, reprojection_errors
 from ba_node.io.bal import BalError, BalProblem, from_state, read_bal, to_problem, write_bal
@@ -203,3 +204,21 @@ def test_files_with_a_blank_line_after_the_header(shared_data: Path, name: str, 
     bal = read_bal(shared_data / "gtsam-dubrovnik-small" / f"dubrovnik-{name}-pre.txt")
     assert (len(bal.cameras), len(bal.points), len(bal.observations)) == shape
     assert np.abs(residuals(bal)).max() < 50.0, "residuals of a real problem at its start are pixels, not hundreds"
+
+
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+def test_numbers_are_read_to_the_bit() -> None:
+    rng = np.random.default_rng(5)
+    values = np.concatenate([rng.normal(size=2000) * 10.0 ** rng.integers(-300, 300, 2000), rng.integers(-9, 9, 99)])
+    words = [f(value) for f in (repr, "{:.3e}".format, "{:.17g}".format) for value in values.tolist()]
+    spaces = rng.choice(list(" \t\n\r\v\f"), (len(words) + 1, 2))
+    text = "".join(f"{a}{b}{word}" for (a, b), word in zip(spaces, words, strict=False)) + "".join(spaces[-1])
+    np.testing.assert_array_equal(native.kernels.numbers(text.encode()), np.array(words, dtype=np.float64))
+    assert native.kernels.numbers(b"-1.5").tolist() == [-1.5]
+    assert native.kernels.numbers(b" \n").shape == (0,)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+@pytest.mark.parametrize("word", ["x", "1x", "1,2", "nan", "inf", "1e999", "1e-999", "+1", "0x10", "-", ".", "1\0"])
+def test_what_is_no_plain_number_is_left_to_numpy(word: str) -> None:
+    assert native.kernels.numbers(f"1 {word} 2".encode()) is None

@@ -86,7 +86,7 @@ def test_mask_and_odometry_file(pictures: Path, tmp_path: Path, capsys: pytest.C
         " ".join(map(str, [1.0 + 0.1 * i, *pose.translation, *geometry.quaternion_from_matrix(pose.rotation)]))
         for i, pose in enumerate(world.drive(12))
     ]
-    (tmp_path / "odometry.tum").write_text("\n".join(lines))
+    (tmp_path / "odometry.tum").write_text("\n".join(reversed(lines)))
     out = tmp_path / "mono.mcap"
     words = ["track", str(one), str(out), "--mask", str(tmp_path / "mask.png")]
     assert main([*words, "--odometry", str(tmp_path / "odometry.tum")]) == 0

@@ -5,17 +5,19 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ba_node import window
+from ba_node import native, window
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.scene.scene import Scene
 from ba_node.synthetic import SyntheticOptions, generate
-from ba_node.window.moving import moving, much
+from ba_node.window.moving import _mismatches, moving, much
 from ba_node.window.selection import Selection
 from experiments.robustness.faults import Recording, spoiled, without_outliers
 
@@ -178,3 +180,16 @@ def test_a_young_map_does_not_take_what_stands_for_moving(seed: int) -> None:
         pass
     assert absolute_error(backend.estimate().trajectory, data.truth).translation.rmse < 0.01
     assert "moving" not in backend.scene.log.warnings
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+def test_both_kernels_find_the_same_mismatches() -> None:
+    rng = np.random.default_rng(4)
+    point = np.sort(rng.integers(0, 60, 800))
+    seen = SimpleNamespace(point=point, camera=rng.integers(0, 3, 800))
+    problem: Any = SimpleNamespace(observations=seen, cameras=SimpleNamespace(model=np.zeros(3)))
+    norms = np.abs(rng.normal(size=800)) * np.where(rng.random(800) < 0.2, 10.0, 1.0)
+    norms[rng.random(800) < 0.05] = np.inf
+    by_numpy, by_native = (_mismatches(problem, norms, kernels) for kernels in ("numpy", "native"))
+    assert 20 < np.count_nonzero(by_numpy) < 200
+    np.testing.assert_array_equal(by_native, by_numpy)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ba_node import window
+from ba_node import native, window
 from ba_node.arrays import IntArray
 from ba_node.config import Config
-from ba_node.core import geometry, objective
+from ba_node.core import geometry, native_kernels, objective
 from ba_node.core.result import Result, Status
 from ba_node.measurements import FeatureTracks, Keyframe, Measurement
 from ba_node.scene.scene import Scene
 from ba_node.synthetic import SyntheticOptions, generate
+from ba_node.window.merging import _doubted
 
 TRACKS = Config().tracks
 QUIET: dict[str, Any] = {
@@ -358,3 +360,27 @@ def test_guesses_move_with_the_map() -> None:
     rows = np.flatnonzero(scene.landmarks.has_guess)
     expected = scene.landmarks.guess[rows] @ turn.T + shift
     np.testing.assert_allclose(window.moved_guesses(scene, rows), expected, atol=1e-9)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+def test_both_kernels_doubt_the_same_points() -> None:
+    settings = config()
+    selection = selected(scene_of(settings), settings)
+    rng, state = np.random.default_rng(2), selection.problem.start
+    scale = np.where(rng.random((len(state.points), 1)) < 0.2, [[100.0]], [[0.1]])
+    state = dataclasses.replace(state, points=state.points + scale * rng.normal(size=state.points.shape))
+    norms = native_kernels.residual_norms(selection.whole, state, "numpy")
+    by_numpy, by_native = (_doubted(selection, state, norms, 3.0, kernels) for kernels in ("numpy", "native"))
+    assert 0.1 < np.mean(by_numpy[0]) < 1.0
+    for ours, theirs in zip(by_native, by_numpy, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+def test_what_keyframes_see_is_counted_alike() -> None:
+    rng = np.random.default_rng(3)
+    obs: Any = SimpleNamespace(keyframe=rng.integers(0, 7, 500), point=rng.integers(0, 90, 500))
+    used, marked = rng.random(500) < 0.6, rng.random(90) < 0.3
+    every, well = native.kernels.seen_by_keyframe(obs, used, marked, 9)
+    np.testing.assert_array_equal(every, np.bincount(obs.keyframe[used], minlength=9))
+    np.testing.assert_array_equal(well, np.bincount(obs.keyframe[used & marked[obs.point]], minlength=9))

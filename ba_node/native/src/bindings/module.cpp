@@ -5,8 +5,12 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
+#include <charconv>
+#include <cmath>
+#include <cstddef>
 #include <memory>
 #include <string>
+#include <string_view>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -19,6 +23,38 @@
 namespace ba {
 
 namespace {
+
+bool is_space(char c) { return c == ' ' || (c >= '\t' && c <= '\r'); }
+
+// The numbers of a text between white space; None where something in it is no finite number as C++ reads them.
+py::object numbers(const py::bytes& bytes) {
+#if defined(__cpp_lib_to_chars)
+  const std::string_view text(bytes);
+  std::size_t n = 0;
+  bool between = true;
+  for (const char c : text) {
+    const bool space = is_space(c);
+    n += between && !space;
+    between = space;
+  }
+  Doubles out = empty({static_cast<py::ssize_t>(n)});
+  double* value = out.mutable_data();
+  const bool sound = without_gil([&] {
+    const char *at = text.data(), *end = at + text.size();
+    for (; at != end; ++at) {
+      if (is_space(*at)) continue;
+      const auto [next, error] = std::from_chars(at, end, *value);
+      if (error != std::errc() || !std::isfinite(*value) || (next != end && !is_space(*next))) return false;
+      ++value;
+      if (next == end) break;
+      at = next;
+    }
+    return true;
+  });
+  if (sound) return std::move(out);
+#endif
+  return py::none();
+}
 
 // What this processor can run, the widest first.
 std::vector<const Target*> supported_targets() {
@@ -329,4 +365,5 @@ PYBIND11_MODULE(_kernels, m) {
   m.def("triangulate", &ba::triangulate);
   m.def("agreeing", &ba::agreeing);
   m.def("consensus", &ba::consensus);
+  m.def("numbers", &ba::numbers);
 }
