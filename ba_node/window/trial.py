@@ -24,8 +24,9 @@ from ba_node.core.problem import Observations, Problem, State
 
 # One track in so many may sit a solve out: more would be missed by a small window.
 _SHARE = 128
-# Rays that meet at fewer standard deviations of a pixel than this tell no distance.
-MIN_PARALLAX = 4.0
+# Rays that meet at fewer standard deviations of a pixel than this tell no distance; those of a camera that stands still
+# seem to meet at up to 4.1.
+MIN_PARALLAX = 4.2
 # A track with fewer views by fewer keyframes tells nothing: any poses explain it.
 _MIN_VIEWS = 3
 # Fewer residuals than this tell nothing.
