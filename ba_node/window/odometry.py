@@ -17,9 +17,9 @@ So images decide where they see enough. Where these see little (no tracks, no pa
 turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
 images by far, as where the front-end has jumped, pulls at nothing. Once the standard deviations are known to be right
 the loss is wider, for all steps that are not wild belong to that distribution, and keep tracks on moving objects from
-carrying a keyframe along. So it is in windows without measured depths of which most keyframes see little: a dozen
-points tell turns, but hardly lengths, and nobody is there to tell how precise the steps are. It is widest in a young
-map that sees much: nothing but the steps tells there what moves.
+carrying a keyframe along. So it is in windows of one camera of which most keyframes see little: a dozen points tell it
+turns, but no lengths, and nobody is there to tell how precise the steps are. It is widest in a young map that sees
+much: nothing but the steps tells there what moves.
 Where much of what is seen moves, refined steps may follow it and tell nothing; there the standard deviations are those
 stated, and the loss is the widest too, but where depths are measured. Rotation and translation have a loss each, so
 that a wrong one does not release the other.
@@ -48,7 +48,7 @@ _MAX_GAP = 100
 # Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
 _LEAST_STEPS = 8
 MANY_OBSERVATIONS = 50
-# How many times as wide as stated the loss is once they have told, or where most see little without depths; and before,
+# How many times as wide as stated the loss is once they have told, or where most see little to one camera; and before,
 # where all keyframes see much.
 _WIDE = 5.0
 _WIDEST = 20.0
@@ -104,15 +104,14 @@ def factors(
         return ()
     many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= MANY_OBSERVATIONS
     stated = _front_end(scene, config, keyframes, tied)
-    depths = len(problem.observations.depth_m) > 0
-    much_moves = much_moves and not depths
+    much_moves = much_moves and not len(problem.observations.depth_m)
     inflated = None if much_moves else _as_learned(scene, config, keyframes, many, stated)
     steps = stated if inflated is None else inflated
     if turned is not None:
         rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
-    few = not depths and len(keyframes) <= _WINDOW and 2 * np.count_nonzero(many) < len(many)
+    few = not problem.has_scale and len(keyframes) <= _WINDOW and 2 * np.count_nonzero(many) < len(many)
     width = _WIDE if few or inflated is not None else 1.0
     if inflated is None and (much_moves or many.all()):
         width = _WIDEST
