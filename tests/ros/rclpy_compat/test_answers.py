@@ -272,23 +272,26 @@ def test_twenty_faults_in_a_row_do_not_end_the_node(client: Client) -> None:
 
 @pytest.fixture
 def start_alone(
-    start_node: Callable[..., Any], make_peer: Callable[..., Any], folder: Path, scene: SyntheticData
+    start_node: Callable[..., Any], make_peer: Callable[..., Any], tmp_path: Path, scene: SyntheticData
 ) -> Callable[..., Client]:
-    """Return a function that starts a node of its own with options, and returns a client of it."""
+    """Return a function that starts a node of its own with options, and returns a client of it.
+
+    It has a folder of its own: the other node would take what is put in for itself.
+    """
 
     def start(**options: Any) -> Client:
-        node = start_node(*ALONE, "-p", f"node.map_folder:={folder}", **options)
+        node = start_node(*ALONE, "-p", f"node.map_folder:={tmp_path}", **options)
         peer = make_peer(namespace="alone")
         peer.advertise()
         peer.play(scene)
-        return Client(node, peer, folder)
+        return Client(node, peer, tmp_path)
 
     return start
 
 
-def test_the_solvers_thread_dies(start_alone: Callable[..., Client], folder: Path, scene: SyntheticData) -> None:
+def test_the_solvers_thread_dies(start_alone: Callable[..., Client], tmp_path: Path, scene: SyntheticData) -> None:
     """Whoever waits then is answered, and whoever comes later too."""
-    alone = start_alone(prepare=put_faults, folder=str(folder))
+    alone = start_alone(prepare=put_faults, folder=str(tmp_path))
     peer = alone.peer
     alone.arm("solver")
     # The round that is under way when the fault is put in may still serve the first.
@@ -305,7 +308,7 @@ def test_the_solvers_thread_dies(start_alone: Callable[..., Client], folder: Pat
 
 @pytest.mark.parametrize("number", [2, 15])
 def test_who_waits_when_a_signal_comes_is_answered(
-    number: int, start_alone: Callable[..., Client], gates: Any, folder: Path
+    number: int, start_alone: Callable[..., Client], gates: Any, tmp_path: Path
 ) -> None:
     alone = start_alone(**gates.options)
     node, peer = alone.node, alone.peer
@@ -322,5 +325,4 @@ def test_who_waits_when_a_signal_comes_is_answered(
     gates.open("optimize")
     gates.open("map file")
     assert node.wait() == 0, node.err
-    assert (folder / "late.npz").exists(), "a file is written to the end"
-    (folder / "late.npz").unlink()
+    assert (tmp_path / "late.npz").exists(), "a file is written to the end"
