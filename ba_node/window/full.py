@@ -133,10 +133,9 @@ class Optimization:
     @contextmanager
     def _without_inliers(self) -> Iterator[None]:
         """Keep of all observations those alone that the problem leaves out, until it is solved."""
-        selection, inlier = self.selection, self.selection.inlier
-        left_out = some_observations(selection.whole, np.flatnonzero(~inlier)).observations
-        self.selection = dataclasses.replace(selection, observations=left_out)
-        del selection
+        inlier = self.selection.inlier
+        left_out = some_observations(self.selection.whole, np.flatnonzero(~inlier)).observations
+        self.selection = dataclasses.replace(self.selection, observations=left_out)
         try:
             yield
         finally:
