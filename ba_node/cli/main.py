@@ -48,7 +48,6 @@ GROUPS: dict[str, dict[str, str]] = {
         "merge": "put several recordings together",
         "convert": "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY",
         "rig": "show, convert or publish the cameras of a rig",
-        "synth": "make a recording with ground truth",
     },
     "the running node": {
         "record": "record the node's inputs from live topics",
@@ -57,6 +56,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "params": "print all parameters with their defaults",
     },
     "in a checkout of the repository": {
+        "synth": "make a recording with ground truth",
         "steps": "search the steps of the scaling inc on a BAL file",
         "sphere": "make a BAL problem of points on a sphere, with its truth",
         "robustness": "prove on recordings gone wrong that no harm is done",
@@ -65,6 +65,7 @@ GROUPS: dict[str, dict[str, str]] = {
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 _EXPERIMENTS = {
+    "synth": "synthetic.command",
     "steps": "thesis.steps",
     "sphere": "thesis.sphere_file",
     "robustness": "robustness.command",
