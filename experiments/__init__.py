@@ -4,5 +4,5 @@
 
 ``thesis`` repeats the experiments of the thesis behind the methods (``ba thesis``), ``benchmarks`` compares with other
 solvers (``make bench``), ``robustness`` replays recordings gone wrong (``ba robustness``), ``synthetic`` makes
-recordings with ground truth (``ba synth``).
+recordings with ground truth (``ba synth``), ``demo`` shows the node at work (``ba demo``).
 """

@@ -26,7 +26,7 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
     assert "--json FILE" in text
 
 
-@pytest.mark.parametrize("command", ["synth", "steps", "sphere", "robustness", "thesis"])
+@pytest.mark.parametrize("command", ["demo", "synth", "steps", "sphere", "robustness", "thesis"])
 def test_commands_of_a_checkout_say_so_elsewhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
