@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import functools
 
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 
 @functools.lru_cache(maxsize=32)

@@ -51,7 +51,6 @@ WITHOUT_BACKEND = (
     "offline/solve_model.py",
     "offline/solve_ranks.py",
     "offline/solver_settings.py",
-    "cli/steps.py",
 )
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -30,7 +30,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "scene": ("scene", "measurements", "estimate"),
     "window": ("window", "check"),
     "backend": ("backend",),
-    "services": ("messages", "io", "evaluation", "synthetic", "front_end"),
+    "services": ("messages", "io", "evaluation", "front_end"),
     "tools": ("ros", "offline", "cli"),
 }
 UNSEEN = ("licence", "arrays")

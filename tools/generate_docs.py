@@ -18,10 +18,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ba_node.config import Config, Parameter, SolverOptions, Value, declared
+from ba_node.config import Config, Parameter, SolverOptions, Value, declarations, declared
 from ba_node.config.front_end import FrontEndNodeOptions, FrontEndOptions
 from ba_node.core.methods import METHODS
-from ba_node.io.parameters import parameters_markdown, parameters_yaml, plain_yaml
+from ba_node.io.parameters import allowed, parameters_yaml, plain_yaml, scalar
 from ba_node.messages.topics import ACTIONS, INTERFACE_VERSION, SERVICES, TOPICS, Command, Direction, Topic
 from ba_node.scene.rejections import NOTICES, REASONS
 from experiments.robustness.page import page as robustness_page
@@ -95,7 +95,16 @@ def topics_markdown() -> str:
 
 def parameters_page() -> str:
     """Return docs/parameters.md."""
-    return PARAMETERS_INTRO + parameters_markdown()
+    return PARAMETERS_INTRO + parameters_table(declarations())
+
+
+def parameters_table(parameters: Sequence[Parameter]) -> str:
+    """Return a table with a row for each parameter."""
+    lines = ["| parameter | default | unit | allowed | change | meaning |", "|---|---|---|---|---|---|"]
+    for p in parameters:
+        change = "next solve" if p.live else "restart"
+        lines.append(f"| `{p.name}` | {scalar(p.default)} | {p.unit} | {allowed(p)} | {change} | {p.doc} |")
+    return "\n".join(lines) + "\n"
 
 
 def renewed(name: str, tables: str) -> str:
@@ -171,7 +180,7 @@ def pages() -> dict[str, str]:
     second = json.loads((ROOT / "docs" / "thesis_second_run.json").read_text(encoding="utf-8"))
     robustness = json.loads((ROOT / "docs" / "robustness_results.json").read_text(encoding="utf-8"))
     note = f"<!-- Written by `{MADE_BY}`: do not edit. -->\n\n"
-    front_end_table = parameters_markdown(of_the_front_end(FrontEndNodeOptions, FrontEndOptions))
+    front_end_table = parameters_table(of_the_front_end(FrontEndNodeOptions, FrontEndOptions))
     return {
         "config/ba_node.yaml": yaml_file(),
         "docs/parameters.md": note + parameters_page(),

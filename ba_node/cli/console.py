@@ -144,28 +144,6 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_declared_options(parser: argparse.ArgumentParser, options: type) -> None:
-    """Declare an option of the command for each that a dataclass declares."""
-    from ba_node.config import declared  # noqa: PLC0415
-
-    for option in declared(options):
-        flag, unit = f"--{option.name.replace('_', '-')}", f", {option.unit}" if option.unit else ""
-        text = f"{option.doc} (default: {option.default}{unit})".replace("%", "%%")
-        if option.kind is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, help=text)
-        else:
-            metavar = None if option.choices else option.kind.__name__.upper()
-            parser.add_argument(flag, type=option.kind, choices=option.choices or None, metavar=metavar, help=text)
-
-
-def declared_options(args: argparse.Namespace, options: type) -> dict[str, Any]:
-    """Return those of the options of :func:`add_declared_options` that were given."""
-    from ba_node.config import declared  # noqa: PLC0415
-
-    values = {option.name: getattr(args, option.name) for option in declared(options)}
-    return {name: value for name, value in values.items() if value is not None}
-
-
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of commands that run the back-end."""
     parser.add_argument(

@@ -48,15 +48,15 @@ GROUPS: dict[str, dict[str, str]] = {
         "merge": "put several recordings together",
         "convert": "convert between recordings, COLMAP, Bundler, BAL, TUM, KITTI, g2o, PLY",
         "rig": "show, convert or publish the cameras of a rig",
-        "synth": "make a recording with ground truth",
     },
     "the running node": {
         "record": "record the node's inputs from live topics",
         "play": "publish a recording on live topics",
-        "demo": "run the node on a recording and compare with ground truth",
         "params": "print all parameters with their defaults",
     },
     "in a checkout of the repository": {
+        "demo": "run the node on a recording and compare with ground truth",
+        "synth": "make a recording with ground truth",
         "steps": "search the steps of the scaling inc on a BAL file",
         "sphere": "make a BAL problem of points on a sphere, with its truth",
         "robustness": "prove on recordings gone wrong that no harm is done",
@@ -65,6 +65,8 @@ GROUPS: dict[str, dict[str, str]] = {
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 _EXPERIMENTS = {
+    "demo": "demo.command",
+    "synth": "synthetic.command",
     "steps": "thesis.steps",
     "sphere": "thesis.sphere_file",
     "robustness": "robustness.command",

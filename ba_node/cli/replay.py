@@ -178,7 +178,7 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
     print(table(list(batch.COLUMNS.values())[:-1], [batch.cells(row)[:-1] for row in rows]))
     for row in rows:
         if row["state"] == batch.LOOK:
-            print(f"ba: warning: {_named(row)}", file=sys.stderr)
+            print(f"ba: warning: {row['recording']}: {row['note']}", file=sys.stderr)
     failed = [row for row in rows if row["state"] == batch.FAILED]
     say_left_out({row["recording"]: row["note"] for row in failed})
     with delivered(args.out) as folder:
@@ -197,15 +197,11 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
     return 0 if all(row["state"] == batch.OK for row in rows) else ATTENTION
 
 
-def _named(row: Mapping[str, Any]) -> str:
-    return f"{row['recording']}: {row['note']}"
-
-
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return what came out, then how."""
     statuses = ", ".join(f"{n} {name.lower()}" for name, n in report["solves_by_status"].items())
     older = ", ".join(f"{old['keyframes']} keyframes in {old['folder']}" for old in report["older_sessions"])
-    rejected = ", ".join(f"{n} {reason}" for reason, n in _rejected(report).items())
+    rejected = ", ".join(f"{n} {reason}" for reason, n in (report["bag_rejected"] | report["rejected"]).items())
     error = report.get("trajectory_error_m")
     rows = [
         ("keyframes", f"{report['keyframes_refined']} of {report['keyframes']} refined"),
@@ -246,10 +242,6 @@ def _behind(of: Mapping[str, int]) -> list[tuple[str, str]]:
     if not any(of.values()):
         return []
     return [("behind a camera", f"{of['input']} -> {of['refined']} observations, which count in none of these")]
-
-
-def _rejected(report: Mapping[str, Any]) -> dict[str, int]:
-    return {**report["bag_rejected"], **report["rejected"]}
 
 
 def _tell(report: Mapping[str, Any]) -> None:

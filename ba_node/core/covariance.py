@@ -149,15 +149,11 @@ def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, vari
             matrix[g, other] += np.sum(
                 (j * d[:, None] @ (moved[other].T * slopes[other]) @ moved[other]) * j * d[:, None]
             )
-        score = rows.weight[of] * rows.residual[of]
-        total[g] = np.sum(score * score) + _STATED * mean * mean - _sum_of_forms(j * d[:, None], of_seen)
+        score, scaled = rows.weight[of] * rows.residual[of], j * d[:, None]
+        total[g] = np.sum(score * score) + _STATED * mean * mean - np.sum((scaled @ of_seen) * scaled)
     found = np.linalg.lstsq(matrix, total, rcond=None)[0]
     for of, d, v in zip(members, slopes, found, strict=True):
         variance[of] = max(float(v), _LEAST * float(d.mean())) * d
-
-
-def _sum_of_forms(x: FloatArray, matrix: FloatArray) -> float:
-    return float(np.sum((x @ matrix) * x))
 
 
 def _jackknifed(score: FloatArray, slope: FloatArray, leverage: FloatArray) -> FloatArray:

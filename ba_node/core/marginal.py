@@ -73,16 +73,6 @@ class MarginalPrior:
         return MarginalPrior(numbers[None], self.rotation[stays], self.translation[stays], parts, offset)
 
 
-def gauge_directions(state: State) -> FloatArray:
-    """Return the local steps (n_kf, 6, 7) of all keyframes with which the world turns, moves and grows."""
-    n = len(state.translation)
-    out = np.zeros((n, 6, 7))
-    out[:, :3, :3] = np.eye(3)
-    out[:, 3:, 3:6] = np.eye(3)
-    out[:, 3:, 6] = (np.swapaxes(state.rotation, 1, 2) @ state.translation[:, :, None])[..., 0]
-    return out
-
-
 def triangular(going: FloatArray, staying: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return R_kk and z_k of the QR decomposition of [J_g, J_k, r]; rows that nothing of k is in are left out."""
     stacked: FloatArray = np.column_stack([going, staying, residual])

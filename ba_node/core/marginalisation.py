@@ -11,7 +11,7 @@ by the rows Q_2 of ``J_p = Q_1 R``, then that on dg by another QR decomposition 
 
 ``H`` is never formed, so that no digits are lost, and the rank stays what it is. delta_k is the local step from the
 pose at which the rows were linearised, for good (first-estimate Jacobians, Huang et al., IJRR 2010): J annihilates the
-directions in which the whole map moves (``marginal.gauge_directions``) there, and the prior tells nothing of them that
+directions in which the whole map moves there, and the prior tells nothing of them that
 nothing told.
 """
 

@@ -166,7 +166,7 @@ class NumpySystem:
         """Return the solution by PCG in the space scaled by 1 / ``scale``."""
         if kind == "two_level":
             return self.two_level.solve(self.sparse(), self.rhs, scale, limits)
-        return solve_pcg(self, preconditioner(kind, self, scale), scale, limits, formed=formed)
+        return solve_pcg(kind, self, scale, limits, formed=formed)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x, by S itself where forming it pays."""
@@ -207,22 +207,18 @@ def solve_factored(matrix: scipy.sparse.spmatrix, rhs: FloatArray) -> FloatArray
     return linear.cholesky(matrix, rhs).x
 
 
-class _Operator(Protocol):
-    """A system of which products are known."""
+class _Blocked(System, Protocol):
+    """A system of which the diagonal blocks of what was not eliminated are known too."""
 
-    rhs: FloatArray
-
-    def dense(self) -> FloatArray:
-        """Return S, (n, n)."""
-
-    def product(self, x: FloatArray) -> FloatArray:
-        """Return S x."""
+    def own_blocks(self) -> tuple[FloatArray, ...]:
+        """Return these blocks, damped, in runs of equal size."""
 
 
 def solve_pcg(
-    system: _Operator, precondition: linear.Product, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool
+    kind: str, system: _Blocked, scale: FloatArray, limits: linear.PcgLimits, *, formed: bool
 ) -> linear.Solution:
-    """Return the solution by PCG in the space scaled by 1 / ``scale``; ``precondition`` works there."""
+    """Return the solution by PCG in the space scaled by 1 / ``scale``, in which the preconditioner ``kind`` is made."""
+    precondition = preconditioner(kind, system, scale)
     matrix = system.dense() if formed else None
     if matrix is not None:
         matrix *= scale[:, None]
@@ -235,17 +231,7 @@ def solve_pcg(
     return replace(found, x=None if found.x is None else scale * found.x)
 
 
-class _Blocks(Protocol):
-    """A system of which diagonal blocks are known."""
-
-    def diagonal_blocks(self) -> tuple[FloatArray, ...]:
-        """Return those of S."""
-
-    def own_blocks(self) -> tuple[FloatArray, ...]:
-        """Return those of what was not eliminated, damped."""
-
-
-def preconditioner(kind: str, system: _Blocks, scale: FloatArray) -> linear.Product:
+def preconditioner(kind: str, system: _Blocked, scale: FloatArray) -> linear.Product:
     """Return ``r -> M^-1 r`` for the system scaled by ``scale`` = 1/D, (n,)."""
     if kind == "none":
         return lambda r: r

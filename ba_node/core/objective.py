@@ -119,16 +119,9 @@ class Objective:
 
         (n_obs, 3) m; rows of masked observations count for nothing; (n_obs, d).
         """
-        of = self._all
-        x_cam, _ = self._in_camera(state, of)
-        masked = self._mask(x_cam, of)
-        uv = cameras.project(x_cam, of.model, self._params(state, of))
-        _, root_weight = self._costs(self._residual(uv, x_cam, masked, of), masked, of)
-        return (
-            x_cam,
-            masked,
-            np.broadcast_to(self._row_scale(root_weight, of), (len(x_cam), 3 if self._has_depth else 2)),
-        )
+        x_cam, masked, _, root_weight = self._evaluate(state)
+        scale = self._row_scale(root_weight, self._all)
+        return x_cam, masked, np.broadcast_to(scale, (len(x_cam), 3 if self._has_depth else 2))
 
     def in_camera(self, state: State) -> FloatArray:
         """Return the observed points in their camera's optical frame, (n_obs, 3), m."""
@@ -146,7 +139,7 @@ class Objective:
 
     def value(self, state: State) -> float:
         """Return the objective 1/2 sum Psi."""
-        return _total(self._evaluate(state, self._all)[1]) + self.factors_value(state)
+        return _total(self._evaluate(state)[2]) + self.factors_value(state)
 
     def factors_value(self, state: State) -> float:
         """Return what the factors have of the objective."""
@@ -240,13 +233,13 @@ class Objective:
         x_cam[masked] = (0.0, 0.0, 1.0)
         return masked
 
-    def _evaluate(self, state: State, of: _Observed) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """Return residuals that are not weighted, costs and root weights as of _costs, and which are masked."""
+    def _evaluate(self, state: State) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+        """Return points in their cameras, which observations are masked, costs and root weights as of _costs."""
+        of = self._all
         x_cam, _ = self._in_camera(state, of)
         masked = self._mask(x_cam, of)
         uv = cameras.project(x_cam, of.model, self._params(state, of))
-        residual = self._residual(uv, x_cam, masked, of)
-        return residual, *self._costs(residual, masked, of), masked
+        return x_cam, masked, *self._costs(self._residual(uv, x_cam, masked, of), masked, of)
 
     def _residual(self, uv: FloatArray, x_cam: FloatArray, masked: IntArray, of: _Observed) -> FloatArray:
         residual = columns.empty(len(uv), 3 if self._has_depth else 2)

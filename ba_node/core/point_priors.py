@@ -12,6 +12,7 @@ which is measured as D with the standard deviation s3. So the squares of all thr
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from ba_node.core.problem import Cameras, Observations, Problem, State
 
 # Metres; the digits that it costs are those beyond 1e-10 m.
 _FAR_M = 1e5
+Table = TypeVar("Table", Cameras, Observations, State)
 
 
 def as_observations(problem: Problem) -> Problem:
@@ -35,40 +37,19 @@ def as_observations(problem: Problem) -> Problem:
     translation = np.array([0.0, 0.0, _FAR_M]) - (rotation @ priors.position[:, :, None])[..., 0]
     lens = np.zeros((n, cameras.N_PARAMS))
     lens[:, :2] = _FAR_M / sigma[:, :2]
-    rig = problem.cameras
-    model = np.full(n, int(cameras.Model.RATIONAL), rig.model.dtype)
-    whole_rig = Cameras(
-        np.concatenate([rig.rotation, np.tile(np.eye(3), (n, 1, 1))]),
-        np.concatenate([rig.translation, np.zeros((n, 3))]),
-        np.concatenate([rig.model, model]),
-        np.concatenate([rig.params, lens]),
-    )
-    depth = _filled(obs.depth_m, len(obs)), _filled(obs.depth_sigma_m, len(obs))
-    columns = Observations(
-        np.concatenate([obs.keyframe, n_kf + np.arange(n)]),
-        np.concatenate([obs.camera, n_cam + np.arange(n)]),
-        np.concatenate([obs.point, priors.point]),
-        np.concatenate([obs.uv, np.zeros((n, 2))]),
-        np.concatenate([obs.sigma_px, np.ones(n)]),
-        np.concatenate([depth[0], np.full(n, _FAR_M)]),
-        np.concatenate([depth[1], sigma[:, 2]]),
-    )
-    order = np.argsort(columns.point, kind="stable")
-    intrinsics = start.intrinsics
-    if problem.free_intrinsics:
-        intrinsics = np.concatenate([intrinsics, np.tile([1.0, 0.0, 0.0], (n, 1))])
-    state = State(
-        np.concatenate([start.rotation, rotation]),
-        np.concatenate([start.translation, translation]),
-        start.points,
-        intrinsics,
-    )
+    model = np.full(n, int(cameras.Model.RATIONAL), problem.cameras.model.dtype)
+    theirs = Cameras(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), model, lens)
+    known = replace(obs, depth_m=_filled(obs.depth_m, len(obs)), depth_sigma_m=_filled(obs.depth_sigma_m, len(obs)))
+    which = n_kf + np.arange(n), n_cam + np.arange(n), priors.point
+    seen = _joined(known, Observations(*which, np.zeros((n, 2)), np.ones(n), np.full(n, _FAR_M), sigma[:, 2]))
+    order = np.argsort(seen.point, kind="stable")
+    intrinsics = np.tile([1.0, 0.0, 0.0], (n if problem.free_intrinsics else 0, 1))
     return replace(
         problem,
-        start=state,
+        start=_joined(start, State(rotation, translation, np.empty((0, 3)), intrinsics)),
         fixed=np.concatenate([problem.fixed, np.ones(n, bool)]),
-        cameras=whole_rig,
-        observations=Observations(*(values[order] for values in vars(columns).values())),
+        cameras=_joined(problem.cameras, theirs),
+        observations=Observations(*(values[order] for values in vars(seen).values())),
         point_priors=None,
     )
 
@@ -77,6 +58,11 @@ def without(state: State, problem: Problem) -> State:
     """Return a state of :func:`as_observations` without the keyframes that this added."""
     n = problem.n_keyframes
     return State(state.rotation[:n], state.translation[:n], state.points, state.intrinsics[:n])
+
+
+def _joined(first: Table, second: Table) -> Table:
+    """Return the rows of one table, then those of another."""
+    return type(first)(*map(np.concatenate, zip(vars(first).values(), vars(second).values(), strict=True)))
 
 
 def _filled(depth: FloatArray, n: int) -> FloatArray:

@@ -22,7 +22,7 @@ from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import linear, linear_costs, native_kernels, scaling
 from ba_node.core.communicator import Communicator, total
 from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System
-from ba_node.core.numpy_kernels import preconditioner, solve_pcg
+from ba_node.core.numpy_kernels import solve_pcg
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.two_level import TwoLevel
 
@@ -222,7 +222,7 @@ class RankSystem:
         """Return the solution by PCG in the space scaled by 1 / ``scale``, with products summed over ranks."""
         if kind == "two_level":
             return self._two_level.solve(self.local.sparse(), self.rhs, scale, limits)
-        return solve_pcg(self, preconditioner(kind, self, scale), scale, limits, formed=formed)
+        return solve_pcg(kind, self, scale, limits, formed=formed)
 
     def product(self, x: FloatArray) -> FloatArray:
         """Return S x."""

@@ -43,10 +43,6 @@ class Iteration:
     side: str = ""  # what was eliminated: points, cameras or none; empty in row 0
 
 
-def _unknown() -> tuple[float, float]:
-    return 0.0, 0.0
-
-
 @dataclass(frozen=True)
 class Result:
     """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start.
@@ -61,7 +57,7 @@ class Result:
     method: str
     trace: tuple[Iteration, ...]
     linear_solver: str = ""
-    loosest: Callable[[], tuple[float, float]] = _unknown
+    loosest: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
 
     @cached_property
     def weakest(self) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read parameters from YAML, and write them as YAML for ROS and as Markdown for people."""
+"""Read parameters from YAML, and write them as YAML for ROS."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def changes_yaml(config: Config) -> str:
     """Return the parameters that differ from their defaults as such a file, the default behind each."""
     values = config.values()
     changed = [one for one in declarations() if values[one.name] != one.default]
-    rows = ((one, values[one.name], (), f"  # default {_scalar(one.default)}") for one in changed)
+    rows = ((one, values[one.name], (), f"  # default {scalar(one.default)}") for one in changed)
     return _yaml(rows) if changed else "{}  # all parameters have their defaults\n"
 
 
@@ -83,23 +83,14 @@ def _yaml(rows: Iterable[tuple[Parameter, Value, Sequence[str], str]]) -> str:
             lines.append(f"    {group}:")
             last = group
         indent = " " * (6 if group else 4)
-        lines += [*(f"{indent}# {line}" for line in above), f"{indent}{key}: {_scalar(value)}{behind}"]
+        lines += [*(f"{indent}# {line}" for line in above), f"{indent}{key}: {scalar(value)}{behind}"]
     return "\n".join(lines) + "\n"
 
 
 def _comments(parameter: Parameter) -> tuple[str, str]:
     unit = f"[{parameter.unit}] " if parameter.unit else ""
     change = "takes effect at the next solve" if parameter.live else "takes effect at start only"
-    return parameter.doc, f"{unit}{_allowed(parameter)}; default {_scalar(parameter.default)}; {change}"
-
-
-def parameters_markdown(parameters: Sequence[Parameter] = declarations()) -> str:
-    """Return a table of parameters, those of the node if none are given."""
-    lines = ["| parameter | default | unit | allowed | change | meaning |", "|---|---|---|---|---|---|"]
-    for p in parameters:
-        change = "next solve" if p.live else "restart"
-        lines.append(f"| `{p.name}` | {_scalar(p.default)} | {p.unit} | {_allowed(p)} | {change} | {p.doc} |")
-    return "\n".join(lines) + "\n"
+    return parameter.doc, f"{unit}{allowed(parameter)}; default {scalar(parameter.default)}; {change}"
 
 
 def _of_this_node(path: Path | str, content: dict[Any, Any]) -> dict[Any, Any]:
@@ -138,7 +129,8 @@ def _as_float(value: object) -> object:
         return value
 
 
-def _scalar(value: Value) -> str:
+def scalar(value: Value) -> str:
+    """Return a value as YAML has it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -150,7 +142,8 @@ def _scalar(value: Value) -> str:
     return str(value)
 
 
-def _allowed(parameter: Parameter) -> str:
+def allowed(parameter: Parameter) -> str:
+    """Return in words what a parameter may be."""
     if parameter.choices:
         return ", ".join(parameter.choices)
     if parameter.kind is bool:

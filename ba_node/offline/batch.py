@@ -63,17 +63,13 @@ def recordings(places: Sequence[str], *, each: bool = False) -> list[tuple[str, 
     found: list[list[str]] = []
     for place in expand(places):
         lone = each or is_url(place) or Path(place).is_dir()
-        group = None if lone else next((one for one in found if _belongs(one, place)), None)
+        files = (one for one in found if not (is_url(one[0]) or Path(one[0]).is_dir()))
+        group = None if lone else next((one for one in files if same_recording(Path(one[0]), Path(place))), None)
         if group is None:
             found.append([place])
         else:
             group.append(place)
     return [tuple(group) for group in found]
-
-
-def _belongs(group: Sequence[str], place: str) -> bool:
-    first = group[0]
-    return not (is_url(first) or Path(first).is_dir()) and same_recording(Path(first), Path(place))
 
 
 def each(

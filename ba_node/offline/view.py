@@ -97,7 +97,8 @@ class _Show:
     def play(self) -> None:
         """Send all messages once."""
         began, first = time.monotonic(), None
-        for time_ns, channel, data in merge(*map(self._messages, self._readers), key=lambda message: message[0]):
+        parts = (reader.raw() for reader in self._readers)
+        for channel, time_ns, data in merge(*parts, key=lambda message: message[1]):
             first = time_ns if first is None else first
             self._wait(began + (time_ns - first) / _NS / self._rate if self._rate else began, time_ns)
             key = (channel.topic, channel.type_name)
@@ -107,11 +108,6 @@ class _Show:
                 self._latched[key] = data
             self._channels[key].log(data, log_time=time_ns)
             self.count += 1
-
-    @staticmethod
-    def _messages(reader: BagReader) -> Iterator[tuple[int, BagChannel, bytes]]:
-        for channel, time_ns, data in reader.raw():
-            yield time_ns, channel, data
 
     def _wait(self, due: float, time_ns: int) -> None:
         """Sleep until it is time, and repeat what is latched."""

@@ -31,8 +31,8 @@ from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros import qos
 from ba_node.ros.message_factory import RclpyFactory, message_class
-from ba_node.ros.tools.domain import free_domain, isolation
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.demo.domain import free_domain, isolation
+from experiments.synthetic import SyntheticOptions, generate
 
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]

@@ -22,7 +22,7 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate, Extras
 from ba_node.measurements import FeatureTracks, Keyframe, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 SENSORS = ("stereo", "rgbd", "mono")
 LOSSES = ("squared", "huber", "cauchy")

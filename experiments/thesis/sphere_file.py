@@ -12,8 +12,9 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from ba_node.cli.console import TargetError, add_declared_options, declared_options, require_folder
+from ba_node.cli.console import TargetError, require_folder
 from ba_node.io.bal import BalProblem, write_bal
+from experiments.command_options import add_declared_options, declared_options
 from experiments.thesis.sphere import SphereData, generate_sphere
 from experiments.thesis.sphere_options import PRESETS, SphereOptions, preset
 

@@ -16,7 +16,7 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.scene.candidates import Admitted
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 S = 1_000_000_000
 HOUR = 3600 * S

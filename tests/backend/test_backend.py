@@ -13,7 +13,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Status
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions
+from experiments.synthetic import SyntheticData, SyntheticOptions
 from tests.generated import generated
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate, Extras
 from ba_node.measurements import CameraRig, Keyframe, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 SMALL: dict[str, Any] = {
     "keyframes": 10, "landmarks": 800, "tracks": 60, "length_m": 10.0, "path": "line", "drift_rotation_deg": 2.0,

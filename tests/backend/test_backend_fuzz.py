@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 if TYPE_CHECKING:
     from ba_node.estimate import Estimate

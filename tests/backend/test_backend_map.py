@@ -20,7 +20,7 @@ from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement, OfTime
 from ba_node.scene.map_content import MapContent, MapError
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.backend.session_streams import Remembering
 
 LENGTH = 12

@@ -20,10 +20,10 @@ from ba_node.core import geometry, solver
 from ba_node.core.result import Iteration, Status
 from ba_node.evaluation.alignment import align
 from ba_node.measurements import CameraRig, Measurement, OfTime
-from ba_node.synthetic import SyntheticData, SyntheticOptions
 from ba_node.window import full
 from ba_node.window.merging import scaled
 from ba_node.window.problems import some_observations
+from experiments.synthetic import SyntheticData, SyntheticOptions
 from tests.generated import generated
 
 if TYPE_CHECKING:

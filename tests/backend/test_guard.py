@@ -18,7 +18,7 @@ from ba_node.core.result import Status
 from ba_node.estimate import Estimate, Poses
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic import SyntheticOptions
+from experiments.synthetic import SyntheticOptions
 from tests.generated import generated
 
 if TYPE_CHECKING:

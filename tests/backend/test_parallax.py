@@ -16,8 +16,8 @@ from ba_node.core import geometry
 from ba_node.core.result import Status
 from ba_node.estimate import Estimate
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.synthetic import SyntheticOptions, generate
-from ba_node.synthetic.world import Path, World
+from experiments.synthetic import SyntheticOptions, generate
+from experiments.synthetic.world import Path, World
 
 
 def begun(at: FloatArray, turned_deg: FloatArray) -> Callable[[World, Path], tuple[World, Path]]:

@@ -16,7 +16,7 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.measurements import FeatureTracks
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticData, SyntheticOptions
+from experiments.synthetic import SyntheticData, SyntheticOptions
 from tests.generated import generated
 
 FloatArray = NDArray[np.float64]

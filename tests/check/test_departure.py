@@ -13,7 +13,7 @@ from ba_node.check.departure import departed
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticData
+from experiments.synthetic import SyntheticData
 from tests.check.set_ups import recording, scene_of
 
 STEP_NOISE_M = 0.02

@@ -16,9 +16,9 @@ from ba_node.check.examine import examine
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
-from ba_node.synthetic.world import Path, World
 from experiments.robustness.faults import spoiled
+from experiments.synthetic import SyntheticOptions, generate
+from experiments.synthetic.world import Path, World
 from tests.check.set_ups import recording, seen
 from tests.window.street import round_trip
 

@@ -14,7 +14,7 @@ from ba_node.backend import Backend
 from ba_node.check import two_view
 from ba_node.config import Config
 from ba_node.estimate import Estimate, Status
-from ba_node.synthetic import SyntheticData
+from experiments.synthetic import SyntheticData
 from tests.check.set_ups import WRONG, recording, rig
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from ba_node.io.bal import BalProblem, write_bal
 from ba_node.offline.recording import record
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 KEYFRAMES = 8
 TRACKS = 60

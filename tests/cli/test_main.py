@@ -26,7 +26,7 @@ def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -
     assert "--json FILE" in text
 
 
-@pytest.mark.parametrize("command", ["steps", "sphere", "robustness", "thesis"])
+@pytest.mark.parametrize("command", ["demo", "synth", "steps", "sphere", "robustness", "thesis"])
 def test_commands_of_a_checkout_say_so_elsewhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -35,12 +35,6 @@ def test_commands_of_a_checkout_say_so_elsewhere(
         assert refused(capsys, *arguments) == (
             f"ba: error: {command} needs a checkout of the repository: experiments are not installed\n"
         )
-
-
-def test_an_installed_package_makes_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command_line, "ROOT", tmp_path)
-    assert main(["synth", str(tmp_path / "short.mcap"), "--keyframes", "3"]) == 0
-    assert (tmp_path / "short.mcap").stat().st_size > 1000
 
 
 def test_overview_names_every_command_and_is_fast() -> None:

@@ -15,7 +15,7 @@ from ba_node.io.map_file import is_map
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import Keyframe
 from ba_node.offline.recording import record
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 from tests.ply import read_ply
 
 

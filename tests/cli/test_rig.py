@@ -19,7 +19,7 @@ from ba_node.cli.main import main
 from ba_node.io.rig_file import read_rig
 from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
-from ba_node.ros.tools.domain import free_domain, isolation
+from experiments.demo.domain import free_domain, isolation
 from tests.io.test_rig_file import CAMCHAIN
 from tests.messages.adapters import layouts
 from tests.ros.harness import Peer

@@ -15,7 +15,6 @@ from ba_node.config import Config, ConfigError, SolverConfig, SolverOptions, dec
 from ba_node.config.front_end import FrontEndNodeOptions, FrontEndOptions
 from ba_node.core import methods
 from ba_node.offline.solver_settings import solver_options
-from ba_node.synthetic import SyntheticOptions
 
 PACKAGE = Path(__file__).resolve().parent.parent.parent / "ba_node"
 
@@ -42,7 +41,6 @@ def test_each_option_is_declared_exactly_once() -> None:
         "config/solver.py": len(declared(SolverOptions)),
         "config": len(declarations()) - len(declared(SolverConfig)),
         "config/front_end.py": len(declared(FrontEndOptions)) + len(declared(FrontEndNodeOptions)),
-        "synthetic/options.py": len(declared(SyntheticOptions)),
     }
     counted = {
         "config": declared_in.pop("config/estimation.py") + declared_in.pop("config/node.py"),

@@ -26,7 +26,7 @@ from ba_node.io.bag_writer import BagWriter
 from ba_node.measurements import CameraRig
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 Message = tuple[str, str, int, bytes]
 

@@ -22,7 +22,7 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGue
 from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.offline.replay import MapOptions, replay
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 F = ROSBAGS_FACTORY
 KF, FT, LG, RIG, INFO = "keyframes", "feature_tracks", "landmark_guesses", "camera_rig", "camera_info"

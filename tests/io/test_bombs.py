@@ -39,7 +39,7 @@ from ba_node.io.trajectory import TrajectoryError, read_tum
 from ba_node.offline.recording import TRUTH_TYPE, record
 from ba_node.offline.replay import replay
 from ba_node.scene.map_content import MapContent
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 MAX_MB = 1000
 RUN = """

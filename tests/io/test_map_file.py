@@ -20,7 +20,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.io.map_file import VERSION, MapFileError, load_map, read_map, write_map
 from ba_node.scene.map_content import MapContent
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 DTYPES = st.sampled_from(["u8", "i8", "i4", "u1", "f4", "f8", "?"]).map(np.dtype)
 ARRAYS = hnp.arrays(DTYPES, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=4))

@@ -18,10 +18,10 @@ from ba_node.core import geometry, triangulation
 from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window import moving, trial
 from ba_node.window.initial_points import agreed_points
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
+from experiments.synthetic import SyntheticOptions, generate
 
 pytestmark = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
 

@@ -17,7 +17,7 @@ from ba_node.io.bag_reader import BagReader
 from ba_node.io.rig_file import rig_yaml
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.adapters import SOURCES
-from ba_node.synthetic import SyntheticData
+from experiments.synthetic import SyntheticData
 from tests.messages.adapters import layouts
 
 EVERY = {"openvins": 12, "vins_fusion": 9, "vins_mono": 5, "rtabmap": 12, "rtabmap_map": 12}

@@ -17,7 +17,7 @@ from ba_node.core import geometry
 from ba_node.io.rig_file import read_rig
 from ba_node.measurements import CameraRig, Measurement
 from ba_node.offline.recording import record
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 OPTIONS = SyntheticOptions(
     seed=1, keyframes=30, landmarks=1200, tracks=80, length_m=40.0, baseline_m=0.2, outlier_share=0.02,

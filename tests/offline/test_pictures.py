@@ -14,7 +14,7 @@ from ba_node.estimate import Poses
 from ba_node.offline.figures import trajectory_figures
 from ba_node.offline.pictures import draw_trajectory
 from ba_node.offline.run_folder import Comparison
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 if TYPE_CHECKING:
     from pathlib import Path

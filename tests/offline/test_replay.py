@@ -26,7 +26,7 @@ from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.offline.convert import timeline
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 from tests.ply import read_ply
 
 BAGS = sorted((Path(__file__).resolve().parents[2] / "bags").glob("*.mcap"))

@@ -22,7 +22,7 @@ from ba_node.messages.conversion import input_message
 from ba_node.messages.topics import INPUT_TYPES
 from ba_node.offline.recording import TRUTH_TYPE, _true_pose
 from ba_node.offline.replay import replay
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 F = ROSBAGS_FACTORY
 

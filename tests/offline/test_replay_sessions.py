@@ -19,7 +19,7 @@ from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement, OfTime
 from ba_node.offline.recording import record
 from ba_node.offline.replay import replay
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 from tests.window.test_joining import CUT, N, small_eight, two_sessions
 
 S = 1_000_000_000

@@ -18,7 +18,7 @@ from ba_node.io.bag_reader import BagReader
 from ba_node.io.parameters import NODE_NAME
 from ba_node.offline.recording import record
 from ba_node.offline.view import ViewError, ViewOptions, serve, view
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 websocket = pytest.importorskip("tornado.websocket", reason="needs tornado")

@@ -15,7 +15,7 @@ from ba_node.estimate import Poses
 from ba_node.offline.figures import trajectory_figures
 from ba_node.offline.run_folder import Comparison
 from ba_node.offline.viewpoint import seen_from, upwards
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 N = 20
 WAY, STILL = np.linspace(0.0, 9.0, N), np.zeros(N)

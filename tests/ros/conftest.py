@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ba_node.ros.tools.domain import free_domain, isolation
+from experiments.demo.domain import free_domain, isolation
 from tests.ros.harness import Gates, NodeProcess, Peer
 
 

@@ -37,7 +37,7 @@ from ba_node.messages import conversion
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES, TOPICS, WHOLE_MAP
 from ba_node.ros import qos
 from ba_node.ros.message_factory import RclpyFactory, message_class
-from ba_node.synthetic import SyntheticData
+from experiments.synthetic import SyntheticData
 from tests.ros.zygote import name_of
 
 ROOT = Path(__file__).resolve().parents[2]

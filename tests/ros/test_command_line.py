@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from ba_node.config import Config
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 NO_ROS2 = shutil.which("ros2") is None or importlib.util.find_spec("ros2cli") is None
 pytestmark = [

@@ -21,7 +21,7 @@ from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.ros.components import silence
 from ba_node.ros.message_factory import message_class
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 

@@ -28,7 +28,7 @@ from ba_node.messages import conversion
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import OUTPUT_TYPES
 from ba_node.ros.message_factory import RclpyFactory, message_class
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.ros.harness import NodeProcess, Peer, solve_until_stopped
 
 pytestmark = pytest.mark.dds

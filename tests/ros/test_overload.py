@@ -14,7 +14,7 @@ from rcl_interfaces.srv import GetParameters
 
 from ba_node.core import solver
 from ba_node.estimate import Status
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 pytestmark = [pytest.mark.dds, pytest.mark.slow]
 

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.ros import qos
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 tf2 = pytest.importorskip("tf2_msgs.msg", reason="needs tf2_msgs: make setup", exc_type=ImportError)
 

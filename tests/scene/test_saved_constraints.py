@@ -28,7 +28,7 @@ from ba_node.scene import saved_constraints
 from ba_node.scene.constraints import Absolute, Constraints
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.scene.rejections import RejectionLog
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 from tests.window.street import replayed
 
 TURNED = geometry.quaternion_from_matrix(geometry.so3_exp(np.array([0.1, -0.2, 0.3])))

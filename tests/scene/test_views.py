@@ -8,7 +8,7 @@ import pytest
 from ba_node import native
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 
 @pytest.fixture(params=["C++", "numpy"])

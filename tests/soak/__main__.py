@@ -49,7 +49,7 @@ def _show(name: str, parts: Iterator[Part], timed: bool) -> list[str]:
 
 
 def _node(count: int) -> list[str]:
-    from ba_node.ros.tools.domain import free_domain, isolation  # noqa: PLC0415
+    from experiments.demo.domain import free_domain, isolation  # noqa: PLC0415
     from tests.ros.harness import NodeProcess, Peer  # noqa: PLC0415
 
     os.environ.update(isolation(free_domain()))

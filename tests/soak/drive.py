@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from experiments.robustness.faults.motion import stands_still
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 # Between keyframes: the default of SyntheticOptions.keyframe_rate_hz.
 _STEP_NS = 250_000_000

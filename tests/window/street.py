@@ -17,9 +17,9 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate
 from ba_node.measurements import GlobalFix, Keyframe, Measurement, RelativePose
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
-from ba_node.synthetic.world import Path as Motion
-from ba_node.synthetic.world import World
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic.world import Path as Motion
+from experiments.synthetic.world import World
 
 pymap3d = pytest.importorskip("pymap3d", reason="needs pymap3d")
 ORIGIN = (48.0, 11.0, 500.0)

@@ -29,8 +29,8 @@ from ba_node.measurements import (
     TrackMerge,
 )
 from ba_node.scene.map_content import MapContent, MapError
-from ba_node.synthetic import SyntheticData
 from ba_node.window import constraints
+from experiments.synthetic import SyntheticData
 from tests.window.street import (
     ANTENNA,
     aligned_rms,

@@ -12,8 +12,8 @@ from ba_node.config import Config
 from ba_node.core import geometry, methods, parameterisation, solver
 from ba_node.core.problem import Problem, State
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window import covariance, gauge
+from experiments.synthetic import SyntheticOptions, generate
 
 EXACT = dataclasses.replace(methods.options("auto"), gradient_tolerance=1e-9, function_tolerance=1e-12)
 

@@ -15,7 +15,7 @@ from ba_node.core import geometry
 from ba_node.estimate import Estimate
 from ba_node.measurements import GravityDirection, Keyframe, Measurement, RelativePose
 from ba_node.scene.constraints import joined_step
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.scene.small import check_links
 from tests.window.street import first, replayed
 

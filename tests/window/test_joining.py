@@ -17,7 +17,7 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement, TrackMerge
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 CUT, N = 20, 40
 FAR = np.uint64(10**6)

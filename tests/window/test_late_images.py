@@ -11,9 +11,9 @@ import pytest
 
 from ba_node.core import geometry
 from ba_node.core.calibration import Parameter
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
-from ba_node.synthetic.world import Path as Motion
-from ba_node.synthetic.world import World
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic.world import Path as Motion
+from experiments.synthetic.world import World
 from tests.window.street import replayed
 
 RATE, LATE_S = 5.0, 0.0208

@@ -16,10 +16,10 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window.moving import _mismatches, moving, much
 from ba_node.window.selection import Selection
 from experiments.robustness.faults import Recording, spoiled, without_outliers
+from experiments.synthetic import SyntheticOptions, generate
 
 # A loop of 30 m; the front-end is very good, or as it often is.
 DRIVE = {

@@ -18,10 +18,10 @@ from ba_node.estimate import Poses
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from ba_node.window import odometry, select
 from ba_node.window.selection import Selection
 from experiments.robustness.faults import spoiled
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 GOOD = {"drift_rotation_deg": 0.2, "drift_translation": 0.01}
 ON = Config()

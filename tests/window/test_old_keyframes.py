@@ -12,8 +12,8 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.core.marginal import MarginalPrior
 from ba_node.estimate import Estimate, Extras
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from ba_node.window.old_keyframes import Memory
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 N = 6
 

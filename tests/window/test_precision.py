@@ -12,8 +12,8 @@ import pytest
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate
-from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window import precision
+from experiments.synthetic import SyntheticOptions, generate
 
 
 def replayed(

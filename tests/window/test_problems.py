@@ -7,8 +7,8 @@ import pytest
 
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window.problems import part_of, problem_of, some_observations
+from experiments.synthetic import SyntheticOptions, generate
 
 
 @pytest.mark.parametrize("depth_share", [0.0, 0.5])

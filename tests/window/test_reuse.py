@@ -14,7 +14,7 @@ from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.measurements import FeatureTracks, Measurement
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 
 def with_slots(data: SyntheticData, slots: int) -> Iterator[Measurement]:

@@ -16,8 +16,8 @@ from ba_node.core import geometry, native_kernels, objective
 from ba_node.core.result import Result, Status
 from ba_node.measurements import FeatureTracks, Keyframe, Measurement
 from ba_node.scene.scene import Scene
-from ba_node.synthetic import SyntheticOptions, generate
 from ba_node.window.merging import _doubted
+from experiments.synthetic import SyntheticOptions, generate
 
 TRACKS = Config().tracks
 QUIET: dict[str, Any] = {

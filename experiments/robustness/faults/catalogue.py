@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.synthetic.generate import generate
-from ba_node.synthetic.options import SyntheticOptions
-from ba_node.synthetic.world import Path, World
 from experiments.robustness.faults import midway, motion, setup, stamps, tracks
 from experiments.robustness.faults.recording import Recording
+from experiments.synthetic.generate import generate
+from experiments.synthetic.options import SyntheticOptions
+from experiments.synthetic.world import Path, World
 
 Edit = Callable[[Recording, float, np.random.Generator], Recording]
 Motion = Callable[[World, Path, float], tuple[World, Path]]

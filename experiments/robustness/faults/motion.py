@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 
 from ba_node.core.geometry import so3_exp
-from ba_node.synthetic.world import Path, World
+from experiments.synthetic.world import Path, World
 
 # What dead reckoning errs by while the body stands: that of so many metres a keyframe.
 _STILL_M = 1e-3

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ba_node.core.geometry import matrix_from_quaternion
 from ba_node.estimate import Poses
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic.generate import SyntheticData
-from ba_node.synthetic.tracker import lenses
-from ba_node.synthetic.world import Path
+from experiments.synthetic.generate import SyntheticData
+from experiments.synthetic.tracker import lenses
+from experiments.synthetic.world import Path
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]

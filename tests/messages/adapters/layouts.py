@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from ba_node.arrays import FloatArray
 from ba_node.core import cameras, geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 ODOMETRY, CLOUD = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"

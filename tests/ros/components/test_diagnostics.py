@@ -16,7 +16,7 @@ from ba_node.core import solver
 from ba_node.core.result import Result, Status
 from ba_node.ros import qos
 from ba_node.ros.components.diagnostics import _resident_mb, _since
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 StartNode = Callable[..., Any]
 MakePeer = Callable[..., Any]

@@ -17,7 +17,7 @@ from ba_node.estimate import Transform
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 tf2 = pytest.importorskip("tf2_msgs.msg", reason="needs tf2_msgs: make setup", exc_type=ImportError)
 geometry_msgs = pytest.importorskip("geometry_msgs.msg")

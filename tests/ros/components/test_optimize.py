@@ -21,7 +21,7 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from ba_node.core.result import Status
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 

@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 from ba_node.estimate import Status
 from ba_node.io.map_file import read_map
 from ba_node.messages.topics import SERVICES
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 

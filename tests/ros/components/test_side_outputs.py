@@ -15,8 +15,8 @@ from ba_node.messages.topics import TOPICS
 from ba_node.ros import qos
 from ba_node.ros.components import publishing
 from ba_node.ros.message_factory import message_class
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
 from ba_node.window import view
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 

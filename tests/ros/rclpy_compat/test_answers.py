@@ -24,7 +24,7 @@ from rclpy.action import ActionClient
 from std_srvs.srv import SetBool, Trigger
 
 from ba_node.core.result import Status
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.ros.harness import NodeProcess, Peer
 
 pytestmark = pytest.mark.dds

@@ -15,7 +15,7 @@ from lifecycle_msgs.srv import GetState
 from ba_node.measurements import Keyframe
 from ba_node.messages.topics import INPUT_TYPES, OUTPUT_TYPES
 from ba_node.ros.components.publishing import Publishing
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.ros.harness import solve_until_stopped
 
 pytestmark = pytest.mark.dds

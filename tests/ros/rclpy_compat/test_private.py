@@ -19,7 +19,7 @@ from rclpy.action import ActionClient
 from ba_node.ros import parameters
 from ba_node.ros.rclpy_compat import actions, lifecycle, private
 from ba_node.ros.rclpy_compat.private import part
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 
 def test_a_part_that_is_missing_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ from ba_node.offline.replay import replay
 from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
 from ba_node.ros.tools.play import Listener, PlayError, PlayOptions, PlaySummary, play
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 MakePeer = Callable[..., Any]
 STEP_NS = 100_000_000

@@ -14,7 +14,7 @@ import pytest
 
 from ba_node.io.bag_reader import BagReader
 from ba_node.offline.recording import record
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 
 pytestmark = pytest.mark.dds
 BA = [sys.executable, "-m", "ba_node.cli.main"]

@@ -26,10 +26,9 @@ from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.offline.pictures import draw_trajectory
 from ba_node.offline.recording import read_truth
 from ba_node.offline.run_folder import Comparison
-from ba_node.ros.tools.domain import free_domain, isolation
-from ba_node.ros.tools.listen import NodeListener
+from experiments.demo.domain import free_domain, isolation
+from experiments.demo.listen import NodeListener
 
-SHIPPED = "stereo_loop.mcap"
 RATE = 2.0
 NODE = "/ba_node"
 NODE_MODULE = "ba_node.ros.main"
@@ -54,22 +53,6 @@ class Outcome:
     reports: list[Any]  # ``ba_msgs/SolverReport`` of every solve
     frame_id: str  # name of the frame of the refined poses and the map
     duration_s: float  # from the start of the node to its end
-
-
-def shipped_bag() -> Path:
-    """Return the recording that comes with the package, from the repository or from where it was installed.
-
-    Raises:
-        DemoError: there is none.
-    """
-    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
-    shares = [Path(prefix) / "share" / "ba_node" for prefix in prefixes if prefix]
-    folders = [folder / "bags" for folder in (Path(__file__).resolve().parents[2], *shares)]
-    found = [folder / SHIPPED for folder in folders if (folder / SHIPPED).is_file()]
-    if not found:
-        searched = ", ".join(map(str, folders))
-        raise DemoError(f"no {SHIPPED} in {searched}: name a recording with --bag, or make one with ba synth")
-    return found[0]
 
 
 def run(bag: Path, out: Path, say: Callable[[str], None]) -> Outcome:

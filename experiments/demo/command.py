@@ -12,32 +12,34 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ba_node.cli import interrupts
 from ba_node.cli.console import facts, table, write_result
+from ba_node.io.files import locked_folder
 
 if TYPE_CHECKING:
-    from ba_node.offline.demo import Outcome
+    from experiments.demo.demo import Outcome
 
 EXAMPLE = "ba demo --out out/demo"
+_SHIPPED = Path(__file__).resolve().parents[2] / "bags" / "stereo_loop.mcap"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
-    parser.add_argument(
-        "--bag", type=Path, metavar="BAG.mcap", help="a recording with ground truth (default: the one that is shipped)"
-    )
+    words = "a recording with ground truth (default: the one that is shipped)"
+    parser.add_argument("--bag", type=Path, default=_SHIPPED, metavar="BAG.mcap", help=words)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the demo."""
-    from ba_node.io.files import locked_folder  # noqa: PLC0415
-    from ba_node.offline.demo import run as run_demo  # noqa: PLC0415
-    from ba_node.offline.demo import shipped_bag, stop_processes, write  # noqa: PLC0415
+    from experiments.demo.demo import run as run_demo  # noqa: PLC0415
+    from experiments.demo.demo import stop_processes, write  # noqa: PLC0415
 
     interrupts.at_interrupt(stop_processes)
     with locked_folder(args.out):
-        outcome = run_demo(args.bag or shipped_bag(), args.out, lambda text: print(text, flush=True))
+        outcome = run_demo(args.bag, args.out, lambda text: print(text, flush=True))
         errors = write(outcome, args.out)
     rows = []
     for kind, unit in (("translation", "m"), ("rotation", "deg")):
@@ -60,8 +62,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _rows(outcome: Outcome) -> list[tuple[str, str]]:
-    import numpy as np  # noqa: PLC0415
-
     last = outcome.reports[-1]
     times_ms = 1e3 * np.array([report.solve_time_s for report in outcome.reports])
     waits_ms = 1e3 * np.array([report.queue_wait_s for report in outcome.reports])

@@ -13,8 +13,8 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import cameras
 from ba_node.core.geometry import matrix_from_quaternion, quaternion_from_matrix, so3_exp
 from ba_node.measurements import CameraRig
-from ba_node.synthetic.options import SyntheticOptions
-from ba_node.synthetic.world import Path, World
+from experiments.synthetic.options import SyntheticOptions
+from experiments.synthetic.world import Path, World
 
 # The camera looks along the body's x: its x (right) is -y of the body, its y (down) is -z (REP-103).
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

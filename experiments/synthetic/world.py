@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core.geometry import so3_exp
-from ba_node.synthetic.options import SyntheticOptions
+from experiments.synthetic.options import SyntheticOptions
 
 _WALL_HEIGHT = 3.0
 _BODY_HEIGHT = 1.2

@@ -12,24 +12,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import add_declared_options, declared_options, require_mcap, write_result
+from ba_node.cli.console import require_mcap, write_result
+from ba_node.offline.recording import record
+from experiments.command_options import add_declared_options, declared_options
+from experiments.synthetic import SyntheticOptions, generate
 
 EXAMPLE = "ba synth loop.mcap --seed 3 --keyframes 100 --outlier-share 0.1"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    from ba_node.synthetic import SyntheticOptions  # noqa: PLC0415
-
     parser.add_argument("target", type=Path, metavar="OUT.mcap")
     add_declared_options(parser, SyntheticOptions)
 
 
 def run(args: argparse.Namespace) -> int:
     """Generate."""
-    from ba_node.offline.recording import record  # noqa: PLC0415
-    from ba_node.synthetic import SyntheticOptions, generate  # noqa: PLC0415
-
     require_mcap(args.target)
     data = generate(SyntheticOptions(**declared_options(args, SyntheticOptions)))
     count = record(args.target, data.timeline(), data.truth)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make data with ground truth: what a front-end would publish in a known world."""
 
-from ba_node.synthetic.generate import SyntheticData, generate
-from ba_node.synthetic.options import SyntheticOptions
+from experiments.synthetic.generate import SyntheticData, generate
+from experiments.synthetic.options import SyntheticOptions
 
 __all__ = ["SyntheticData", "SyntheticOptions", "generate"]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ba_node.config import ConfigError, declared
 from ba_node.evaluation.metrics import absolute_error
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
-from ba_node.synthetic import SyntheticData, SyntheticOptions, generate
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 FloatArray = NDArray[np.float64]
 

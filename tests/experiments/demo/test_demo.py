@@ -16,9 +16,9 @@ from ba_node.io.trajectory import read_tum
 from tests.ply import read_ply
 
 pytest.importorskip("ba_msgs")
-demo = pytest.importorskip("ba_node.offline.demo", reason="needs ROS 2")
+demo = pytest.importorskip("experiments.demo.demo", reason="needs ROS 2")
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def run_demo(out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -61,4 +61,4 @@ def test_a_node_that_fails_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.setenv(name, os.environ.get(name, ""))
     with pytest.raises(demo.DemoError, match=r"broken_node ended with code 3: .*node.log: no such luck"):
-        demo.run(demo.shipped_bag(), tmp_path / "out", lambda _: None)
+        demo.run(ROOT / "bags" / "stereo_loop.mcap", tmp_path / "out", lambda _: None)

@@ -13,9 +13,9 @@ from ba_node.arrays import FloatArray, IdArray, IntArray
 from ba_node.core.geometry import compose, inverse, quaternion_from_matrix, so3_exp
 from ba_node.estimate import Poses
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.synthetic.options import SyntheticOptions
-from ba_node.synthetic.tracker import Lens, Tracker, build_rig, lenses
-from ba_node.synthetic.world import Path, World, build
+from experiments.synthetic.options import SyntheticOptions
+from experiments.synthetic.tracker import Lens, Tracker, build_rig, lenses
+from experiments.synthetic.world import Path, World, build
 
 START_NS = 1_700_000_000_000_000_000
 FIXED_FRAME = "odom"
