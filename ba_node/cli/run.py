@@ -12,8 +12,12 @@ to be looked at, which is said in a line of its own.
 from __future__ import annotations
 
 import argparse
+import json
+import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ba_node.cli import check, replay, track
 from ba_node.cli.console import add_parameter_options, progress_bar, write_result
@@ -52,9 +56,21 @@ def run(args: argparse.Namespace) -> int:
     codes.append(_call(replay, [str(tracks), "--out", str(args.out), "--final-optimize", *page, *parameters]))
     # Too little to check is no fault of what was tracked.
     codes[1] = 0 if codes[1] == check.TOO_LITTLE else codes[1]
+    _tell_again(args.out / "report.json", report)
     by_name = dict(zip(("track", "check", "replay"), codes, strict=True))
     write_result(args.json, {"track": report, "exit_codes": by_name})
     return max(codes, key=lambda code: (code == 2, code))
+
+
+def _tell_again(path: Path, tracked: Mapping[str, Any]) -> None:
+    """Say last, and in report.json, what was wrong with the images, as all after them stands on it."""
+    from ba_node.io.files import write_json  # noqa: PLC0415
+
+    for note in track.attention(tracked):
+        print(f"ba: warning: tracking: {note}", file=sys.stderr)
+    if path.is_file():
+        told = {name: tracked[name] for name in ("mode", "images", "states", "left_out", "causes", "notes")}
+        write_json(path, json.loads(path.read_text()) | {"tracking": told})
 
 
 def _call(command: object, words: list[str]) -> int:

@@ -14,6 +14,7 @@ from ba_node.estimate import Cloud, Poses, Transform
 from ba_node.front_end import opencv
 from ba_node.front_end.checks import ImageWatch
 from ba_node.front_end.frame import Frame
+from ba_node.front_end.odometry import OdometryWatch
 from ba_node.front_end.records import FrontEndError, Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig, ideal_rig
 from ba_node.front_end.session import Session
@@ -84,6 +85,7 @@ class FrontEnd:
         self._mask, self._fixed_frame = mask, fixed_frame
         self._watch = ImageWatch(rig, self.options)
         self._notes: list[str] = []
+        self._odometry = OdometryWatch(lambda cause, words: self._watch.say(cause, words, self._notes))
         self._ideal: IdealRig | None = None
         self._allowed: BoolArray = np.ones((0, 0), bool)
         if rig.image_size.all():
@@ -136,6 +138,8 @@ class FrontEnd:
         """
         self._notes = []
         told = self._process(images, odometry)
+        if odometry is not None:
+            self._hold_against(odometry, told)
         return dataclasses.replace(told, notes=tuple(self._notes))
 
     def refine(self, poses: Poses, cloud: Cloud | None = None) -> None:
@@ -146,6 +150,13 @@ class FrontEnd:
         """
         if self._session is not None:
             self._session.refine(poses, cloud)
+
+    def _hold_against(self, odometry: Transform, told: Tracked) -> None:
+        """Hold the odometry of an image against what came of it."""
+        self._odometry.image(told.stamp_ns, odometry, stands=told.state is State.STANDING)
+        if told.keyframe is not None and self._session is not None and self._ideal is not None:
+            step = self._session.step
+            self._odometry.keyframe(told.stamp_ns, odometry, step, self._ideal.body_from_camera)
 
     def _process(self, images: Images, odometry: Transform | None) -> Tracked:
         last_ns = self._stamp_ns
@@ -277,6 +288,7 @@ class FrontEnd:
         if self._session is not None:
             self._turn = self._session.tracker.alignment.turn
         self._session = None
+        self._odometry.forget()
 
     def _end(self, why: str) -> None:
         """End the session, if there is one."""

@@ -13,6 +13,7 @@ from ba_node.core import geometry
 from ba_node.estimate import Cloud, Poses, Transform
 from ba_node.front_end import covariance
 from ba_node.front_end.frame import Frame
+from ba_node.front_end.odometry import Step, step_of
 from ba_node.front_end.records import Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig
 from ba_node.front_end.tracking import Content, Found, Tracker
@@ -46,6 +47,7 @@ class Session:
         self._waiting_ns = 0
         self._fixed_from_map = _IDENTITY  # changes when the map is refined, so that published poses do not
         self._odometry = odometry  # at the last image that had a pose
+        self.step: Step | None = None  # to the last keyframe as images alone see it, where there is an odometry
         self.keyframes = 0
         self._known_id = 0  # points up to this id were told as guesses
 
@@ -105,8 +107,17 @@ class Session:
         if still or not sure:
             state = State.STANDING if shift < _STANDS_PX else State.TRACKING
             return self.told(state, images, found, odometry)
+        before = self.tracker.last
         content, refined = self.tracker.keyframe(self.keyframes + 1)
+        if odometry is not None and before is not None:
+            self.step = self.tracker.seen_step if self.tracker.given else self._measured_step(*before, content)
         return self._keyframe(images, content, (), refined or found, odometry)
+
+    def _measured_step(self, before: Content, there: Transform, content: Content) -> Step:
+        """Return the step from a keyframe to the last image, where depths tell both poses."""
+        _, i, j = np.intersect1d(before.track_id, content.track_id, return_indices=True)
+        motion = self.tracker.pose.after(there.inverse())
+        return step_of(self._ideal, motion, before.uv[i], content.uv[j], has_length=True)
 
     def _expected(self, odometry: Transform | None) -> Transform:
         """Return camera from map as foretold, by odometry or by going on as before."""

@@ -29,6 +29,8 @@ RECTIFIED = "image_rect"
 MAX_APART_NS = 50_000_000
 # A pose so near is that of a time; stamps are rounded in files. Between poses further apart nothing is known.
 _SAME_NS, _GAP_NS = 100_000, 1_000_000_000
+# Poses between others so far apart miss what a vehicle does there.
+_SPARSE_NS = 300_000_000
 
 
 class Frame(NamedTuple):
@@ -130,6 +132,7 @@ class OdometryBuffer:
 
     def __init__(self, keep: int = 2000) -> None:
         self._keep = keep
+        self._widest_ns = 0  # between poses of which one between was asked for
         self._stamps: list[int] = []
         self._poses: list[Transform] = []
 
@@ -146,6 +149,14 @@ class OdometryBuffer:
         if len(self._stamps) > self._keep:
             del self._stamps[: self._keep // 2], self._poses[: self._keep // 2]
 
+    @property
+    def sparse(self) -> str:
+        """Return in words that poses were too far apart for those between that were asked for; empty if not."""
+        if self._widest_ns <= _SPARSE_NS:
+            return ""
+        apart = f"the odometry's poses are up to {self._widest_ns / 1e9:.2f} s apart"
+        return f"{apart}: images between have them on a straight way at even speed; give it at 10 Hz or more"
+
     def covers(self, stamp_ns: int) -> bool:
         """Return True if no later pose is needed to tell the one at a time."""
         return bool(self._stamps) and self._stamps[-1] >= stamp_ns
@@ -158,6 +169,7 @@ class OdometryBuffer:
                 return self._poses[near]
         if i in (0, len(self._stamps)) or self._stamps[i] - self._stamps[i - 1] > _GAP_NS:
             return None
+        self._widest_ns = max(self._widest_ns, self._stamps[i] - self._stamps[i - 1])
         before, after = self._poses[i - 1], self._poses[i]
         share = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
         turn = geometry.so3_log((before.rotation.T @ after.rotation)[None])[0]

@@ -24,6 +24,7 @@ from ba_node.front_end.covariance import Lengths
 from ba_node.front_end.depths import Depths, measure_depths
 from ba_node.front_end.frame import Frame
 from ba_node.front_end.local_map import LocalMap, Warp
+from ba_node.front_end.odometry import Step, step_of
 from ba_node.front_end.rectify import IdealRig
 
 # Correlation of a patch and what is found for it, below which it is another thing; and of one that was lost.
@@ -70,7 +71,7 @@ class Tracker:
         self.side = options.patch_px | 1
         self.map = LocalMap(rig, self.side)
         self.alignment = StereoAlignment(rig, options.stereo_yaw_px, options.stereo_roll_px)
-        self._last: tuple[Content, Transform] | None = None  # of the last keyframe, with its pose
+        self.last: tuple[Content, Transform] | None = None  # of the last keyframe, with its pose
         self.rows: IntArray = np.empty(0, np.intp)  # points that are followed
         self.uv = np.empty((0, 2))  # where they are in the last image
         self.frame: Frame | None = None
@@ -79,6 +80,7 @@ class Tracker:
         self.given = False  # True where poses come from an odometry
         self.lengths = Lengths()  # of its steps
         self.shared = 0  # features of the last keyframe
+        self.seen_step: Step | None = None  # to it, as one camera sees it without the odometry
 
     @property
     def scene_inverse_depth(self) -> float:
@@ -204,8 +206,8 @@ class Tracker:
             self.map.rotation[place], self.map.position[place] = new.rotation, new.translation
         if last is not None:
             self.pose = self.pose.after(last.inverse())
-            if self._last is not None:
-                self._last = self._last[0], self.keyframe_pose
+            if self.last is not None:
+                self.last = self.last[0], self.keyframe_pose
         return last
 
     def keyframe(self, keyframe_id: int) -> tuple[Content, Found | None]:
@@ -243,16 +245,16 @@ class Tracker:
         content = Content(self.map.track_id[rows], uv, told, depths, added)
         if self.options.stereo_align and depths.measures and frame.right is not None:
             self._learn(content)
-        self._last = content, self.pose
+        self.last = content, self.pose
         new = self.map.forget()
         self.rows = new[self.rows]
         return content, found
 
     def _learn(self, content: Content) -> None:
         """Learn from the last two keyframes how the second camera is turned, and put the map right by that."""
-        if self._last is None:
+        if self.last is None:
             return
-        before, pose_before = self._last
+        before, pose_before = self.last
         _, i, j = np.intersect1d(before.track_id, content.track_id, return_indices=True)
         seen = before.depths.found[i]
         i, j = i[seen], j[seen]
@@ -313,13 +315,15 @@ class Tracker:
 
     def _agree_in_pairs(self) -> None:
         """Let go features that do not move as the others since the last keyframe: epipolar geometry, by consensus."""
-        if self._last is None:
+        self.seen_step = None
+        if self.last is None:
             return
-        before = self._last[0]
+        before = self.last[0]
         _, i, j = np.intersect1d(before.track_id, self.map.track_id[self.rows], return_indices=True)
         found = pose.relative(self.rig, before.uv[i], self.uv[j], _EPIPOLAR_PX)
         if found is None or found[1].mean() < 0.5:
             return
+        self.seen_step = step_of(self.rig, found[0], before.uv[i][found[1]], self.uv[j][found[1]], has_length=False)
         keep = np.ones(len(self.rows), bool)
         keep[j[~found[1]]] = False
         self.rows, self.uv, self.sigma = self.rows[keep], self.uv[keep], self.sigma[keep]

@@ -124,18 +124,29 @@ def _names(folder: Path) -> list[str]:
 
 def _listed(folder: Path, facts: dict[str, Any]) -> BagFiles:
     storage, packing = facts.get("storage_identifier"), str(facts.get("compression_format") or "")
-    if storage not in _KNOWN:
+    names = _names_in(facts)
+    if storage and storage not in _KNOWN:  # without one the files tell
         raise BagError(f"{folder}: storage {storage!r} is not read: convert it with ros2 bag convert to mcap")
     if packing not in ("", "zstd"):
         raise BagError(f"{folder}: compression_format {packing!r} is not read: unpack it, or record with zstd or none")
-    names = _names_in(facts)
     found = {name: _there(folder / name) for name in names}
     files = [file for file in found.values() if file is not None]
     missing = [name for name, file in found.items() if file is None]
     if not files:
         raise BagError(f"{folder}: none of the files that its {METADATA} lists is there: {_shown(missing)}")
     text = f"{folder}: {len(missing)} of its {len(names)} files are missing: {_shown(missing)}: results have gaps"
-    return BagFiles(files, True, {"missing_files": text} if missing else {})
+    warnings = {"missing_files": text} if missing else {}
+    parts = {_base_name(file) for file in files}
+    taken = {name.removesuffix(PACKED) for name in names}
+    more = [
+        file.name
+        for file in _recordings_in(folder)
+        if _base_name(file) in parts and file.name.removesuffix(PACKED) not in taken
+    ]
+    if more:
+        text = f"{folder}: its {METADATA} does not list {_shown(more)}: left aside; take it away to read all files"
+        warnings["unlisted_files"] = text
+    return BagFiles(files, True, warnings)
 
 
 def _there(path: Path) -> Path | None:
@@ -146,10 +157,15 @@ def _there(path: Path) -> Path | None:
 
 def _in_folder(folder: Path) -> list[Path]:
     """Return the recordings in a folder, by number and name; what is there packed and unpacked once."""
+    files = _recordings_in(folder)
+    if not files:
+        raise BagError(f"{folder}: no recording in this folder: expected .mcap or .db3 files, as ros2 bag writes them")
+    return files
+
+
+def _recordings_in(folder: Path) -> list[Path]:
     files = [f for f in folder.iterdir() if f.is_file() and f.name.removesuffix(PACKED).endswith(STORAGES)]
     by_name = {f.name.removesuffix(PACKED): f for f in sorted(files, key=lambda f: f.suffix == PACKED, reverse=True)}
-    if not by_name:
-        raise BagError(f"{folder}: no recording in this folder: expected .mcap or .db3 files, as ros2 bag writes them")
     return [by_name[name] for name in sorted(by_name, key=_natural)]
 
 

@@ -209,8 +209,9 @@ class BagReader:
             missing.append(" or ".join(CAMERA_TYPES))
         if missing:
             listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there)) or "none"
+            lost = "".join(f"; {words}" for words in self.warnings.values())
             raise BagError(
-                f"{self.path}: no topic of type {', and none of type '.join(missing)}; in the recording: {listed}"
+                f"{self.path}: no topic of type {', and none of type '.join(missing)}; in the recording: {listed}{lost}"
             )
         return chosen
 
@@ -279,21 +280,21 @@ class BagReader:
     def _check(self, number: int) -> None:
         channel = self._channels[number]
         where = f"{self.path}: topic {channel.topic}"
-        if channel.encoding != ("cdr", "ros2msg"):
-            messages, definitions = channel.encoding
+        messages, definitions = channel.encoding
+        if messages != "cdr" or definitions not in ros_types.LANGUAGES:
             raise BagError(
                 f"{where}: messages in {messages!r}, definitions in {definitions!r}:"
-                " expected 'cdr' and 'ros2msg', as ROS 2 records them"
+                f" expected 'cdr' and {' or '.join(map(repr, ros_types.LANGUAGES))}, as ROS 2 records them"
             )
         try:
-            ros_types.check_definition(channel.type_name, channel.definition)
+            ros_types.check_definition(channel.type_name, channel.definition, definitions)
         except TypeMismatchError as error:
             raise BagError(f"{where}: {error}") from error
 
     def _decoder(self, number: int) -> Callable[[bytes], Any]:
         if number not in self._decoders:
             channel = self._channels[number]
-            self._decoders[number] = ros_types.decoder(channel.type_name, channel.definition)
+            self._decoders[number] = ros_types.decoder(channel.type_name, channel.definition, channel.encoding[1])
         return self._decoders[number]
 
     def _reject(self, path: Path, reason: str, words: str) -> None:

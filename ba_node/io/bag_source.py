@@ -17,7 +17,7 @@ from rosbags.interfaces import MessageDefinitionFormat, QosDurability
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from ba_node.io import ros_types
-from ba_node.io.bag_topics import BagError, EmptyBagError
+from ba_node.io.bag_topics import BagError, EmptyBagError, absolute
 from ba_node.io.files import FileKindError, open_regular
 from ba_node.io.mcap_index import BagIndex, Message, read_index, read_messages
 
@@ -34,7 +34,7 @@ class BagChannel:
     """Messages of one topic and type in one file."""
 
     id: int  # in its file
-    topic: str  # full name
+    topic: str  # full name, with the slash that other writers leave out
     type_name: str  # ``package/msg/Type``; empty if the file does not say
     encoding: tuple[str, str]  # of messages and of definitions, as the file names them
     definition: str  # of the type
@@ -87,7 +87,7 @@ def _mcap_channel(index: BagIndex, channel: Channel) -> BagChannel:
     schema = index.schemas.get(channel.schema_id)
     return BagChannel(
         channel.id,
-        channel.topic,
+        absolute(channel.topic),
         "" if schema is None else ros_types.full_name(schema.name),
         (channel.message_encoding, "" if schema is None else schema.encoding),
         "" if schema is None else schema.data.decode("utf-8", errors="replace"),
@@ -137,4 +137,5 @@ def _sqlite_channel(connection: Any) -> BagChannel:
         definition = ros_types.schema_text(type_name)
     encoding = (connection.ext.serialization_format, kind)
     latched = any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in connection.ext.offered_qos_profiles)
-    return BagChannel(connection.id, connection.topic, type_name, encoding, definition, connection.msgcount, latched)
+    topic = absolute(connection.topic)
+    return BagChannel(connection.id, topic, type_name, encoding, definition, connection.msgcount, latched)

@@ -34,6 +34,8 @@ MAX_WAITING_BYTES = 2**29
 
 # opcode (1 byte) and length (8 bytes) in front of every record
 _HEAD = struct.Struct("<BQ")
+# smallest log time in front of a chunk's content
+_START = struct.Struct("<Q")
 # channel, number, log time, publish time in front of a message's bytes
 _MESSAGE = struct.Struct("<HIQQ")
 # How files begin that are taken for a recording -> what to do with them.
@@ -186,7 +188,9 @@ def _from_summary(stream: IO[bytes], size: int) -> BagIndex | None:
         for c in summary.chunk_indexes
     ]
     schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
-    whole = all(block.offset + block.length <= size for block in blocks)
+    counted = sum(summary.statistics.channel_message_counts.values()) == summary.statistics.message_count
+    listed = len(blocks) == summary.statistics.chunk_count
+    whole = counted and listed and all(_is_there(stream, block, size) for block in blocks)
     if not whole or not used <= summary.channels.keys() or not schemas <= summary.schemas.keys():
         return None
     if not summary.channels:
@@ -199,6 +203,18 @@ def _from_summary(stream: IO[bytes], size: int) -> BagIndex | None:
         Counter(summary.statistics.channel_message_counts),
         max(c.message_end_time for c in summary.chunk_indexes),
     )
+
+
+def _is_there(stream: IO[bytes], block: Block, size: int) -> bool:
+    """Return True if a chunk begins and ends where the index of a file of so many bytes says."""
+    if block.offset + block.length > size:
+        return False
+    stream.seek(block.offset)
+    head = stream.read(_HEAD.size + _START.size)
+    if len(head) < _HEAD.size + _START.size:
+        return False
+    found = _HEAD.unpack_from(head), _START.unpack_from(head, _HEAD.size)
+    return found == ((Opcode.CHUNK, block.length - _HEAD.size), (block.start_ns,))
 
 
 def _place(block: Block) -> tuple[int, int]:

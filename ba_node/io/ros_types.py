@@ -9,6 +9,7 @@ definitions, and is decoded by them: fields that a later version adds do no harm
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 # Fields of the inputs that nothing here reads, so that a recording may have them otherwise, and those it may lack.
@@ -24,7 +25,11 @@ _UNREAD = frozenset({"covariance", "r", "p"})
 _OPTIONAL = frozenset({"binning_x", "binning_y", "roi"})
 _LISTS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 _TEXTS = ("string", "wstring")
+# Second byte of messages in CDR, big and little endian; empty ones are the decoder's to refuse.
+_PLAIN_CDR = (b"", b"\0", b"\1")
 
+# Languages of definitions; recorders write the second where they do not find a package's .msg files.
+MSG, IDL = LANGUAGES = ("ros2msg", "ros2idl")
 # What a definition in a recording may be: code is made of it, for each field and each entry of an array of messages.
 MAX_DEFINITION_BYTES = 2**18
 MAX_DEFINITION_LINES = 4000
@@ -99,24 +104,24 @@ def full_name(type_name: str) -> str:
     return type_name if "/" in rest or not rest else f"{package}/msg/{rest}"
 
 
-def decoder(type_name: str, text: str) -> Callable[[bytes], Any]:
-    """Return a function that decodes messages of a definition that came with a recording.
+def decoder(type_name: str, text: str, language: str = MSG) -> Callable[[bytes], Any]:
+    """Return a function that decodes messages of a definition that came with a recording, in one of LANGUAGES.
 
     Raises:
         TypeMismatchError: the definition cannot be read.
     """
-    return functools.partial(_decode, _store_of(type_name, text), type_name)
+    return functools.partial(_decode, _store_of(type_name, text, language), type_name)
 
 
-def check_definition(type_name: str, text: str) -> None:
+def check_definition(type_name: str, text: str, language: str = MSG) -> None:
     """Raise TypeMismatchError if a recording's definition of an input lacks a field or has it of another type."""
-    wrong = list(_differences(type_name, _store_of(type_name, text)))
+    wrong = list(_differences(type_name, _store_of(type_name, text, language)))
     if wrong:
         raise TypeMismatchError(f"{'; '.join(wrong)}: record it with the current message definitions")
 
 
 @functools.lru_cache(maxsize=64)
-def _store_of(type_name: str, text: str) -> Typestore:
+def _store_of(type_name: str, text: str, language: str) -> Typestore:
     store = Typestore()
     size, lines = len(text), text.count("\n")
     if size > MAX_DEFINITION_BYTES or lines > MAX_DEFINITION_LINES:
@@ -125,7 +130,7 @@ def _store_of(type_name: str, text: str) -> Typestore:
             f" in {MAX_DEFINITION_LINES}: record the message without fields that are not its own"
         )
     try:
-        definitions = get_types_from_msg(text, type_name)
+        definitions = _types_in(type_name, text.replace("\r\n", "\n"), language)
         count = _expanded(definitions, type_name)
         if count <= MAX_FIELDS:
             store.register(definitions)
@@ -138,6 +143,16 @@ def _store_of(type_name: str, text: str) -> Typestore:
             f" are up to {MAX_FIELDS}: record the message without fields that are not its own"
         )
     return store
+
+
+def _types_in(type_name: str, text: str, language: str) -> dict[str, Any]:
+    if language == MSG:
+        return get_types_from_msg(text, type_name)
+    found: dict[str, Any] = {}
+    without_includes = re.sub(r"^[ \t]*#.*$", "", text, flags=re.MULTILINE)
+    for part in re.split(r"^=+\nIDL: .*\n", without_includes, flags=re.MULTILINE):
+        found |= get_types_from_idl(part) if part.strip() else {}
+    return found
 
 
 def _expanded(definitions: Mapping[str, Any], type_name: str, depth: int = 0) -> int:
@@ -157,6 +172,10 @@ def _expanded(definitions: Mapping[str, Any], type_name: str, depth: int = 0) ->
 
 
 def _decode(store: Typestore, type_name: str, data: bytes) -> Any:
+    if data[:1] == b"\0" and data[1:2] not in _PLAIN_CDR:
+        raise ValueError(
+            f"serialised as {data[:2].hex()}, another form of CDR: expected 0000 or 0001, as ROS 2 writes it"
+        )
     return store.deserialize_cdr(data, type_name)
 
 

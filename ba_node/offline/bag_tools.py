@@ -7,7 +7,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,8 +82,16 @@ def examine(path: Path | Sequence[Path], choice: TopicChoice, progress: Progress
         for topic, kind in reader.topics.items():
             facts.topics.setdefault(topic, TopicFacts(kind))
         _use(reader, facts)
-        facts.attention += [*reader.warnings.values(), *reader.rejection_notes]
+        facts.attention += [*reader.warnings.values(), *_shortened(list(reader.rejection_notes), reader.rejected)]
     return facts
+
+
+def _shortened(notes: list[str], rejected: Mapping[str, int]) -> list[str]:
+    """Return the first of many notes, and how many were turned away in all."""
+    if len(notes) <= _TOLD:
+        return notes
+    counts = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
+    return [*notes[: _TOLD - 1], f"turned away in all: {counts}"]
 
 
 def _use(reader: BagReader, facts: RecordingFacts) -> None:

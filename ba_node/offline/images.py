@@ -81,6 +81,7 @@ class ImageSource:
     read: Callable[[], Iterator[tuple[Images, Transform | None]]]  # images, and the odometry of their time if there is
     counted: Counter[str] = field(default_factory=Counter)  # images left out, by reason
     notes: dict[str, str] = field(default_factory=dict)  # the last words on each reason
+    warnings: dict[str, str] = field(default_factory=dict)  # what is wrong though no image was left out, by kind
 
 
 @contextlib.contextmanager
@@ -184,6 +185,8 @@ def _paired(
     source.counted.update(streams.counted)
     for name, apart_ns in streams.apart_ns.items():
         source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+    if poses is not None and poses.sparse:
+        source.warnings["sparse odometry"] = poses.sparse
 
 
 def _messages(
@@ -205,8 +208,8 @@ def _messages(
         child, body = str(message.child_frame_id), source.rig.frame_id
         place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
         if place is None:
-            words = f"it is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
-            source.counted["odometry of another frame"], source.notes["odometry of another frame"] = 1, words
+            words = f"the odometry is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
+            source.warnings["odometry of another frame"] = words
         poses.add(stamp_ns, pose if place is None else pose.after(place))
 
 

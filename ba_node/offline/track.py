@@ -106,6 +106,7 @@ class _Run:
         for done, (images, odometry) in enumerate(self.source.read(), start=1):
             self._take(images, odometry)
             progress(done, self.source.total)
+        self.notes += self.source.warnings.values()
         left = _left_out(self.source)
         if left:
             self.notes.append(left)

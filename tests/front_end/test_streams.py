@@ -95,3 +95,13 @@ def test_odometry_begins_anew_when_time_goes_back() -> None:
     assert found is not None and found.translation[0] == pytest.approx(150.0)
     buffer.add(190 * MS, Transform(np.eye(3), np.zeros(3)))  # out of order: passed over
     assert buffer.covers(200 * MS)
+
+
+@pytest.mark.parametrize(("apart_s", "words"), [(0.1, ""), (0.5, "up to 0.50 s apart")])
+def test_an_odometry_that_comes_seldom_is_said(apart_s: float, words: str) -> None:
+    buffer = OdometryBuffer()
+    for i in range(4):
+        buffer.add(round(1e9 * apart_s * i), Transform(np.eye(3), np.array([float(i), 0.0, 0.0])))
+    assert buffer.at(round(1e9 * apart_s)) is not None and buffer.sparse == "", "no pose between others"
+    assert buffer.at(round(1.4e9 * apart_s)) is not None
+    assert words in buffer.sparse and bool(words) == bool(buffer.sparse)

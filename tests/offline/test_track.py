@@ -98,6 +98,27 @@ def test_mask_and_odometry_file(pictures: Path, tmp_path: Path, capsys: pytest.C
     assert "the scale is free" in capsys.readouterr().out
 
 
+def test_an_odometry_in_millimetres_is_said_last_and_in_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [
+        " ".join(
+            map(str, [1.0 + 0.1 * i, *(1000.0 * pose.translation), *geometry.quaternion_from_matrix(pose.rotation)])
+        )
+        for i, pose in enumerate(world.drive(24))
+    ]
+    (tmp_path / "odometry.tum").write_text("\n".join(lines))
+    source, out = tmp_path / "pictures", tmp_path / "out"
+    write_pictures(source, world.drive(24))
+    assert (
+        main(["run", str(source), "--out", str(out), "--no-report", "--odometry", str(tmp_path / "odometry.tum")]) == 3
+    )
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("ba: warning: tracking: the odometry's steps are") and "millimetres" in last
+    told = json.loads((out / "report.json").read_text())["tracking"]
+    assert told["causes"]["odometry_unit"] >= 1 and told["states"] == {"tracking": 24}
+
+
 @pytest.mark.parametrize(
     ("extra", "words"),
     [

@@ -287,6 +287,8 @@ class FrontEndNode(ManagedNode):
             self.counted[reason] += 1
             self._warn(reason, f"{reason} for {self.counted[reason]} images")
             return
+        if self._odometry.sparse:
+            self._warn("sparse", self._odometry.sparse)
         tracked = front_end.process(images_of(frame, self._mode), odometry)
         self.counted["images"] += 1
         for note in tracked.notes:
