@@ -247,11 +247,11 @@ class NativeSystem:
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
+        if asked == "dense" or (asked in ("auto", "cholesky") and self.unknowns <= linear_costs.FEW_UNKNOWNS):
+            return LinearSolver("dense", linear_costs.describe("dense", self.unknowns, None, None))
         sizes = self.sizes()
         if asked == "pcg":
             return self._pcg(sizes)
-        if asked == "dense":
-            return LinearSolver(asked, linear_costs.describe(asked, self.unknowns, None, None))
         exact = asked == "cholesky"
         limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=exact)
         factor = self.factor_size(linear_costs.max_blocks(sizes.block), limit)
@@ -270,7 +270,7 @@ class NativeSystem:
 
     def pcg_tries(self) -> int:
         """Return how many steps of PCG to try before an exact solution."""
-        return linear_costs.pcg_tries(self.sizes())
+        return 0 if self.unknowns <= linear_costs.FEW_UNKNOWNS else linear_costs.pcg_tries(self.sizes())
 
     def factor_size(self, max_blocks: int, max_products: float) -> Factor:
         """Return the size of the sparse factor; found at the first call with limits that it meets."""

@@ -125,7 +125,7 @@ def to_problem(bal: BalProblem) -> Problem:
     """
     n = len(bal.observations)
     # What is sorted already is not copied: it may be most of the memory of a large problem.
-    is_sorted = bool((bal.point_index[1:] >= bal.point_index[:-1]).all())
+    is_sorted = bool(np.logical_and.reduce(bal.point_index[1:] >= bal.point_index[:-1]))
     order = slice(None) if is_sorted else np.argsort(bal.point_index, kind="stable")
     params = np.zeros((1, 12))
     params[0, :2] = 1.0
@@ -135,7 +135,7 @@ def to_problem(bal: BalProblem) -> Problem:
         ),
         fixed=np.zeros(len(bal.cameras), dtype=bool),
         cameras=Cameras(
-            rotation=np.diag([1.0, -1.0, -1.0])[None],
+            rotation=np.array([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]]),
             translation=np.zeros((1, 3)),
             model=np.array([Model.RATIONAL], dtype=np.uint8),
             params=params,
