@@ -140,6 +140,11 @@ def max_products(sizes: Sizes, *, exact: bool = False) -> float:
     """Return from how many block products on the sparse factor is not the cheapest way."""
     low, high = 1.0, max(sizes.unknowns / sizes.block, 1.0) ** 3
     dense, form = dense_s(sizes), _form_s(sizes)
+    # PCG is charged less for a map that a factor with more products spans: if not even that is less than a dense S, it
+    # never is.
+    as_dense = max((dense - form) * _SPARSE_FLOPS / (2.0 * sizes.block**3), low)
+    if as_dense < high and (exact or pcg_s(sizes, as_dense) >= dense):
+        return as_dense
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
         others = min(dense, math.inf if exact else pcg_s(sizes, middle)) - form

@@ -187,6 +187,7 @@ class NativeSystem:
         # These are written in every iteration; right-hand side and S only where they are asked for.
         self._x, self._rhs, self._dense = np.empty(n), np.empty(n), np.empty((0, 0))
         self._has_rhs = False
+        self._sizes: Sizes | None = None
         # S, and where its blocks on and above the diagonal go, and their transposes, -1 for those of the diagonal.
         self._sparse: tuple[scipy.sparse.bsr_matrix, IntArray, IntArray] | None = None
 
@@ -241,9 +242,10 @@ class NativeSystem:
         return matrix
 
     def sizes(self) -> Sizes:
-        """Return what each linear solver would have to do."""
-        edges, pairs = self._kernel.pairs()
-        return Sizes(self.unknowns, self._size, edges, pairs)
+        """Return what each linear solver would have to do, which no iteration changes."""
+        if self._sizes is None:
+            self._sizes = Sizes(self.unknowns, self._size, *self._kernel.pairs())
+        return self._sizes
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
