@@ -42,6 +42,9 @@ _WORTH_A_TRY = 15
 # And only where the map is so many tracks long at most: on longer ones PCG ends after a step or two by a residual of
 # which the weak modes are next to nothing, and iteration after iteration gains next to nothing too.
 _TRIED_STRETCHES = 4.0
+# Up to so many unknowns S is factored as a dense matrix, in a few microseconds at most; to count what else there is
+# takes longer. At these sizes a try of PCG is never worth it.
+FEW_UNKNOWNS = 64
 # No factor may take more memory than this.
 MAX_BYTES = 4.8e9
 
@@ -137,6 +140,11 @@ def max_products(sizes: Sizes, *, exact: bool = False) -> float:
     """Return from how many block products on the sparse factor is not the cheapest way."""
     low, high = 1.0, max(sizes.unknowns / sizes.block, 1.0) ** 3
     dense, form = dense_s(sizes), _form_s(sizes)
+    # PCG is charged less for a map that a factor with more products spans: if not even that is less than a dense S, it
+    # never is.
+    as_dense = max((dense - form) * _SPARSE_FLOPS / (2.0 * sizes.block**3), low)
+    if as_dense < high and (exact or pcg_s(sizes, as_dense) >= dense):
+        return as_dense
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
         others = min(dense, math.inf if exact else pcg_s(sizes, middle)) - form

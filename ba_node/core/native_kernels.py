@@ -187,6 +187,7 @@ class NativeSystem:
         # These are written in every iteration; right-hand side and S only where they are asked for.
         self._x, self._rhs, self._dense = np.empty(n), np.empty(n), np.empty((0, 0))
         self._has_rhs = False
+        self._sizes: Sizes | None = None
         # S, and where its blocks on and above the diagonal go, and their transposes, -1 for those of the diagonal.
         self._sparse: tuple[scipy.sparse.bsr_matrix, IntArray, IntArray] | None = None
 
@@ -241,17 +242,18 @@ class NativeSystem:
         return matrix
 
     def sizes(self) -> Sizes:
-        """Return what each linear solver would have to do."""
-        edges, pairs = self._kernel.pairs()
-        return Sizes(self.unknowns, self._size, edges, pairs)
+        """Return what each linear solver would have to do, which no iteration changes."""
+        if self._sizes is None:
+            self._sizes = Sizes(self.unknowns, self._size, *self._kernel.pairs())
+        return self._sizes
 
     def choose(self, asked: str) -> LinearSolver:
         """Return how to solve systems like this one: by what each way would cost, see linear_costs.py."""
+        if asked == "dense" or (asked in ("auto", "cholesky") and self.unknowns <= linear_costs.FEW_UNKNOWNS):
+            return LinearSolver("dense", linear_costs.describe("dense", self.unknowns, None, None))
         sizes = self.sizes()
         if asked == "pcg":
             return self._pcg(sizes)
-        if asked == "dense":
-            return LinearSolver(asked, linear_costs.describe(asked, self.unknowns, None, None))
         exact = asked == "cholesky"
         limit = np.inf if asked == "sparse" else linear_costs.max_products(sizes, exact=exact)
         factor = self.factor_size(linear_costs.max_blocks(sizes.block), limit)
@@ -270,7 +272,7 @@ class NativeSystem:
 
     def pcg_tries(self) -> int:
         """Return how many steps of PCG to try before an exact solution."""
-        return linear_costs.pcg_tries(self.sizes())
+        return 0 if self.unknowns <= linear_costs.FEW_UNKNOWNS else linear_costs.pcg_tries(self.sizes())
 
     def factor_size(self, max_blocks: int, max_products: float) -> Factor:
         """Return the size of the sparse factor; found at the first call with limits that it meets."""

@@ -176,12 +176,12 @@ class Problem:
 
 def _check_shapes(problem: Problem, n_obs: int) -> None:
     start, obs, cams = problem.start, problem.observations, problem.cameras
-    n_kf, n_cam = problem.n_keyframes, len(cams.model)
+    n_kf, n_cam = len(start.translation), len(cams.model)
     expected: dict[str, tuple[NDArray[np.generic], tuple[int, ...]]] = {
         "rotation": (start.rotation, (n_kf, 3, 3)),
         "translation": (start.translation, (n_kf, 3)),
-        "points": (start.points, (problem.n_points, 3)),
-        "intrinsics": (start.intrinsics, (n_kf if problem.free_intrinsics else 0, 3)),
+        "points": (start.points, (len(start.points), 3)),
+        "intrinsics": (start.intrinsics, (n_kf if len(start.intrinsics) else 0, 3)),
         "fixed": (problem.fixed, (n_kf,)),
         "camera rotation": (cams.rotation, (n_cam, 3, 3)),
         "camera translation": (cams.translation, (n_cam, 3)),

@@ -67,7 +67,7 @@ class ReducedSolver:
         radius *= system.radius_factor
         if self.kind != "pcg":
             x = system.solve_dense() if self.kind == "dense" else system.solve_sparse()
-            if x is None or not np.isfinite(x).all():
+            if x is None or not np.logical_and.reduce(np.isfinite(x)):
                 return linear.Solution(None)
             share = self._share_inside(x, system, hessian, radius)
             return linear.Solution(x if share == 1.0 else share * x, on_boundary=share < 1.0)
@@ -81,7 +81,7 @@ class ReducedSolver:
         if not np.isfinite(radius):
             return 1.0
         squares = scaling.squares(self._options.scaled_space, hessian(of_points=system.side != "points"))
-        length2 = float(np.einsum("i,i,i", system.gather(*squares), x, x))
+        length2 = float(np.dot(system.gather(*squares) * x, x))
         return 1.0 if length2 <= radius * radius else radius / float(np.sqrt(length2))
 
     def _worth_trying(self, system: System) -> int:

@@ -87,13 +87,13 @@ def solve(
             f"schur = cameras with {problem.n_factors} factors, which couple keyframes with each other: take"
             " schur = points, none or adaptive"
         )
-    if len(problem.observations) + problem.n_factors == 0 or (problem.fixed.all() and problem.n_points == 0):
+    if len(problem.observations) + problem.n_factors == 0 or (problem.n_points == 0 and problem.fixed.all()):
         return Result(problem.start, Status.SKIPPED, "no observations: nothing to solve", options.method, ())
-    try:
-        run = _Run(problem, options, clock, on_iteration, kernels)
-    except native_kernels.KernelsError as error:
-        return Result(problem.start, Status.FAILED, str(error), options.method, ())
     with np.errstate(all="ignore"):
+        try:
+            run = _Run(problem, options, clock, on_iteration, kernels)
+        except native_kernels.KernelsError as error:
+            return Result(problem.start, Status.FAILED, str(error), options.method, ())
         result = run.run()
         if weakest and result.status.usable:
             result = replace(result, loosest=partial(_weakest, run.kernels, problem, result.state, options))
@@ -121,8 +121,7 @@ class _Run:
         self.options = options
         self.clock, self.began = clock, clock()
         self.on_iteration = on_iteration
-        with np.errstate(all="ignore"):
-            self.kernels = kernels or native_kernels.make(problem, options)
+        self.kernels = kernels or native_kernels.make(problem, options)
         self.reduced = ReducedSolver(options)
         self.state = problem.start
         self.value = np.inf
@@ -134,8 +133,7 @@ class _Run:
         self.trace: list[Iteration] = []
         self.annealing: Annealing | None = None
         if options.annealing == "gnc":
-            with np.errstate(all="ignore"):
-                self.annealing = Annealing(problem, options)
+            self.annealing = Annealing(problem, options)
             self._graduate()
 
     def run(self) -> Result:

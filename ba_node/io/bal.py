@@ -125,17 +125,20 @@ def to_problem(bal: BalProblem) -> Problem:
     """
     n = len(bal.observations)
     # What is sorted already is not copied: it may be most of the memory of a large problem.
-    is_sorted = bool((bal.point_index[1:] >= bal.point_index[:-1]).all())
+    is_sorted = bool(np.logical_and.reduce(bal.point_index[1:] >= bal.point_index[:-1]))
     order = slice(None) if is_sorted else np.argsort(bal.point_index, kind="stable")
     params = np.zeros((1, 12))
     params[0, :2] = 1.0
+    # A product with (1, -1) goes by rows of two numbers, five times as slow.
+    uv = np.array(bal.observations[order])
+    np.negative(uv[:, 1], out=uv[:, 1])
     return Problem(
         start=State(
             so3_exp(bal.cameras[:, :3]), bal.cameras[:, 3:6].copy(), bal.points.copy(), bal.cameras[:, 6:].copy()
         ),
         fixed=np.zeros(len(bal.cameras), dtype=bool),
         cameras=Cameras(
-            rotation=np.diag([1.0, -1.0, -1.0])[None],
+            rotation=np.array([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]]),
             translation=np.zeros((1, 3)),
             model=np.array([Model.RATIONAL], dtype=np.uint8),
             params=params,
@@ -144,7 +147,7 @@ def to_problem(bal: BalProblem) -> Problem:
             keyframe=bal.camera_index[order],
             camera=np.zeros(n, dtype=np.intp),
             point=bal.point_index[order],
-            uv=bal.observations[order] * [1.0, -1.0],
+            uv=uv,
             sigma_px=np.ones(n),
             depth_m=np.empty(0),
             depth_sigma_m=np.empty(0),

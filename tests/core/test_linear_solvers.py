@@ -256,6 +256,36 @@ def test_a_factor_beyond_the_limit_is_never_the_cheapest(cameras: int, reach: in
 
 
 @built
+@pytest.mark.parametrize(("keyframes", "is_counted"), [(10, False), (11, True)])
+def test_what_each_way_costs_is_not_counted_for_few_unknowns(
+    keyframes: int, is_counted: bool, make_problem: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: list[Sizes] = []
+    count = native_kernels.NativeSystem.sizes
+
+    def counted(system: native_kernels.NativeSystem) -> Sizes:
+        counts.append(count(system))
+        return counts[-1]
+
+    monkeypatch.setattr(native_kernels.NativeSystem, "sizes", counted)
+    problem, _ = make_problem(keyframes=keyframes, fixed=0)
+    system, hessian = systems(problem, 1e-3)
+    found = ReducedSolver(SolverOptions()).solve(system, _telling(hessian), np.inf).x
+    assert bool(counts) == is_counted
+    assert found is not None
+    np.testing.assert_allclose(found, np.linalg.solve(system.dense(), system.rhs), rtol=1e-7)
+
+
+@pytest.mark.parametrize("block", [6, 9])
+def test_pcg_is_worth_a_try_for_no_few_unknowns(block: int) -> None:
+    """Where every keyframe sees every point there is most to form for each observation."""
+    keyframes = linear_costs.FEW_UNKNOWNS // block
+    for points in (1, 100, 100_000):
+        pairs = points * keyframes * (keyframes + 1) // 2
+        assert linear_costs.pcg_tries(Sizes(block * keyframes, block, points * keyframes, pairs)) == 0
+
+
+@built
 def test_the_result_names_the_linear_solver(make_problem: Make) -> None:
     problem, _ = make_problem()
     texts = {
@@ -263,6 +293,6 @@ def test_the_result_names_the_linear_solver(make_problem: Make) -> None:
         for kind in ("auto", "dense", "sparse", "pcg")
     }
     assert texts["dense"] == "dense Cholesky (24 unknowns, 4.6e-06 GFLOP)"
-    assert texts["sparse"] == texts["auto"]
+    assert texts["dense"] == texts["auto"], "that few are not counted"
     assert texts["sparse"].startswith("sparse Cholesky (24 unknowns, fill 1e+02 %, ")
     assert texts["pcg"] == "PCG (24 unknowns)"

@@ -183,3 +183,24 @@ def test_what_cannot_be_worked_with_is_not_sound() -> None:
             wrong[len(wrong) // 2] = -1 if values.dtype.kind == "i" else np.nan
             changed = dataclasses.replace(problem, **{place: dataclasses.replace(record, **{field: wrong})})
             assert not native.kernels.is_sound(changed), f"{place}.{field}"
+
+
+def test_a_single_wrong_number_is_found_wherever_it_stands() -> None:
+    """Rows are looked at by eights: each place of the first and of what is left over at the end, and both limits."""
+    problem = window()
+    rows = problem.observations
+    limits = {"keyframe": problem.n_keyframes, "camera": len(problem.cameras.model), "point": problem.n_points}
+    wrong: dict[str, tuple[float, ...]] = {name: (-1, limit, -(2**63), 2**63 - 1) for name, limit in limits.items()}
+    wrong |= {"uv": (np.nan, np.inf, -np.inf), "sigma_px": (np.nan, np.inf, -np.inf, 0.0, -1.0)}
+    for name, values in wrong.items():
+        for place in [*range(9), *range(-9, 0)]:
+            for value in values:
+                column = getattr(rows, name).copy()
+                column[place] = value
+                changed = dataclasses.replace(problem, observations=dataclasses.replace(rows, **{name: column}))
+                assert not native.kernels.is_sound(changed), f"{name}[{place}] = {value}"
+    unsorted = rows.point.copy()
+    unsorted[-1] = unsorted[0]
+    assert not native.kernels.is_sound(
+        dataclasses.replace(problem, observations=dataclasses.replace(rows, point=unsorted))
+    )

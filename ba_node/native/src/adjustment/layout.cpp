@@ -225,13 +225,15 @@ void Layout::index_by_keyframe() {
 
 void Layout::list_observations() {
   const std::int64_t partials = n_lists(), lists = partials * n_free;
+  Buffer<std::int32_t> column_of_image(images.size());
+  for (std::size_t m = 0; m < images.size(); ++m) column_of_image[m] = column_[images[m] / n_cameras];
   // take(list, observation, where its point is)
-  const auto each = [this, partials](auto take) {
+  const auto each = [&](auto take) {
     for (std::int64_t partial = 0; partial < partials; ++partial)
       for (std::int64_t b = sections[partial]; b < (partials > 1 ? sections[partial + 1] : n_batches); ++b)
         for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at) {
           if (inverse_sigma[at] == 0.0) continue;
-          const std::int64_t k = column_[images[slot_image[at]] / n_cameras];
+          const std::int64_t k = column_of_image[slot_image[at]];
           if (k >= 0) take(partial * n_free + k, at, 3 * kLanes * b + at % kLanes);
         }
   };

@@ -11,23 +11,38 @@
 #include <utility>
 
 #include "adjustment/types.hpp"
+#include "simd/target.hpp"
 
 namespace ba {
 
 inline bool all_finite(const double* values, std::int64_t n) {
-  // A number that is not finite is none any more after this either, and no sum of zeros overflows.
-  double sum = 0.0;
-  for (std::int64_t i = 0; i < n; ++i) sum += values[i] * 0.0;
-  return sum == 0.0;
+  // A number that is not finite is none any more after this either, and no sum of zeros overflows. Sums side by side do
+  // not wait for one another.
+  double sums[kLanes] = {};
+  std::int64_t i = 0;
+  for (; i + kLanes <= n; i += kLanes)
+    for (int l = 0; l < kLanes; ++l) sums[l] += values[i + l] * 0.0;
+  for (; i < n; ++i) sums[0] += values[i] * 0.0;
+  return std::all_of(sums, sums + kLanes, [](double sum) { return sum == 0.0; });
 }
 
 // Whether all is in range, sorted by point and finite, and sigmas are positive, as core/problem.py asks for.
 inline bool is_sound(const ProblemView& p, const StateView& s) {
-  bool good = true;
-  for (std::int64_t o = 0; o < p.n_obs; ++o) {
-    good &= p.keyframe[o] >= 0 && p.keyframe[o] < p.n_keyframes && p.camera[o] >= 0 && p.camera[o] < p.n_cameras;
-    good &= p.point[o] >= (o ? p.point[o - 1] : 0) && p.point[o] < p.n_points && p.sigma[o] > 0.0;
-  }
+  // A sign bit anywhere is an index out of range, or one of a point after a larger one.
+  std::uint64_t signs = 0;
+  const auto look_at = [&signs](const std::int64_t* index, std::int64_t n, std::int64_t limit) {
+    for (std::int64_t o = 0; o < n; ++o) {
+      const auto i = static_cast<std::uint64_t>(index[o]);
+      signs |= i | (static_cast<std::uint64_t>(limit) - 1 - i);
+    }
+  };
+  look_at(p.keyframe, p.n_obs, p.n_keyframes);
+  look_at(p.camera, p.n_obs, p.n_cameras);
+  look_at(p.point, p.n_obs, p.n_points);
+  for (std::int64_t o = 1; o < p.n_obs; ++o)
+    signs |= static_cast<std::uint64_t>(p.point[o]) - static_cast<std::uint64_t>(p.point[o - 1]);
+  bool good = signs >> 63 == 0;
+  for (std::int64_t o = 0; o < p.n_obs; ++o) good &= p.sigma[o] > 0.0;
   return good && all_finite(p.uv, 2 * p.n_obs) && all_finite(p.sigma, p.n_obs) &&
          all_finite(p.params, kParams * p.n_cameras) && all_finite(s.rotation, 9 * p.n_keyframes) &&
          all_finite(s.translation, 3 * p.n_keyframes) && all_finite(s.points, 3 * p.n_points) &&

@@ -6,17 +6,31 @@
 
 #if defined(__linux__)
 #include <sys/mman.h>
+#include <unistd.h>
+
+#include <fstream>
 #endif
+
+#include "parallel/huge_pages.hpp"
 
 namespace ba {
 
 namespace {
 
-constexpr std::size_t kCacheLine = 64, kHugePage = std::size_t{1} << 21, kSlab = std::size_t{1} << 24;
+constexpr std::size_t kCacheLine = 64, kSlab = std::size_t{1} << 24;
 // Bytes of slabs out of use that are not given back.
 constexpr std::size_t kKept = std::size_t{1} << 25;
 
 std::size_t rounded(std::size_t bytes, std::size_t to) { return (bytes + to - 1) / to * to; }
+
+// Have a new slab in huge pages where twice as much is at hand in them, so that others find some too.
+void ask_for_huge_pages([[maybe_unused]] void* begin, [[maybe_unused]] std::size_t size) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  if (sysconf(_SC_PAGESIZE) != 4096) return;
+  std::ifstream buddyinfo("/proc/buddyinfo");
+  if (free_in_huge_pages(buddyinfo) >= 2 * size) madvise(begin, size, MADV_HUGEPAGE);  // if refused, pages are small
+#endif
+}
 
 }  // namespace
 
@@ -41,9 +55,7 @@ void* Slabs::take(std::size_t bytes) {
   const std::size_t size = rounded(bytes < kSlab ? kSlab : bytes, kHugePage);
   void* begin = std::aligned_alloc(kHugePage, size);
   if (begin == nullptr) throw std::bad_alloc();
-#if defined(__linux__) && defined(MADV_HUGEPAGE)
-  madvise(begin, size, MADV_HUGEPAGE);  // where it is refused, pages are small
-#endif
+  ask_for_huge_pages(begin, size);
   slabs_.push_back({static_cast<char*>(begin), size, 0, 0});
   return cut(slabs_.back(), bytes);
 }
