@@ -19,7 +19,7 @@ from ba_node.io import ros_types
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import BagError
 from ba_node.offline.recording import record
-from ba_node.synthetic import SyntheticOptions, generate
+from experiments.synthetic import SyntheticOptions, generate
 from tests.io.test_bag_folders import split, write_metadata
 
 Message = tuple[str, str, int, bytes]
