@@ -21,6 +21,16 @@ def ranges(begin: IntArray, end: IntArray) -> IntArray:
     return np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
 
 
+def changed(record: Record, **values: Any) -> Record:
+    """Return a dataclass with other values in some fields: dataclasses.replace in a fifth of the time, without checks.
+
+    For those that keep nothing but their fields.
+    """
+    new = object.__new__(type(record))
+    vars(new).update(vars(record), **values)
+    return new
+
+
 def take_rows(record: Record, rows: Any) -> Record:
     """Return a dataclass of arrays with some rows of each; fields that are no arrays stay."""
     return type(record)(*(value[rows] if isinstance(value, np.ndarray) else value for value in vars(record).values()))

@@ -31,6 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import geometry, loss
 from ba_node.core.problem import KeyframeFactors, ProblemError, State
@@ -89,7 +90,12 @@ class RelativePoses:
             array = getattr(self, name)
             if array.shape != shape:
                 raise ProblemError(f"{name} of the relative poses has shape {array.shape}, expected {shape}")
-            if not np.isfinite(array.sum()):
+        if native.kernels is not None and native.kernels.are_sound(self, n_keyframes, _ORTHONORMAL):
+            _check_loss(self)
+            return
+        for name in shapes:
+            array = getattr(self, name)
+            if not np.isfinite(array).all():
                 bad = ~np.isfinite(array).reshape(n, -1).all(axis=1)
                 raise ProblemError(f"{name} of relative pose {int(np.argmax(bad))} is not finite")
         turned = np.abs(self.rotation @ np.swapaxes(self.rotation, 1, 2) - np.eye(3))
@@ -259,6 +265,10 @@ def check_common(kind: KeyframeFactors, n_keyframes: int) -> None:
         row, place = np.argwhere(bad)[0]
         what = f"keyframe index {kind.keyframes[row, place]} is out of range [0, {n_keyframes})"
         raise ProblemError(f"factor {row} ({type(kind).__name__}): {what}")
+    _check_loss(kind)
+
+
+def _check_loss(kind: KeyframeFactors) -> None:
     if kind.loss not in loss.LOSSES or not (np.isfinite(kind.loss_scale) and kind.loss_scale > 0.0):
         known = ", ".join(loss.LOSSES)
         raise ProblemError(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import FloatArray
 
 # Below this angle (rad) the closed forms lose digits to cancellation and their series are used.
@@ -95,6 +96,8 @@ def _third_term(angle2: FloatArray) -> FloatArray:
 
 def matrix_from_quaternion(quaternion: FloatArray) -> FloatArray:
     """Return the rotation of a quaternion x y z w, which need not be normalised: (..., 4) -> (..., 3, 3)."""
+    if native.kernels is not None:
+        return np.asarray(native.kernels.rotations(quaternion)).reshape(*quaternion.shape[:-1], 3, 3)
     q = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     x, y, z, w = (q[..., i] for i in range(4))
     rows = [
@@ -111,6 +114,8 @@ def quaternion_from_matrix(rotation: FloatArray) -> FloatArray:
     Shepperd's method: of the four equivalent formulas it takes, per matrix, the one with the largest
     divisor, so that no half turn loses digits.
     """
+    if native.kernels is not None:
+        return np.asarray(native.kernels.quaternions(rotation)).reshape(*rotation.shape[:-2], 4)
     r = rotation
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]

@@ -12,10 +12,10 @@ import numpy as np
 import scipy
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
-from ba_node.core.factors import FactorSum, FactorTerms, Known, RelativePoses
+from ba_node.core.factors import FactorSum, FactorTerms, Known, Pairs, RelativePoses
 from ba_node.core.kernels import DENSE_LIMIT, Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
@@ -62,11 +62,20 @@ def missing(options: SolverOptions) -> str:
     return reason
 
 
-def residual_norms(problem: Problem, state: State, kernels: str = "auto") -> FloatArray:
-    """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see."""
+def residual_norms(problem: Problem, state: State, kernels: str = "auto", rows: IntArray | None = None) -> FloatArray:
+    """Return the size of each residual, (n_obs,) in sigmas, inf for points that their camera cannot see.
+
+    ``rows`` are the observations that are wanted, by default all.
+    """
     if kernels != "numpy" and native.kernels is not None and not problem.free_intrinsics:
-        norms: FloatArray = native.kernels.residual_norms(problem, state)
+        norms: FloatArray = (
+            native.kernels.residual_norms(problem, state)
+            if rows is None
+            else native.kernels.residual_norms_of(problem, state, rows)
+        )
         return norms
+    if rows is not None:
+        problem = changed(problem, observations=problem.observations.take(rows))
     error = reprojection_errors(problem, state)
     return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
 
@@ -312,6 +321,21 @@ class NativeFactorSum(FactorSum):
         """Hand those on relative poses over; they are copied."""
         super().__init__(factors, fixed)
         self._kernels = [self._kernel(kind, number) for number, kind in enumerate(self._factors)]
+        n, pairs = len(self._free), len(self.rows)
+        between = Pairs(self.rows, self.columns, np.empty((pairs, 6, 6)))
+        self._sums = np.empty((n, 6)), np.empty((n, 6, 6)), between
+
+    def linearise(self, state: State) -> FactorTerms:
+        """Return what the factors add at a state; the next call writes over it."""
+        if any(kernel is None for kernel in self._kernels):
+            return super().linearise(state)
+        gradient, diagonal, between = self._sums
+        value, blocks = 0.0, between.blocks
+        gradient[...] = diagonal[...] = blocks[...] = 0.0
+        for kernel in self._kernels:
+            assert kernel is not None
+            value += kernel.linearise(state, gradient, diagonal, blocks)
+        return FactorTerms(value, gradient, diagonal, between)
 
     def value(self, state: State) -> float:
         """Return 1/2 sum Psi."""

@@ -70,6 +70,11 @@ class Observations:
     def __len__(self) -> int:
         return len(self.keyframe)
 
+    def take(self, rows: IntArray) -> Observations:
+        """Return some of them."""
+        columns = (column.take(rows, axis=0) if len(column) else column for column in vars(self).values())
+        return Observations(*columns)
+
 
 class KeyframeFactors(Protocol):
     """Factors of one kind: n of them, each with m residuals on k keyframes.

@@ -154,6 +154,9 @@ def allocations() -> int:
     """Return how often the kernels have asked for memory."""
 
 def residual_norms(problem: Problem, state: State) -> Doubles: ...
+def residual_norms_of(problem: Problem, state: State, rows: Ints) -> Doubles:
+    """Return the same of some observations."""
+
 def triangulate(rays: Rays, n_points: int) -> tuple[Doubles, Doubles, NDArray[np.bool_]]: ...
 def agreeing(rays: Rays, n_points: int, gate: float) -> NDArray[np.bool_]: ...
 def consensus(
@@ -245,6 +248,37 @@ def explained(
 
 def is_sound(problem: Problem) -> bool:
     """Return whether indices are in range, observations sorted, numbers finite, sigmas positive."""
+
+def are_sound(steps: object, n_keyframes: int, most: float) -> bool:
+    """Return True if relative poses are finite, of different keyframes that exist, and rotations to within ``most``."""
+
+def are_sane_tracks(
+    ids: NDArray[np.uint64],
+    uv: Doubles,
+    sigma: Doubles,
+    depth: Doubles,
+    bounds: tuple[float, float, float, float, float],
+) -> bool:
+    """Return what scene.ingest._nothing_to_check does; bounds of |uv|, sigma from and to, depth from and to."""
+
+def tracks_to_try(track_id: NDArray[np.uint64], point: Ints, wanted: int, least_views: int, multiplier: int) -> Ints:
+    """Return the first of what window.trial.choose does; point of each usable observation."""
+
+def quaternions(rotation: Doubles) -> Doubles:
+    """Return core.geometry.quaternion_from_matrix of (n, 3, 3)."""
+
+def rotations(quaternion: Doubles) -> Doubles:
+    """Return core.geometry.matrix_from_quaternion of (n, 4)."""
+
+def seem_to_move(
+    observations: object,
+    norms: Doubles,
+    unplaced: NDArray[np.bool_],
+    unrefined: NDArray[np.bool_],
+    of_noise: tuple[float, float, int],
+    limits: tuple[float, float, float, float, float],
+) -> tuple[Doubles, NDArray[np.bool_]]:
+    """Return what window.moving._off and _leaves_more_than_noise do, where points without a place do not count."""
 
 def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, float]:
     """Return what core.covariance.weakest does, of blocks (n, 6, 6) of S and positions (n, 3)."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IdArray
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Cameras
@@ -234,6 +235,9 @@ def seen_from_first(rig: CameraRig) -> CameraRig:
 
 def _nothing_to_check(ids: IdArray, uv: FloatArray, sigma: FloatArray, depth: FloatArray) -> bool:
     """Return True for most messages: ids that rise, sane pixels and sigmas, no depth or only sane ones."""
+    if native.kernels is not None:
+        bounds = MAX_PIXEL, *SIGMA_RANGE, *DEPTH_RANGE_M
+        return bool(native.kernels.are_sane_tracks(ids, uv, sigma, depth, bounds))
     if not len(ids) or not (ids[1:] > ids[:-1]).all():
         return False
     lowest, highest = np.fmin.reduce(depth), np.fmax.reduce(depth)

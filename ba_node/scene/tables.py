@@ -109,6 +109,8 @@ class Table:
 
     def changed(self, rows: IntArray | slice = slice(None)) -> None:
         """Note that rows are to be copied anew, by default all."""
+        if not self.COPIED:
+            return
         if isinstance(rows, slice):
             self._pieces, self._stale = [], np.ones(self._n_pieces, bool)
         elif len(rows):

@@ -357,6 +357,8 @@ def _keys(scene: Scene, number: IntArray) -> list[tuple[int, int]]:
 def in_place(steps: tuple[RelativePoses, ...], others: list[KeyframeFactors]) -> tuple[KeyframeFactors, ...]:
     """Return all factors, without the front-end's own turns and moves where others measured these between keyframes."""
     told = [kind for kind in others if isinstance(kind, RelativePoses)]
+    if not told:
+        return (*steps, *others)
     left = []
     for part, kind in enumerate(steps):
         pairs = set()

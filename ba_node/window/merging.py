@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import TracksConfig
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem, State
@@ -69,7 +68,7 @@ def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: s
     if len(found):
         points, aside = state.points.copy(), selection.tried[: len(found)]
         points[aside] = np.where(np.isnan(found), points[aside], found)
-        state = dataclasses.replace(state, points=points)
+        state = changed(state, points=points)
     norms = native_kernels.residual_norms(selection.whole, state, kernels)
     state = _returned(selection, state, norms, tracks.outlier_px or np.inf, kernels)
     return Merged(norms, state, explained)
@@ -82,19 +81,18 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     rows = np.flatnonzero(doubted.take(point))
     if not len(rows):
         return state
-    views = part_of(whole, rows, doubted)
-    start = dataclasses.replace(state, points=whole.start.points[doubted])
-    before = native_kernels.residual_norms(views, start, kernels)
-    support = np.bincount(views.observations.point[before <= gate], minlength=views.n_points)
+    point = point.take(rows)
+    before = native_kernels.residual_norms(whole, changed(state, points=whole.start.points), kernels, rows)
+    support = np.bincount(point[before <= gate], minlength=whole.n_points)
     # A leap has to be borne out by more views than there were.
-    better = support + leapt[doubted] > agreeing[doubted]
-    back, lost = ~began[doubted] & (better | away[doubted]), (away & began)[doubted]
-    returned = back.take(views.observations.point)
+    better = support + leapt > agreeing
+    back, lost = doubted & ~began & (better | away), doubted & began & away
+    returned = back.take(point)
     norms[rows[returned]] = before[returned]
-    norms[rows[lost.take(views.observations.point)]] = np.inf
+    norms[rows[lost.take(point)]] = np.inf
     points = state.points.copy()
-    points[np.flatnonzero(doubted)[back]] = whole.start.points[doubted][back]
-    return dataclasses.replace(state, points=points)
+    points[back] = whole.start.points[back]
+    return changed(state, points=points)
 
 
 def _doubted(
@@ -207,7 +205,7 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
         hanging[obs.point[members.take(obs.keyframe)]] = True
         points[hanging] = centre + scale * (points[hanging] - centre)
     _, translation = geometry.inverse(rotation, position)
-    return dataclasses.replace(state, translation=translation, points=points)
+    return changed(state, translation=translation, points=points)
 
 
 def classify(
@@ -222,7 +220,7 @@ def classify(
     written over.
     """
     obs, n_points, outlier_px = selection.observations, selection.problem.n_points, tracks.outlier_px
-    whole = dataclasses.replace(selection.problem, observations=obs, start=state)
+    whole = changed(selection.problem, observations=obs, start=state)
     # What was left out of the solve tells nothing about how good it is.
     gate = widened(outlier_px, norm.take(selection.used)) if outlier_px > 0 else np.inf
     outlier = norm > gate
@@ -258,7 +256,7 @@ def _place_anew(
         return
     views = part_of(whole, rows, doubted)
     found = agreed_points(views, tracks, tracks.outlier_px, kernels)
-    start = dataclasses.replace(views.start, points=found.points)
+    start = changed(views.start, points=found.points)
     at = native_kernels.residual_norms(views, start, kernels)
     supports = at <= tracks.outlier_px
     better = found.good & (np.bincount(views.observations.point, supports, views.n_points) > good[doubted])

@@ -24,12 +24,10 @@ So there the front-end's steps count as they are stated (``odometry.py``), and a
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.core import consensus, native_kernels, triangulation
 from ba_node.core.problem import Problem
 from ba_node.window.problems import part_of
@@ -41,6 +39,7 @@ _LARGE = 3.0
 # So many residuals of a track, and that share of them, are larger.
 _LEAST_LARGE = 2
 _LARGE_SHARE = 0.4
+_LIMITS = _LARGE, _MISMATCH, _BOUND, _LEAST_LARGE, _LARGE_SHARE
 # With fewer observations a keyframe, or fewer keyframes, poses are not known well enough to tell: most of what seems to
 # move in a young map stands.
 _MANY = 50
@@ -66,19 +65,31 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     young = problem.n_keyframes < _LEAST_KEYFRAMES or np.count_nonzero(unrefined) > 1 + problem.n_keyframes // 2
     if young or len(point) < _MANY * problem.n_keyframes:
         return np.zeros(problem.n_points, bool)
-    norms = np.where(np.isnan(problem.start.points[:, 0]).take(point), np.inf, norms)
-    off = _off(problem, norms, unrefined)
-    found = _leaves_more_than_noise(problem, norms, off, kernels)
+    off, found = _seem_to_move(problem, norms, unrefined, kernels)
     rows = np.flatnonzero(found.take(point))
     if not len(rows):
         return found
     doubted = part_of(problem, rows, found)
     places, _ = consensus.triangulate(triangulation.rays_of(doubted, kernels), doubted.n_points, _BOUND, kernels)
-    at = dataclasses.replace(doubted.start, points=np.nan_to_num(places.points))
+    at = changed(doubted.start, points=np.nan_to_num(places.points))
     again = native_kernels.residual_norms(doubted, at, kernels)
     again[_mismatches(doubted, again, kernels)] = np.inf
     found[found] = _leaves_more_than_noise(doubted, again, off, kernels)
     return found
+
+
+def _seem_to_move(
+    problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: str
+) -> tuple[FloatArray, BoolArray]:
+    """Return how far off keyframes are, see ``_off``, and which points leave more than noise."""
+    unplaced = np.isnan(problem.start.points[:, 0])
+    if kernels != "numpy" and native.kernels is not None:
+        noise = _NOISE_AT_RANK, _RANK, _KNOWN
+        off, found = native.kernels.seem_to_move(problem.observations, norms, unplaced, unrefined, noise, _LIMITS)
+        return off, found
+    norms = np.where(unplaced.take(problem.observations.point), np.inf, norms)
+    off = _off(problem, norms, unrefined)
+    return off, _leaves_more_than_noise(problem, norms, off, kernels)
 
 
 def _mismatches(problem: Problem, norms: FloatArray, kernels: str) -> BoolArray:
@@ -110,6 +121,8 @@ def _stands_out(track: IntArray, norms: FloatArray, *, alone: bool) -> BoolArray
 
 def much(problem: Problem, moves: BoolArray) -> bool:
     """Return True if a large share of what is seen moves; points without a place, (n_pt,) NaN, do not count."""
+    if not moves.any():
+        return False
     views = np.bincount(problem.observations.point, minlength=problem.n_points)
     placed = ~np.isnan(problem.start.points[:, 0])
     return bool(np.sum(views[moves & placed]) > _MUCH * np.sum(views[placed]))
@@ -136,9 +149,8 @@ def _times_noise(norms: FloatArray) -> float:
 def _leaves_more_than_noise(problem: Problem, norms: FloatArray, off: FloatArray, kernels: str) -> BoolArray:
     """Return which points leave more than noise in most of their views, of residuals over what keyframes are off."""
     if kernels != "numpy" and native.kernels is not None:
-        limits = _LARGE, _MISMATCH, _BOUND, _LEAST_LARGE, _LARGE_SHARE
         found: BoolArray = native.kernels.move_more_than_noise(
-            problem.observations, norms, off, problem.n_points, limits
+            problem.observations, norms, off, problem.n_points, _LIMITS
         )
         return found
     norms = norms / off.take(problem.observations.keyframe)

@@ -27,12 +27,11 @@ that a wrong one does not release the other.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import OdometryConfig
 from ba_node.core import geometry
 from ba_node.core.factors import RelativePoses
@@ -151,7 +150,7 @@ def _as_learned(
     """
     shares = scene.step_shares
     if shares != (1.0, 1.0):
-        steps = dataclasses.replace(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
+        steps = changed(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
     table = scene.keyframes
     sure = many & table.refined[keyframes]
     rows = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
@@ -166,7 +165,7 @@ def _as_learned(
     worse = np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1) / _MEDIAN_NORM
     # Keyframes of before they were known to be precise are worse than they.
     times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
-    return dataclasses.replace(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
+    return changed(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
 
 
 def _relative(

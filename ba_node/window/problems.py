@@ -7,14 +7,13 @@ All observations of a problem are sorted by point, keyframe, camera. A part keep
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.problem import Observations, Problem, State
@@ -48,7 +47,7 @@ def problem_of(
 
 def some_observations(problem: Problem, rows: IntArray) -> Problem:
     """Return a problem with some of the observations of another, and all its keyframes and points."""
-    return dataclasses.replace(problem, observations=_taken(problem.observations, rows))
+    return changed(problem, observations=_taken(problem.observations, rows))
 
 
 def part_of(problem: Problem, rows: IntArray, points: BoolArray, keyframes: BoolArray | None = None) -> Problem:
@@ -74,16 +73,11 @@ def _taken(
         every = np.empty(0, np.intp)
         numbers = (every if of is None else of for of in (of_point, of_keyframe))
         return Observations(*native.kernels.take(obs, rows, *numbers))
-    has_depth = len(obs.depth_m) > 0
-    keyframe, point = obs.keyframe.take(rows), obs.point.take(rows)
-    return Observations(
-        keyframe if of_keyframe is None else of_keyframe.take(keyframe),
-        obs.camera.take(rows),
-        point if of_point is None else of_point.take(point),
-        obs.uv.take(rows, axis=0),
-        obs.sigma_px.take(rows),
-        obs.depth_m.take(rows) if has_depth else obs.depth_m,
-        obs.depth_sigma_m.take(rows) if has_depth else obs.depth_sigma_m,
+    some = obs.take(rows)
+    return changed(
+        some,
+        keyframe=some.keyframe if of_keyframe is None else of_keyframe.take(some.keyframe),
+        point=some.point if of_point is None else of_point.take(some.point),
     )
 
 

@@ -14,13 +14,12 @@ problem has its origin at its oldest keyframe: far from the map's origin (UTM) n
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray, changed
 from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
@@ -77,7 +76,7 @@ class Selection:
     @cached_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
-        return dataclasses.replace(self.problem, observations=self.observations)
+        return changed(self.problem, observations=self.observations)
 
     def explained(self, state: State, kernels: str) -> trial.Explained:
         """Return how well the front-end's poses and those of a solution explain the tracks that they are tried on."""
@@ -97,6 +96,7 @@ class _Part:
     keyframes: IntArray
     landmarks: IntArray
     origin: FloatArray
+    heard: BoolArray  # (n_obs,) False for outliers
     turned: turns.Turns | None = None
 
     def only(self, rows: IntArray, keyframes: BoolArray, points: BoolArray) -> _Part:
@@ -104,7 +104,7 @@ class _Part:
         problem = part_of(self.problem, rows, points, keyframes)
         turned = None if self.turned is None else self.turned.take(keyframes)
         places = self.rows.take(rows), self.keyframes[keyframes], self.landmarks[points]
-        return _Part(problem, *places, self.origin, turned)
+        return _Part(problem, *places, self.origin, self.heard.take(rows), turned)
 
 
 def rows_of(scene: Scene, config: Config, end: int | None = None) -> IntArray:
@@ -124,7 +124,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     scene.propagate_corrections()
     known = old_keyframes.memory(scene, config, window)
     part, norms, strays = _arrived(scene, window, config, without)
-    usable = _usable(scene, part, norms, config.tracks.outlier_px)
+    usable = _usable(part, norms, config.tracks.outlier_px)
     lost = _contradicted(scene, part, usable)
     moves = _moving(scene, part, norms, config)
     much_moves = moving.much(part.problem, moves)
@@ -150,14 +150,14 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     prior = None if known is None else known.factor(table.keyframe_id[part.keyframes], part.origin)
     if prior is not None:
         held = gauge.Gauge(is_old, np.full(len(is_old), -1))
-    active = dataclasses.replace(active, fixed=held.fixed)
+    active = changed(active, fixed=held.fixed)
     steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
     beside = constraints.factors(scene, config, active, part.keyframes, part.origin)
     factors = constraints.in_place(steps, beside)
     factors += () if prior is None else (prior,)
     priors = constraints.point_priors(scene, config, part.landmarks, part.origin)
     return Selection(
-        problem=dataclasses.replace(active, factors=factors, point_priors=priors),
+        problem=changed(active, factors=factors, point_priors=priors),
         observations=obs,
         norms=norms,
         rows=part.rows,
@@ -208,18 +208,17 @@ def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     part = _turned(scene, _reach(scene, window, config, without), window, config)
     problem, kernels, new = part.problem, config.solver.kernels, ~scene.landmarks.has_position[part.landmarks]
     points = np.where(new[:, None], 0.0, problem.start.points)
-    start = dataclasses.replace(problem.start, points=points)  # what is put into these is put into it
+    start = changed(problem.start, points=points)  # what is put into these is put into it
     norms = native_kernels.residual_norms(problem, start, kernels)
     of_new = new.take(problem.observations.point)
-    heard = ~scene.observations.outlier.take(part.rows)
     points[new] = np.nan
-    rows = np.flatnonzero(of_new & heard)
+    rows = np.flatnonzero(of_new & part.heard)
     if len(rows):
-        points[new] = _first_positions(scene, part, rows, (new, norms[heard & ~of_new]), config)
-        found = part_of(problem, np.flatnonzero(of_new), new)
-        at = dataclasses.replace(found.start, points=np.nan_to_num(points[new]))
-        norms[of_new] = native_kernels.residual_norms(found, at, kernels)
-    return dataclasses.replace(part, problem=dataclasses.replace(problem, start=start)), norms
+        points[new] = _first_positions(scene, part, rows, (new, norms[part.heard & ~of_new]), config)
+        at = changed(start, points=np.where(np.isnan(points), 0.0, points))
+        rows = np.flatnonzero(of_new)
+        norms[rows] = native_kernels.residual_norms(problem, at, kernels, rows)
+    return changed(part, problem=changed(problem, start=start)), norms
 
 
 def _first_positions(
@@ -268,7 +267,7 @@ def _reach(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     origin = scene.keyframes.position[keyframes[0]] if len(keyframes) else np.zeros(3)
     positions = scene.landmarks.position[landmarks] - origin
     problem, rows = problem_of(scene, views, keyframes, landmarks, origin, positions, config)
-    return _Part(problem, rows, keyframes, landmarks, origin)
+    return _Part(problem, rows, keyframes, landmarks, origin, ~scene.observations.outlier.take(rows))
 
 
 def _views_needed(scene: Scene, window: IntArray, n_fixed: int) -> int | None:
@@ -301,12 +300,12 @@ def _turned(scene: Scene, part: _Part, window: IntArray, config: Config) -> _Par
     if not config.odometry.enabled or len(part.keyframes) > _MOST_TURNS:
         return part
     of_window = (scene.numbers(part.keyframes, window) >= 0).take(part.problem.observations.keyframe)
-    used = of_window & ~scene.observations.outlier.take(part.rows)
-    found = turns.find(part.problem, part.keyframes, used, scene.landmarks.has_position[part.landmarks])
+    placed = scene.landmarks.has_position[part.landmarks]
+    found = turns.find(part.problem, part.keyframes, of_window & part.heard, placed)
     if found is None:
         return part
     free = ~scene.keyframes.refined[part.keyframes]
-    return dataclasses.replace(part, problem=found.applied(part.problem, part.keyframes, free), turned=found)
+    return changed(part, problem=found.applied(part.problem, part.keyframes, free), turned=found)
 
 
 def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
@@ -327,9 +326,9 @@ def moved_guesses(scene: Scene, landmarks: IntArray) -> FloatArray:
     return np.asarray((rotation @ guess[:, :, None])[..., 0] + translation)
 
 
-def _usable(scene: Scene, part: _Part, norms: FloatArray, outlier_px: float) -> BoolArray:
+def _usable(part: _Part, norms: FloatArray, outlier_px: float) -> BoolArray:
     """Return which observations may take part: no outliers, and none that begins with an absurd residual."""
-    usable: BoolArray = ~scene.observations.outlier.take(part.rows)
+    usable = part.heard
     if outlier_px <= 0:
         return usable
     obs = part.problem.observations
@@ -371,14 +370,13 @@ def _moving(scene: Scene, part: _Part, norms: FloatArray, config: Config) -> Boo
 def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     """Return the rows of placed landmarks that absurd residuals leave with too few views, by track id."""
     obs, n = part.problem.observations, len(part.landmarks)
-    heard = ~scene.observations.outlier.take(part.rows)
     doubted = np.zeros(n, bool)
-    doubted[obs.point[heard & ~usable]] = True
+    doubted[obs.point[part.heard & ~usable]] = True
     rows = np.flatnonzero(doubted.take(obs.point))
     if not len(rows):
         return part.landmarks[:0]
     point = obs.point[rows]
     weight = np.where(np.isfinite(obs.depth_m[rows]), 2, 1) if len(obs.depth_m) else np.ones(len(rows))
-    before = np.bincount(point, weight * heard[rows], n)
+    before = np.bincount(point, weight * part.heard[rows], n)
     after = np.bincount(point, weight * usable[rows], n)
     return part.landmarks[scene.landmarks.has_position[part.landmarks] & (before >= 2) & (after < 2)]

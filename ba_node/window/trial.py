@@ -44,6 +44,9 @@ def choose(track_id: IdArray, point: IntArray, wanted: int) -> tuple[IntArray, I
 
     ``track_id`` is (n_pt,), ``point`` that of each usable observation.
     """
+    if native.kernels is not None:
+        tried: IntArray = native.kernels.tracks_to_try(track_id, point, wanted, _MIN_VIEWS, int(_HASH))
+        return tried, tried[: len(track_id) // _SHARE]
     views = np.bincount(point, minlength=len(track_id))
     candidates = np.flatnonzero(views > _MIN_VIEWS)
     if len(candidates) < wanted:

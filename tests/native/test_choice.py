@@ -14,9 +14,10 @@ import pytest
 from ba_node import native
 from ba_node.arrays import take_rows
 from ba_node.config import Config
-from ba_node.core import geometry, triangulation
+from ba_node.core import geometry, native_kernels, triangulation
 from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
+from ba_node.scene import ingest
 from ba_node.scene.scene import Scene
 from ba_node.window import moving, trial
 from ba_node.window.initial_points import agreed_points
@@ -116,6 +117,73 @@ def test_what_moves_is_what_numpy_finds() -> None:
     compiled, plain = (moving._leaves_more_than_noise(problem, norms, off, kernels) for kernels in ("native", "numpy"))
     assert 20 < np.count_nonzero(plain) < problem.n_points - 20
     np.testing.assert_array_equal(compiled, plain)
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0])
+def test_what_seems_to_move_is_what_numpy_finds(factor: float) -> None:
+    """With keyframes that are off, of the window as a whole, or as noise has them."""
+    problem, rng = window(), np.random.default_rng(10)
+    obs, unrefined = problem.observations, np.arange(problem.n_keyframes) >= 7
+    norms = np.abs(rng.normal(size=len(obs))) * rng.choice([1.0, 4.0], problem.n_points)[obs.point]
+    norms *= 1.0 + factor * 10.0 * unrefined[obs.keyframe]
+    norms[::13] = np.inf
+    problem.start.points[::9] = np.nan
+    compiled, plain = (moving._seem_to_move(problem, norms, unrefined, kernels) for kernels in ("native", "numpy"))
+    assert len(np.unique(plain[0])) > 1, "keyframes are off apart"
+    assert 0 < np.count_nonzero(plain[1]) < problem.n_points
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("depth_share", [0.0, 0.3])
+def test_residuals_of_some_are_those_of_all(depth_share: float) -> None:
+    problem = window(depth_share)
+    rows = np.random.default_rng(11).permutation(len(problem.observations))[:200]
+    for kernels in ("native", "numpy"):
+        every = native_kernels.residual_norms(problem, problem.start, kernels)
+        some = native_kernels.residual_norms(problem, problem.start, kernels, rows)
+        assert 20 < np.count_nonzero(np.isfinite(some)) < 180
+        np.testing.assert_array_equal(some, every[rows])
+
+
+def test_tracks_that_need_no_look_are_those_of_numpy(both: Both) -> None:
+    good: dict[str, Any] = {
+        "ids": np.array([3, 7, 2**64 - 1], np.uint64),
+        "uv": np.array([[0.0, -1e6], [1e6, 5.0], [2.0, 3.0]]),
+        "sigma": np.array([1e-6, 1.0, 1e6]),
+        "depth": np.array([np.nan, 1e-3, 1e6]),
+    }
+    wrong: dict[str, list[Any]] = {
+        "ids": [[7, 3, 9], [3, 3, 9], []],
+        "uv": [[[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]], [[0.0, -1.1e6], [0.0, 0.0], [0.0, 0.0]]],
+        "sigma": [[0.0, 1.0, 1.0], [1.0, np.nan, 1.0], [1.0, 1.0, np.inf]],
+        "depth": [[np.nan, 0.0, 1.0], [1.0, np.inf, 1.0]],
+    }
+    cases = [(good, True), (good | {"depth": np.full(3, np.nan)}, True)]
+    cases += [(good | {name: np.array(v, good[name].dtype)}, False) for name, columns in wrong.items() for v in columns]
+    compiled, plain = both(lambda: [ingest._nothing_to_check(**case) for case, _ in cases])
+    assert compiled == plain == [expected for _, expected in cases]
+
+
+@pytest.mark.parametrize("wanted", [0, 40, 10_000])
+def test_tracks_to_try_are_those_of_numpy(wanted: int, both: Both) -> None:
+    rng, n = np.random.default_rng(12), 300
+    track_id = rng.permutation(np.iinfo(np.uint64).max - np.arange(n, dtype=np.uint64) * 12345)
+    point = rng.integers(0, n, 1000)
+    compiled, plain = both(lambda: trial.choose(track_id, point, wanted))
+    assert (len(plain[0]) > 0) == (wanted > 0)
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_rotations_have_the_bits_of_numpy(both: Both) -> None:
+    q = np.random.default_rng(13).normal(size=(2000, 4)) * [1.0, 1.0, 1.0, 0.5]
+    q[:3] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1e-9], [0.0, 0.0, -3.0, 0.0]]
+    compiled, plain = both(lambda: geometry.matrix_from_quaternion(q))
+    np.testing.assert_array_equal(compiled, plain)
+    compiled, plain = both(lambda: geometry.quaternion_from_matrix(plain.reshape(-1, 4, 3, 3)))
+    np.testing.assert_array_equal(compiled, plain)
+    assert geometry.quaternion_from_matrix(np.empty((0, 3, 3))).shape == (0, 4)
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

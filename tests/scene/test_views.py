@@ -69,6 +69,9 @@ def test_views_are_gathered_in_the_order_of_the_lists(scene: Scene) -> None:
     np.testing.assert_array_equal(landmarks[point], table.landmark[rows])
     for found, column in ((camera, table.camera), (uv, table.uv), (sigma_px, table.sigma_px), (depth_m, table.depth_m)):
         np.testing.assert_array_equal(found, column[rows])
+    in_order = scene.gather(rows, keyframes, landmarks)
+    for again, before in zip(in_order, (rows, keyframe, camera, point, uv, sigma_px, depth_m), strict=True):
+        np.testing.assert_array_equal(again, before)
     without = rows[np.isnan(table.depth_m[rows])]
     assert scene.gather(without, keyframes, landmarks)[-1].shape == (0,), "none was measured"
     # What is kept for the next call is as it was.

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "adjustment/types.hpp"
+#include "adjustment/views.hpp"
 
 namespace ba {
 
@@ -202,6 +203,63 @@ inline void leave_more_than_noise(const ResidualsView& seen, std::int64_t n_poin
     found[p] =
         large >= at.least_large && sums[p].total > at.large * at.large * count && large >= at.large_share * count;
   }
+}
+
+// As in window/moving.py: what noise has at a rank, a share of all, and of how many at least.
+struct NoiseLimits {
+  double at_rank, rank;
+  std::int64_t known;
+};
+
+// How many times as large as noise the better ones of some residuals are, 1 or more; they change their order.
+inline double times_noise(std::vector<double>& norms, const NoiseLimits& at) {
+  const auto n = std::count_if(norms.begin(), norms.end(), [](double norm) { return std::isfinite(norm); });
+  const auto rank = static_cast<std::ptrdiff_t>(at.rank * static_cast<double>(n));
+  const auto noise = [&at](double norm) { return norm <= at.at_rank; };
+  if (n < at.known || std::count_if(norms.begin(), norms.end(), noise) > rank) return 1.0;
+  std::nth_element(norms.begin(), norms.begin() + rank, norms.end());
+  return std::max(1.0, norms[static_cast<std::size_t>(rank)] / at.at_rank);
+}
+
+// How many times as large as noise the residuals of each keyframe are where it begins, (n_keyframes,): as those of all
+// are, or its own, if no solve has refined its pose yet.
+inline std::vector<double> off_noise(const ResidualsView& seen, const bool* unrefined, std::int64_t n_keyframes,
+                                     const NoiseLimits& at) {
+  std::vector<double> norms(seen.norms, seen.norms + seen.n);
+  std::vector<double> off(n_keyframes, times_noise(norms, at));
+  for (std::int64_t k = 0; k < n_keyframes; ++k) {
+    if (!unrefined[k]) continue;
+    norms.clear();
+    for (std::int64_t o = 0; o < seen.n; ++o)
+      if (seen.keyframe[o] == k) norms.push_back(seen.norms[o]);
+    off[k] = std::max(off[k], times_noise(norms, at));
+  }
+  return off;
+}
+
+// As in window/trial.py: how many points are wanted, of more views than so many, and the multiplier of ids.
+struct TriedLimits {
+  std::int64_t wanted, least_views;
+  std::uint64_t hash;
+};
+
+// The points to try poses on, in the order of their keys: those with the lowest, whatever else there is.
+inline std::vector<std::int64_t> to_try(const std::uint64_t* track_id, std::int64_t n_points, const RowsView& points,
+                                        const TriedLimits& at) {
+  std::vector<std::int64_t> views(n_points), found;
+  for (std::int64_t i = 0; i < points.n; ++i) ++views[points.row[i]];
+  const auto list = [&](std::int64_t more_than) {
+    found.clear();
+    for (std::int64_t p = 0; p < n_points; ++p)
+      if (views[p] > more_than) found.push_back(p);
+  };
+  list(at.least_views);
+  if (static_cast<std::int64_t>(found.size()) < at.wanted) list(1);
+  const auto before = [&](std::int64_t a, std::int64_t b) { return track_id[a] * at.hash < track_id[b] * at.hash; };
+  const std::int64_t most = std::min<std::int64_t>(std::max<std::int64_t>(at.wanted, 0), found.size());
+  std::partial_sort(found.begin(), found.begin() + most, found.end(), before);
+  found.resize(most);
+  return found;
 }
 
 // Views sorted by point; norms in sigmas.

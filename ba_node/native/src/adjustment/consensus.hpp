@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "adjustment/triangulate.hpp"
+#include "simd/simd.hpp"
 
 namespace ba::BA_TARGET {
 
@@ -33,14 +34,34 @@ class Consensus {
       first_ = row_.data() + begin_[p];
       n_ = begin_[p + 1] - begin_[p];
       if (n_ == 0) continue;
+      load_rays();
       search();
-      for (std::int64_t k = 0; k < n_; ++k) agrees[first_[k]] = error2(k, best_, best_far_) < gate2_;
+      for (std::int64_t k = 0; k < n_; k += kLanes) {
+        const V8 errors = best_far_ ? errors2<true>(k, best_) : errors2<false>(k, best_);
+        for (std::int64_t l = 0; l < std::min<std::int64_t>(kLanes, n_ - k); ++l)
+          agrees[first_[k + l]] = errors[static_cast<int>(l)] < gate2_;
+      }
     }
   }
 
  private:
   const double* centre(std::int64_t k) const { return rays_.centre + 3 * first_[k]; }
   const double* direction(std::int64_t k) const { return rays_.direction + 3 * first_[k]; }
+
+  // The rays of the point at hand, eight to a block; lanes behind the last are zero.
+  void load_rays() {
+    const std::int64_t size = (n_ + kLanes - 1) / kLanes * kLanes;
+    lanes_.assign(7 * size, 0.0);
+    for (std::int64_t k = 0; k < n_; ++k) {
+      double* at = lanes_.data() + 7 * (k / kLanes * kLanes) + k % kLanes;
+      for (int i = 0; i < 3; ++i) {
+        at[i * kLanes] = centre(k)[i];
+        at[(3 + i) * kLanes] = direction(k)[i];
+      }
+      const double scale = rays_.px_per_rad[first_[k]];
+      at[6 * kLanes] = scale * scale;
+    }
+  }
 
   void search() {
     best_score_ = std::numeric_limits<double>::infinity();
@@ -87,35 +108,41 @@ class Consensus {
 
   void attempt(const double* x, bool far) {
     double score = 0.0;
-    for (std::int64_t k = 0; k < n_; ++k) {
-      score += error2(k, x, far);
-      if (!(score < best_score_)) return;
+    for (std::int64_t k = 0; k < n_; k += kLanes) {
+      const V8 errors = far ? errors2<true>(k, x) : errors2<false>(k, x);
+      for (std::int64_t l = 0; l < std::min<std::int64_t>(kLanes, n_ - k); ++l) {
+        score += errors[static_cast<int>(l)];
+        if (!(score < best_score_)) return;
+      }
     }
     best_score_ = score;
     best_far_ = far;
     std::copy_n(x, 3, best_);
   }
 
-  // Squared angle between a ray and a point (or a direction, for one far away), in sigmas; at most the gate's.
-  double error2(std::int64_t k, const double* x, bool far) const {
-    const double *d = direction(k), *c = centre(k);
-    double away[3], dot = 0.0;
+  // Squared angles between eight rays, from the k-th on, and a point (or a direction, for one far away), in sigmas; at
+  // most the gate's.
+  template <bool kFar>
+  V8 errors2(std::int64_t k, const double* x) const {
+    const double* at = lanes_.data() + 7 * k;
+    V8 away[3], d[3];
     for (int i = 0; i < 3; ++i) {
-      away[i] = far ? x[i] : x[i] - c[i];
-      dot += away[i] * d[i];
+      away[i] = kFar ? splat(x[i]) : x[i] - load(at + i * kLanes);
+      d[i] = load(at + (3 + i) * kLanes);
     }
-    if (!(dot > 0.0)) return gate2_;
-    const double cross[3] = {d[1] * away[2] - d[2] * away[1], d[2] * away[0] - d[0] * away[2],
-                             d[0] * away[1] - d[1] * away[0]};
-    const double scale = rays_.px_per_rad[first_[k]];
-    const double across = cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2];
-    const double length = away[0] * away[0] + away[1] * away[1] + away[2] * away[2];
-    return std::min(scale * scale * across / length, gate2_);
+    const V8 dot = away[0] * d[0] + away[1] * d[1] + away[2] * d[2];
+    const V8 cross[3] = {d[1] * away[2] - d[2] * away[1], d[2] * away[0] - d[0] * away[2],
+                         d[0] * away[1] - d[1] * away[0]};
+    const V8 across = cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2];
+    const V8 length = away[0] * away[0] + away[1] * away[1] + away[2] * away[2];
+    const V8 error = load(at + 6 * kLanes) * across / length, most = splat(gate2_);
+    return select(dot > 0.0, select(error > most, most, error), most);
   }
 
   RaysView rays_;
   double gate2_;
   std::vector<std::int64_t> begin_, row_;  // of each point's rays; rows by point
+  std::vector<double> lanes_;              // of the point at hand: by block of eight rays, seven numbers by lane
   const std::int64_t* first_ = nullptr;    // rows of the point at hand
   std::int64_t n_ = 0;
   double best_[3] = {}, best_score_ = 0.0;

@@ -27,37 +27,44 @@ inline void in_camera(const ProblemView& p, const StateView& s, std::int64_t o, 
 
 template <Lens kLens>
 void residual_norms_as(const ProblemView& p, const StateView& s, double* out) {
+  constexpr int kUsed = kLens == Lens::kPinhole ? 4 : kParams;
   for (std::int64_t first = 0; first < p.n_obs; first += kLanes) {
     const int count = static_cast<int>(std::min<std::int64_t>(kLanes, p.n_obs - first));
-    V8 x[3] = {};
+    V8 x[3] = {}, seen[2] = {}, sigma{};
     Cameras cameras{};
     for (int l = 0; l < kLanes; ++l) {
       const std::int64_t o = first + std::min(l, count - 1);
       double y[3];
       in_camera(p, s, o, y);
       for (int i = 0; i < 3; ++i) x[i][l] = y[i];
-      for (int i = 0; i < kParams; ++i) cameras.param[i][l] = p.params[kParams * p.camera[o] + i];
-      cameras.fisheye[l] = p.model[p.camera[o]];
+      for (int i = 0; i < kUsed; ++i) cameras.param[i][l] = p.params[kParams * p.camera[o] + i];
+      if constexpr (kLens == Lens::kMixed) cameras.fisheye[l] = p.model[p.camera[o]];
+      for (int i = 0; i < 2; ++i) seen[i][l] = p.uv[2 * o + i];
+      sigma[l] = p.sigma[o];
     }
     Projected q;
     project<kLens, false>(x, cameras, q);
-    for (int l = 0; l < count; ++l) {
-      const std::int64_t o = first + l;
-      const double du = q.uv[0][l] - p.uv[2 * o], dv = q.uv[1][l] - p.uv[2 * o + 1];
-      const double norm = std::sqrt(du * du + dv * dv) / p.sigma[o];
-      const double y[3] = {x[0][l], x[1][l], x[2][l]};
-      const bool counts = !is_behind(y, kLens == Lens::kMixed && cameras.fisheye[l] != 0.0) && !std::isnan(norm);
-      out[o] = counts ? norm : std::numeric_limits<double>::infinity();
-    }
+    const V8 du = q.uv[0] - seen[0], dv = q.uv[1] - seen[1];
+    const V8 norm = root(du * du + dv * dv) / sigma, none = splat(std::numeric_limits<double>::infinity());
+    // A number that is none is not equal to itself.
+    const V8 found = select(behind<kLens>(x, cameras, false) | (norm != norm), none, norm);
+    for (int l = 0; l < count; ++l) out[first + l] = found[l];
   }
 }
 
 // out: n_obs, sigmas; infinite for points that their camera cannot see.
 inline void residual_norms(const ProblemView& p, const StateView& s, double* out) {
-  if (std::any_of(p.model, p.model + p.n_cameras, [](std::uint8_t model) { return model != 0; }))
+  const std::int64_t n = p.n_cameras;
+  const auto bent = [&p](std::int64_t c) {
+    return std::any_of(p.params + kParams * c + 4, p.params + kParams * (c + 1), [](double k) { return k != 0.0; });
+  };
+  if (std::any_of(p.model, p.model + n, [](std::uint8_t model) { return model != 0; })) {
     residual_norms_as<Lens::kMixed>(p, s, out);
-  else
-    residual_norms_as<Lens::kRational>(p, s, out);
+  } else {
+    bool straight = true;
+    for (std::int64_t c = 0; c < n; ++c) straight &= !bent(c);
+    straight ? residual_norms_as<Lens::kPinhole>(p, s, out) : residual_norms_as<Lens::kRational>(p, s, out);
+  }
 }
 
 }  // namespace ba::BA_TARGET

@@ -49,6 +49,30 @@ inline bool is_sound(const ProblemView& p, const StateView& s) {
          (s.intrinsics == nullptr || all_finite(s.intrinsics, 3 * p.n_keyframes));
 }
 
+// Relative poses of keyframes: n of them.
+struct StepsView {
+  std::int64_t n;
+  const std::int64_t* keyframes;                // (n, 2)
+  const double *rotation, *translation, *root;  // (n, 3, 3), (n, 3), (n, 6, 6)
+};
+
+// Whether they are finite, of different keyframes that exist, and rotations to within `most`, as core/factors.py asks.
+inline bool are_sound(const StepsView& steps, std::int64_t n_keyframes, double most) {
+  for (std::int64_t k = 0; k < steps.n; ++k) {
+    const std::int64_t first = steps.keyframes[2 * k], second = steps.keyframes[2 * k + 1];
+    const double* r = steps.rotation + 9 * k;
+    if (first == second || std::min(first, second) < 0 || std::max(first, second) >= n_keyframes) return false;
+    for (int i = 0; i < 3; ++i)
+      for (int j = i; j < 3; ++j) {
+        const double off = r[3 * i] * r[3 * j] + r[3 * i + 1] * r[3 * j + 1] + r[3 * i + 2] * r[3 * j + 2] - (i == j);
+        if (!(std::abs(off) <= most)) return false;
+      }
+    const double across[3] = {r[4] * r[8] - r[5] * r[7], r[5] * r[6] - r[3] * r[8], r[3] * r[7] - r[4] * r[6]};
+    if (!(r[0] * across[0] + r[1] * across[1] + r[2] * across[2] > 0.0)) return false;
+  }
+  return all_finite(steps.translation, 3 * steps.n) && all_finite(steps.root, 36 * steps.n);
+}
+
 // The inverse of a symmetric 6 x 6 matrix by Cholesky; false if a variance is above `most` of a matrix that is scaled
 // to a unit diagonal, or if it is not positive definite.
 inline bool inverse6(const double* a, double most, double* out) {

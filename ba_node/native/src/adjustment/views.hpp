@@ -8,6 +8,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <utility>
 #include <vector>
@@ -103,6 +104,47 @@ struct PlacedView {
     return keyframe != other.keyframe ? keyframe < other.keyframe : camera < other.camera;
   }
 };
+
+// Where views are written: as core.problem.Observations has them, and their rows.
+struct ViewsSpan {
+  std::int64_t *row, *keyframe, *camera, *point;
+  double *uv, *sigma, *depth;
+
+  // Writes the i-th; returns whether its depth was measured.
+  bool put(std::int64_t i, const TableView& table, const PlacedView& v) const {
+    row[i] = v.row;
+    keyframe[i] = v.keyframe;
+    camera[i] = v.camera;
+    point[i] = v.point;
+    uv[2 * i] = table.uv[2 * v.row];
+    uv[2 * i + 1] = table.uv[2 * v.row + 1];
+    sigma[i] = table.sigma[v.row];
+    depth[i] = table.depth[v.row];
+    return !std::isnan(depth[i]);
+  }
+};
+
+// How many of some views are by keyframes in a list.
+inline std::int64_t count_placed(const TableView& table, const RowsView& rows, const Numbered& keyframes) {
+  return std::count_if(rows.row, rows.row + rows.n,
+                       [&](std::int64_t row) { return keyframes[table.keyframe[row]] >= 0; });
+}
+
+// Writes these as they come, if that is sorted by point, keyframe, camera, as it mostly is; else returns false.
+inline bool put_in_order(const TableView& table, const RowsView& rows, const Numbered& keyframes,
+                         const Numbered& landmarks, const ViewsSpan& out, bool& measured) {
+  PlacedView last{-1, -1, -1, -1};
+  std::int64_t n = 0;
+  for (std::int64_t i = 0; i < rows.n; ++i) {
+    const std::int64_t row = rows.row[i], keyframe = keyframes[table.keyframe[row]];
+    if (keyframe < 0) continue;
+    const PlacedView v{landmarks[table.landmark[row]], keyframe, table.camera[row], row};
+    if (v < last) return false;
+    measured |= out.put(n++, table, v);
+    last = v;
+  }
+  return true;
+}
 
 // Those of some views whose keyframe is in a list, sorted by point, keyframe, camera; all landmarks are in theirs.
 inline std::vector<PlacedView> placed(const TableView& table, const RowsView& rows, const Numbered& keyframes,

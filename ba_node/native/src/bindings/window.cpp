@@ -7,11 +7,14 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <tuple>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
 #include "adjustment/choice.hpp"
+#include "adjustment/quaternions.hpp"
 #include "adjustment/sound.hpp"
 #include "adjustment/trial.hpp"
 #include "adjustment/views.hpp"
@@ -82,28 +85,17 @@ py::tuple gather(const py::object& table, const Ints& rows, const std::pair<Ints
   const Numbered keyframes(rows_view(listed.first), of_keyframe.mutable_data());
   const Numbered landmarks(rows_view(listed.second), of_landmark.mutable_data());
   const RowsView asked = rows_view(rows);
-  const std::vector<PlacedView> views =
-      unless_short(asked.n, [&] { return placed(from, asked, keyframes, landmarks); });
-  const auto n = static_cast<py::ssize_t>(views.size());
+  const auto n = static_cast<py::ssize_t>(count_placed(from, asked, keyframes));
   Ints row({n}), keyframe({n}), camera({n}), point({n});
   Doubles uv({n, py::ssize_t{2}}), sigma({n}), depth({n});
-  std::int64_t *to_row = row.mutable_data(), *to_keyframe = keyframe.mutable_data(), *to_camera = camera.mutable_data(),
-               *to_point = point.mutable_data();
-  double *to_uv = uv.mutable_data(), *to_sigma = sigma.mutable_data(), *to_depth = depth.mutable_data();
+  const ViewsSpan out{row.mutable_data(), keyframe.mutable_data(), camera.mutable_data(), point.mutable_data(),
+                      uv.mutable_data(),  sigma.mutable_data(),    depth.mutable_data()};
   bool measured = false;
-  unless_short(n, [&] {
-    for (py::ssize_t i = 0; i < n; ++i) {
-      const PlacedView& v = views[i];
-      to_row[i] = v.row;
-      to_keyframe[i] = v.keyframe;
-      to_camera[i] = v.camera;
-      to_point[i] = v.point;
-      to_uv[2 * i] = from.uv[2 * v.row];
-      to_uv[2 * i + 1] = from.uv[2 * v.row + 1];
-      to_sigma[i] = from.sigma[v.row];
-      to_depth[i] = from.depth[v.row];
-      measured |= !std::isnan(to_depth[i]);
-    }
+  unless_short(asked.n, [&] {
+    if (put_in_order(from, asked, keyframes, landmarks, out, measured)) return;
+    const std::vector<PlacedView> views = placed(from, asked, keyframes, landmarks);
+    measured = false;
+    for (py::ssize_t i = 0; i < n; ++i) measured |= out.put(i, from, views[i]);
   });
   return py::make_tuple(row, keyframe, camera, point, uv, sigma, measured ? depth : Doubles({py::ssize_t{0}}));
 }
@@ -208,6 +200,90 @@ Array<bool> move_more_than_noise(const py::object& observations, const Doubles& 
   return found;
 }
 
+// unplaced: points that have no place, (n_pt,). of_noise, limits: as NoiseLimits and MotionLimits.
+py::tuple seem_to_move(const py::object& observations, const Doubles& norms, const Array<bool>& unplaced,
+                       const Array<bool>& unrefined, const std::tuple<double, double, std::int64_t>& of_noise,
+                       const std::array<double, 5>& limits) {
+  const Ints keyframe = array_of<std::int64_t>(observations, "keyframe"),
+             point = array_of<std::int64_t>(observations, "point");
+  std::vector<double> counted(norms.data(), norms.data() + norms.size());
+  for (std::size_t o = 0; o < counted.size(); ++o)
+    if (unplaced.data()[point.data()[o]]) counted[o] = std::numeric_limits<double>::infinity();
+  const auto& [at_rank, rank, known] = of_noise;
+  ResidualsView seen{norms.size(), point.data(), keyframe.data(), counted.data(), nullptr};
+  Doubles off({unrefined.size()});
+  const std::vector<double> times = off_noise(seen, unrefined.data(), unrefined.size(), {at_rank, rank, known});
+  std::copy(times.begin(), times.end(), off.mutable_data());
+  seen.off = off.data();
+  Array<bool> found({unplaced.size()});
+  leave_more_than_noise(seen, unplaced.size(), {limits[0], limits[1], limits[2], limits[3], limits[4]},
+                        found.mutable_data());
+  return py::make_tuple(off, found);
+}
+
+// As residual_norms, of some observations.
+Doubles residual_norms_of(const py::object& problem, const py::object& state, const Ints& rows) {
+  const ProblemArrays arrays(problem);
+  const StateArrays at(state);
+  ProblemView view = arrays.view();
+  const auto taken = [&rows](const auto* from, std::int64_t width) {
+    std::vector<std::decay_t<decltype(*from)>> out;
+    out.reserve(width * rows.size());
+    for (py::ssize_t i = 0; i < rows.size(); ++i)
+      out.insert(out.end(), from + width * rows.data()[i], from + width * (rows.data()[i] + 1));
+    return out;
+  };
+  const auto keyframe = taken(view.keyframe, 1), camera = taken(view.camera, 1), point = taken(view.point, 1);
+  const auto uv = taken(view.uv, 2), sigma = taken(view.sigma, 1);
+  view.n_obs = rows.size();
+  view.keyframe = keyframe.data();
+  view.camera = camera.data();
+  view.point = point.data();
+  view.uv = uv.data();
+  view.sigma = sigma.data();
+  view.depth = view.depth_sigma = nullptr;
+  Doubles norms({rows.size()});
+  active_target().residual_norms(view, at.view(), norms.mutable_data());
+  return norms;
+}
+
+// point: of each observation that may be tried. least_views, hash: as TriedLimits.
+Ints tracks_to_try(const Column<std::uint64_t>& track_id, const Ints& point, std::int64_t wanted,
+                   std::int64_t least_views, std::uint64_t hash) {
+  return ints(to_try(track_id.data(), track_id.size(), rows_view(point), {wanted, least_views, hash}));
+}
+
+// Of rotations (n, 3, 3), and back.
+Doubles quaternions(const Doubles& rotation) {
+  const py::ssize_t n = rotation.size() / 9;
+  Doubles out({n, py::ssize_t{4}});
+  for (py::ssize_t i = 0; i < n; ++i) quaternion_of(rotation.data() + 9 * i, out.mutable_data() + 4 * i);
+  return out;
+}
+
+Doubles rotations(const Doubles& quaternion) {
+  const py::ssize_t n = quaternion.size() / 4;
+  Doubles out({n, py::ssize_t{3}, py::ssize_t{3}});
+  for (py::ssize_t i = 0; i < n; ++i) rotation_of(quaternion.data() + 4 * i, out.mutable_data() + 9 * i);
+  return out;
+}
+
+// bounds: of pixels, sigma from and to, depth from and to.
+bool are_sane_tracks(const Column<std::uint64_t>& ids, const Doubles& uv, const Doubles& sigma, const Doubles& depth,
+                     const std::array<double, 5>& bounds) {
+  const auto [pixel, least_sigma, most_sigma, least_depth, most_depth] = bounds;
+  bool good = ids.size() > 0;
+  for (py::ssize_t i = 1; i < ids.size(); ++i) good &= ids.data()[i] > ids.data()[i - 1];
+  for (py::ssize_t i = 0; i < uv.size(); ++i) good &= std::abs(uv.data()[i]) <= pixel;
+  for (py::ssize_t i = 0; i < sigma.size(); ++i)
+    good &= least_sigma <= sigma.data()[i] && sigma.data()[i] <= most_sigma;
+  for (py::ssize_t i = 0; i < depth.size(); ++i) {
+    const double d = depth.data()[i];
+    good &= std::isnan(d) || (least_depth <= d && d <= most_depth);
+  }
+  return good;
+}
+
 // points: where they are and began, (n, 3) m; of: the centre (3,) and what may not be far away, (n,) or (0,). limits:
 // as ReturnLimits.
 py::tuple may_have_run_away_of(const Ints& point, const Doubles& norms, const std::pair<Doubles, Doubles>& points,
@@ -275,6 +351,15 @@ bool is_sound_problem(const py::object& problem) {
   return unless_short(view.n_obs, [&] { return is_sound(view, start); });
 }
 
+// most: as are_sound.
+bool are_sound_steps(const py::object& steps, std::int64_t n_keyframes, double most) {
+  const Ints keyframes = array_of<std::int64_t>(steps, "keyframes");
+  const Doubles rotation = array_of<double>(steps, "rotation"), translation = array_of<double>(steps, "translation"),
+                root = array_of<double>(steps, "root_information");
+  return are_sound({keyframes.shape(0), keyframes.data(), rotation.data(), translation.data(), root.data()},
+                   n_keyframes, most);
+}
+
 // most: variances of blocks that are scaled to a unit diagonal.
 py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double most) {
   const auto [sigma_m, sigma_rad] = loosest(blocks.data(), positions.data(), blocks.shape(0), most);
@@ -290,7 +375,14 @@ void bind_window(py::module_& m) {
   m.def("explained", &explained);
   m.def("agreed", &agreed);
   m.def("is_sound", &is_sound_problem);
+  m.def("are_sound", &are_sound_steps);
   m.def("loosest", &loosest_of);
+  m.def("seem_to_move", &seem_to_move);
+  m.def("residual_norms_of", &residual_norms_of);
+  m.def("are_sane_tracks", &are_sane_tracks);
+  m.def("tracks_to_try", &tracks_to_try);
+  m.def("quaternions", &quaternions);
+  m.def("rotations", &rotations);
   m.def("gather", &gather);
   m.def("take", &take);
   m.def("rays", &rays);
