@@ -15,6 +15,7 @@ Where a step of PCG costs next to nothing beside an exact solution, PCG is tried
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -67,7 +68,8 @@ class ReducedSolver:
         radius *= system.radius_factor
         if self.kind != "pcg":
             x = system.solve_dense() if self.kind == "dense" else system.solve_sparse()
-            if x is None or not np.logical_and.reduce(np.isfinite(x)):
+            # One call, and short: no square is finite of what is not, nor of a step that is no step any more.
+            if x is None or not math.isfinite(np.dot(x, x)):
                 return linear.Solution(None)
             share = self._share_inside(x, system, hessian, radius)
             return linear.Solution(x if share == 1.0 else share * x, on_boundary=share < 1.0)
