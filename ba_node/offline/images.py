@@ -57,6 +57,8 @@ _BEGIN_NS = 1_000_000_000
 # Digits of nanoseconds since 1970.
 _NS_DIGITS = 16
 _QUEUE = 100
+# Bytes of a message until after its header's stamp.
+_STAMPED = 12
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,30 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
 
     source = ImageSource(rig, mode, 0, read)
     source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
+    if request.rig is None:
+        source.warnings |= _changes(reader, [_info_of(reader, chosen[name]) for name in cameras_of(mode)], rig)
     return source
+
+
+def _changes(reader: BagReader, infos: Sequence[str], rig: CameraRig) -> dict[str, str]:
+    """Return in words which cameras change within a recording, of which the first that is said counts; by kind."""
+    found: dict[str, str] = {}
+    first: dict[str, tuple[bytes, Any]] = {}
+    for topic, _, _, data in reader.messages(infos):
+        if topic not in first:
+            first[topic] = data[_STAMPED:], reader.decode(topic, data)
+        elif data[_STAMPED:] != first[topic][0] and f"{topic} changes" not in found:
+            with contextlib.suppress(BagError):
+                message = reader.decode(topic, data)
+                if any(list(getattr(message, key)) != list(getattr(first[topic][1], key)) for key in ("k", "d", "p")):
+                    at = stamp_ns_from_message(message.header.stamp)
+                    words = f"{topic} is another calibration from {at} ns on: the first is taken for all images"
+                    found[f"{topic} changes"] = f"{words}; cut the recording there, or give --rig"
+    moved = static_tree(reader).moved & {rig.frame_id, *rig.names}
+    if moved:
+        words = f"/tf_static says two places of {', '.join(sorted(moved))}: the last is taken"
+        found["tf_static"] = f"{words}; let one node publish it, or give --rig"
+    return found
 
 
 def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str, str], mode: str) -> CameraRig:
