@@ -51,6 +51,7 @@ FOLDERS = {
 }
 PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
+_ODOMETRY = "nav_msgs/msg/Odometry"
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _BEGIN_NS = 1_000_000_000
@@ -105,7 +106,7 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     chosen = _image_topics(reader, request)
     mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
     rig = _first_cameras(request.rig or _recorded_rig(reader, request, chosen, mode), mode, str(reader.path))
-    odometry = absolute(request.topics["odometry"]) if "odometry" in request.topics else ""
+    odometry = _odometry_topic(reader, request)
     topics = {topic: name for name, topic in chosen.items()}
 
     def read() -> Iterator[tuple[Images, Transform | None]]:
@@ -140,12 +141,26 @@ def _changes(reader: BagReader, infos: Sequence[str], rig: CameraRig) -> dict[st
     return found
 
 
+def _odometry_topic(reader: BagReader, request: ImageRequest) -> str:
+    """Return the topic of the odometry, empty if none was asked for."""
+    if "odometry" not in request.topics:
+        return ""
+    topic = absolute(request.topics["odometry"])
+    if reader.topics.get(topic) != _ODOMETRY:
+        there = ", ".join(name for name, kind in sorted(reader.topics.items()) if kind == _ODOMETRY) or "none"
+        raise BagError(f"{reader.path}: odometry={topic}: no topic of {_ODOMETRY}; there are: {there}")
+    return topic
+
+
 def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str, str], mode: str) -> CameraRig:
     infos = [_info_of(reader, chosen[name], alone=mode != "stereo") for name in cameras_of(mode)]
     # A camera_rig tells all that camera_info would.
     known = [] if _RIG in reader.topics.values() and not set(infos) <= set(reader.topics) else infos
     rectified = request.rectified or any(RECTIFIED in chosen[name] for name in cameras_of(mode))
-    return rig_of_recording(reader, known, rectified=rectified, base=request.base)
+    rig = rig_of_recording(reader, known, rectified=rectified, base=request.base)
+    if request.base not in ("", rig.frame_id):
+        raise BagError(f"{reader.path}: /tf_static has no way from {request.base!r} (--base) to {rig.names[0]!r}")
+    return rig
 
 
 def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:
