@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 
 STANDARD_OUTPUT = Path("-")
+# Names of arguments for recordings that are read, and for files that are written.
+_READ, _WRITTEN = ("bag", "bags", "source", "odometry", "mask"), ("out", "target", "json", "csv")
+_RECORDINGS = (".mcap", ".db3")
 _out: list[IO[str]] = []
 _written: list[Path | None] = []
 
@@ -81,6 +84,22 @@ def require_folder(path: Path | None) -> None:
     """Raise TargetError if a file to write is in no folder, before long work is done for it."""
     if path is not None and not path.parent.is_dir():
         raise TargetError(f"{path}: there is no folder {path.parent}: make it first")
+
+
+def require_others(args: argparse.Namespace) -> None:
+    """Raise TargetError if a file to write is one of the recordings to read, or a part of one: it would be lost."""
+    for target in (path for name in _WRITTEN for path in _paths(args, name) if path.is_file()):
+        for source in (path for name in _READ for path in _paths(args, name) if path.exists()):
+            inside = source.is_dir() and target.suffix in _RECORDINGS and target.parent.samefile(source)
+            if inside or target.samefile(source):
+                where = "in the recording" if inside else "the recording"
+                raise TargetError(f"{target}: is {where} that is read, and would be lost: write to another name")
+
+
+def _paths(args: argparse.Namespace, name: str) -> list[Path]:
+    value = getattr(args, name, None)
+    values = value if isinstance(value, list) else [value]
+    return [Path(one) for one in values if isinstance(one, (str, Path))]
 
 
 def require_mcap(path: Path) -> None:

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from ba_node import __version__
 from ba_node.cli import interrupts
-from ba_node.cli.console import CheckoutError, add_json_option, conclude, json_alone, require_folder
+from ba_node.cli.console import CheckoutError, add_json_option, conclude, json_alone, require_folder, require_others
 
 # What every command does, under its heading in ``ba --help``; each is a file of this folder, or below ``experiments``.
 GROUPS: dict[str, dict[str, str]] = {
@@ -210,6 +210,7 @@ def _run(argv: Sequence[str] | None) -> int:
         args = build_parser(command).parse_args(arguments)
         asked = getattr(args, "json", None)
         require_folder(asked)
+        require_others(args)
         with json_alone(asked):
             code = module_of(args.command).run(args)
             if asked is not None:

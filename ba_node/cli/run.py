@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ba_node.cli import check, replay, track
-from ba_node.cli.console import add_parameter_options, progress_bar, write_result
+from ba_node.cli.console import TargetError, add_parameter_options, progress_bar, write_result
 
 EXAMPLE = "ba run drive.mcap --out out/drive\n  ba run kitti/sequences/07 --out out/kitti07"
 
@@ -41,6 +41,8 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.track import track as track_images  # noqa: PLC0415
 
     request = track.request(args)
+    if args.out.exists() and not args.out.is_dir():
+        raise TargetError(f"{args.out}: is no folder: results need one, of another name")
     args.out.mkdir(parents=True, exist_ok=True)
     tracks = args.out / "tracks.mcap"
     with progress_bar("track", "images") as progress:

@@ -26,8 +26,8 @@ _USUAL = 3
 _OFF_CENTRE = 0.25
 # A pair of which so few features have a partner is looked at with left and right exchanged.
 _FEW_PARTNERS = 0.25
-# No depth camera sees so far, m.
-_FAR_M = 200.0
+# No depth camera sees so far, or so near, m.
+_FAR_M, _NEAR_M = 200.0, 0.05
 # Share of an image that is found in any other by chance.
 _STRANGERS = 0.02
 # Corners that are tried, their distance from the border and the side of their patches, px.
@@ -121,6 +121,13 @@ class ImageWatch:
                 notes,
             )
             return dataclasses.replace(images, grey=images.grey[:1], depth_m=None)
+        if len(images.grey) > 1 and np.array_equal(images.grey[0], images.grey[1]):
+            self.say(
+                "same",
+                f"both images at {images.stamp_ns} ns are the same picture: not taken for a pair; check the topics",
+                notes,
+            )
+            return dataclasses.replace(images, grey=images.grey[:1])
         if len(images.grey) < len(self._rig) and images.depth_m is None:
             self.say("single", f"no second image at {images.stamp_ns} ns: followed in the first alone", notes)
         if images.depth_m is not None and images.depth_m.shape != images.grey[0].shape:
@@ -144,6 +151,9 @@ class ImageWatch:
             self.say("no_depth", f"depth image at {stamp_ns} ns has no depth (all 0 or NaN): check its topic", notes)
         elif np.median(known) > _FAR_M:
             text = f"depths of {np.median(known):.0f} m (median): 32FC1 is in m, 16UC1 in mm; are these millimetres?"
+            self.say("depth_unit", text, notes)
+        elif np.median(known) < _NEAR_M:
+            text = f"depths of {np.median(known):.3g} m (median): 32FC1 is in m, 16UC1 in mm; are these metres?"
             self.say("depth_unit", text, notes)
 
     def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:

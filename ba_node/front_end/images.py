@@ -47,6 +47,8 @@ _CHANNELS = (("rgba", 4), ("bgra", 4), ("8UC4", 4), ("yu", 2), ("uy", 2))
 # Quantiles of a 16-bit image that become black and white; it rarely uses all of its range.
 _DARK, _BRIGHT = 0.01, 0.99
 _MM = 0.001
+# Rows in which the order of bytes shows, and how much of the range neighbours of one colour differ by in noise.
+_ROWS, _NOISE = 16, 0.15
 
 
 def grey_of(message: Any) -> Grey:
@@ -137,7 +139,27 @@ def _pixels(message: Any, bits: int, channels: int) -> NDArray[Any]:
     kind = np.dtype({8: "u1", 16: "u2", 32: "f4"}[bits])
     as_sent = kind.newbyteorder(">" if message.is_bigendian else "<")
     pixels: NDArray[Any] = np.ascontiguousarray(rows).view(as_sent).astype(kind, copy=False)
+    if bits == 16:
+        _require_order(pixels.reshape(height, -1)[:: max(height // _ROWS, 1)], 2 * channels, message)
     return pixels.reshape((height, width) if channels == 1 else (height, width, channels))
+
+
+def _require_order(rows: NDArray[Any], apart: int, message: Any) -> None:
+    """Raise FrontEndError if 16-bit pixels are smooth with their bytes exchanged, and noise as they are."""
+    as_given, exchanged = (_roughness(one.astype(np.float32), apart) for one in (rows, rows.byteswap()))
+    if as_given > _NOISE and exchanged < as_given / 2.0:
+        raise FrontEndError(
+            f"{message.encoding} with is_bigendian = {int(message.is_bigendian)} is noise, and an image with the bytes"
+            " of each pixel exchanged: set is_bigendian to what the pixels are"
+        )
+
+
+def _roughness(rows: NDArray[np.float32], apart: int) -> float:
+    """Return by how much values differ that are so many apart (mean), as a share of the range of all."""
+    if rows.shape[1] <= apart:
+        return 0.0
+    low, high = np.quantile(rows, (_DARK, _BRIGHT))
+    return float(np.abs(rows[:, apart:] - rows[:, :-apart]).mean() / max(high - low, 1.0))
 
 
 def _to_8_bit(pixels: NDArray[Any]) -> Grey:

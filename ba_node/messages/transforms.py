@@ -18,6 +18,8 @@ from ba_node.messages.topics import TOPICS
 
 # Variance of what is not known, m^2 and rad^2.
 _UNKNOWN = 1e6
+# Places of a frame that differ by no more are one: m, and entries of the rotation.
+_SAME = 1e-4
 _VECTOR = "geometry_msgs/msg/Vector3"
 
 
@@ -76,6 +78,7 @@ class StaticTree:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Transform]] = {}
+        self.moved: set[str] = set()  # frames that were said to sit in two places
 
     def add(self, message: Any) -> None:
         """Take in a ``tf2_msgs/TFMessage``; a frame that is named again sits where it is said last."""
@@ -85,7 +88,15 @@ class StaticTree:
             position = np.array([t.x, t.y, t.z])
             if np.isfinite(position).all() and np.isfinite(quaternion).all() and np.linalg.norm(quaternion) > 0.0:
                 placed = Transform(geometry.matrix_from_quaternion(quaternion), position)
-                self._parents[_name(stamped.child_frame_id)] = (_name(stamped.header.frame_id), placed)
+                self._place(_name(stamped.child_frame_id), _name(stamped.header.frame_id), placed)
+
+    def _place(self, frame: str, parent: str, placed: Transform) -> None:
+        before = self._parents.get(frame)
+        if before is not None:
+            off = before[1].inverse().after(placed)
+            far = np.abs(off.translation).max() > _SAME or np.abs(off.rotation - np.eye(3)).max() > _SAME
+            self.moved |= {frame} if far or before[0] != parent else set()
+        self._parents[frame] = (parent, placed)
 
     def find(self, base: str, frame: str) -> Transform | None:
         """Return base from frame, None while the way from one to the other is not known."""

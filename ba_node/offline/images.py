@@ -51,12 +51,15 @@ FOLDERS = {
 }
 PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
+_ODOMETRY = "nav_msgs/msg/Odometry"
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _BEGIN_NS = 1_000_000_000
 # Digits of nanoseconds since 1970.
 _NS_DIGITS = 16
 _QUEUE = 100
+# Bytes of a message until after its header's stamp.
+_STAMPED = 12
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     chosen = _image_topics(reader, request)
     mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
     rig = _first_cameras(request.rig or _recorded_rig(reader, request, chosen, mode), mode, str(reader.path))
-    odometry = absolute(request.topics["odometry"]) if "odometry" in request.topics else ""
+    odometry = _odometry_topic(reader, request)
     topics = {topic: name for name, topic in chosen.items()}
 
     def read() -> Iterator[tuple[Images, Transform | None]]:
@@ -112,7 +115,41 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
 
     source = ImageSource(rig, mode, 0, read)
     source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
+    if request.rig is None:
+        source.warnings |= _changes(reader, [_info_of(reader, chosen[name]) for name in cameras_of(mode)], rig)
     return source
+
+
+def _changes(reader: BagReader, infos: Sequence[str], rig: CameraRig) -> dict[str, str]:
+    """Return in words which cameras change within a recording, of which the first that is said counts; by kind."""
+    found: dict[str, str] = {}
+    first: dict[str, tuple[bytes, Any]] = {}
+    for topic, _, _, data in reader.messages(infos):
+        if topic not in first:
+            first[topic] = data[_STAMPED:], reader.decode(topic, data)
+        elif data[_STAMPED:] != first[topic][0] and f"{topic} changes" not in found:
+            with contextlib.suppress(BagError):
+                message = reader.decode(topic, data)
+                if any(list(getattr(message, key)) != list(getattr(first[topic][1], key)) for key in ("k", "d", "p")):
+                    at = stamp_ns_from_message(message.header.stamp)
+                    words = f"{topic} is another calibration from {at} ns on: the first is taken for all images"
+                    found[f"{topic} changes"] = f"{words}; cut the recording there, or give --rig"
+    moved = static_tree(reader).moved & {rig.frame_id, *rig.names}
+    if moved:
+        words = f"/tf_static says two places of {', '.join(sorted(moved))}: the last is taken"
+        found["tf_static"] = f"{words}; let one node publish it, or give --rig"
+    return found
+
+
+def _odometry_topic(reader: BagReader, request: ImageRequest) -> str:
+    """Return the topic of the odometry, empty if none was asked for."""
+    if "odometry" not in request.topics:
+        return ""
+    topic = absolute(request.topics["odometry"])
+    if reader.topics.get(topic) != _ODOMETRY:
+        there = ", ".join(name for name, kind in sorted(reader.topics.items()) if kind == _ODOMETRY) or "none"
+        raise BagError(f"{reader.path}: odometry={topic}: no topic of {_ODOMETRY}; there are: {there}")
+    return topic
 
 
 def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str, str], mode: str) -> CameraRig:
@@ -120,7 +157,10 @@ def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str,
     # A camera_rig tells all that camera_info would.
     known = [] if _RIG in reader.topics.values() and not set(infos) <= set(reader.topics) else infos
     rectified = request.rectified or any(RECTIFIED in chosen[name] for name in cameras_of(mode))
-    return rig_of_recording(reader, known, rectified=rectified, base=request.base)
+    rig = rig_of_recording(reader, known, rectified=rectified, base=request.base)
+    if request.base not in ("", rig.frame_id):
+        raise BagError(f"{reader.path}: /tf_static has no way from {request.base!r} (--base) to {rig.names[0]!r}")
+    return rig
 
 
 def _image_topics(reader: BagReader, request: ImageRequest) -> dict[str, str]:

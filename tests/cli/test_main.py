@@ -195,3 +195,28 @@ def test_missing_ros_is_named() -> None:
     assert run.returncode == 2
     assert run.stderr.startswith("ba: error: import of rclpy halted")
     assert run.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["convert", "a.mcap", "a.mcap"],
+        ["cut", "a.mcap", "--out", "./a.mcap", "--start", "1"],
+        ["merge", "b.mcap", "a.mcap", "--out", "a.mcap"],
+        ["track", "a.mcap", "link.mcap"],
+        ["info", "a.mcap", "--json", "a.mcap"],
+        ["cut", "folder", "--out", "folder/part_0.mcap"],
+    ],
+)
+def test_what_is_read_is_not_written_over(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    for name in ("a.mcap", "b.mcap", "folder/part_0.mcap"):
+        (tmp_path / name).write_bytes(b"months of work")
+    (tmp_path / "link.mcap").symlink_to("a.mcap")
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert "that is read, and would be lost: write to another name" in error and error.count("\n") == 1
+    assert all((tmp_path / name).read_bytes() == b"months of work" for name in ("a.mcap", "folder/part_0.mcap"))

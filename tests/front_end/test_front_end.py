@@ -308,6 +308,15 @@ def test_what_is_wrong_with_images_is_said(stereo: list[Images], changes: dict[s
     assert front_end.process(stereo[2]).session_id == 1
 
 
+def test_one_picture_for_both_cameras_is_no_pair(stereo: list[Images]) -> None:
+    front_end = FrontEnd(world.rig(), PLAIN)
+    told = follow(front_end, [world.without(one, grey=one.grey[:1] * 2) for one in stereo[:6]])
+    assert "are the same picture: not taken for a pair" in told[0].notes[0]
+    assert all("the same picture" not in note for one in told[1:] for note in one.notes), "once"
+    assert front_end.counts["same"] == 6
+    assert all(one.guesses is None for one in told), "no depths from it"
+
+
 def test_left_and_right_exchanged(stereo: list[Images]) -> None:
     told = FrontEnd(world.rig(), PLAIN).process(world.without(stereo[0], grey=stereo[0].grey[::-1]))
     assert any("exchanged" in note for note in told.notes), told.notes

@@ -51,6 +51,22 @@ def test_16_bit_is_stretched(big: bool) -> None:
     assert found.max() == 255
 
 
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("encoding", ["mono16", "rgb16", "bayer_rggb16"])
+def test_bytes_in_the_wrong_order_are_named(encoding: str, big: bool) -> None:
+    deep = 3000 + 20 * GREY.astype(np.uint16)
+    deep = np.repeat(deep[..., None], 3, axis=2) if encoding == "rgb16" else deep
+    sent = message(deep, encoding, big=big)
+    grey_of(sent)
+    sent.is_bigendian = int(not big)
+    with pytest.raises(FrontEndError, match="bytes of each pixel exchanged: set is_bigendian"):
+        grey_of(sent)
+    # Noise and values of 8 bits are neither.
+    noise = np.random.default_rng(1).integers(0, 65536, (48, 64)).astype(np.uint16)
+    for pixels in (noise, GREY.astype(np.uint16), GREY.astype(np.uint16) << 8, np.full((48, 64), 7, np.uint16)):
+        assert grey_of(message(pixels, "mono16", big=big)).shape == (48, 64)
+
+
 @pytest.mark.parametrize(("pattern", "red"), [("rggb", (0, 0)), ("bggr", (1, 1)), ("gbrg", (1, 0)), ("grbg", (0, 1))])
 def test_bayer_patterns(pattern: str, red: tuple[int, int]) -> None:
     # A red surface: only the red pixels of the mosaic are bright, and grey is 0.3 of that everywhere.

@@ -116,3 +116,12 @@ def test_a_rectified_image_needs_p() -> None:
     one.p = [0.0] * 12
     with pytest.raises(ConversionError, match="p of 'left' is all zero"):
         rig_from_infos([one], rectified=True)
+
+
+def test_a_frame_that_was_said_to_sit_in_two_places_is_known() -> None:
+    one, other = ("base", "cam", [0.1, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]), ("base", "cam", [0.2, 0, 0], [0.0, 0, 0, 1.0])
+    assert static_tree(one, one).moved == set(), "said again"
+    tree = static_tree(one, other)
+    place = tree.find("base", "cam")
+    assert tree.moved == {"cam"} and place is not None and place.translation[0] == 0.2
+    assert static_tree(one, ("mast", *one[1:])).moved == {"cam"}

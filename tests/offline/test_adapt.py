@@ -127,3 +127,12 @@ def test_faults_of_the_recording_are_in_the_exit_code(tmp_path: Path) -> None:
     messages[3].message.channels[0].values = np.zeros(2, np.float32)
     bag = layouts.write(tmp_path / "bag", messages)
     assert main(["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "openvins"]) == 3
+
+
+def test_stamps_that_are_all_alike_are_in_the_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sent = list(layouts.openvins(layouts.scene(6)))
+    for one in sent:
+        one.message.header.stamp.sec = one.message.header.stamp.nanosec = 0
+    bag = layouts.write(tmp_path / "bag", sent)
+    assert main(["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "openvins"]) == 3
+    assert "repeated_keyframe = 5 (keyframe 0 came again)" in capsys.readouterr().out

@@ -130,6 +130,30 @@ def test_odometry_of_another_frame_is_said(tmp_path: Path) -> None:
     assert "no way from there to 'cam'" in source.warnings["odometry of another frame"]
 
 
+def test_a_calibration_that_changes_is_said(tmp_path: Path) -> None:
+    messages = [*stereo(), info("/left/camera_info", "left")]
+    source, _ = read(layouts.write(tmp_path / "same", messages))
+    assert source.warnings == {}
+    messages[-1].message.k[0] *= 1.2
+    source, _ = read(layouts.write(tmp_path / "other", messages))
+    (words,) = source.warnings.values()
+    assert "/left/camera_info is another calibration from" in words and "the first is taken" in words
+    assert source.rig.intrinsics[0, 0] == read(tmp_path / "same")[0].rig.intrinsics[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        ({"topics": {"odometry": "/left/image_raw"}}, "no topic of nav_msgs/msg/Odometry; there are: none"),
+        ({"topics": {"odometry": "/nope"}}, "odometry=/nope: no topic of nav_msgs/msg/Odometry"),
+        ({"base": "nope"}, "no way from 'nope'"),
+    ],
+)
+def test_what_is_asked_for_and_not_there_is_said(request_: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=words):
+        read(layouts.write(tmp_path / "bag", stereo()), **request_)
+
+
 def test_a_rig_is_given_or_recorded(tmp_path: Path) -> None:
     """Without camera_info; of a rig for two, one camera takes the first."""
     bag = layouts.write(tmp_path / "bag", [image("/cam0/image_raw", 1, 0), image("/cam1/image_raw", 1, 1)])
