@@ -34,3 +34,8 @@ def changed(record: Record, **values: Any) -> Record:
 def take_rows(record: Record, rows: Any) -> Record:
     """Return a dataclass of arrays with some rows of each; fields that are no arrays stay."""
     return type(record)(*(value[rows] if isinstance(value, np.ndarray) else value for value in vars(record).values()))
+
+
+def join_rows(first: Record, second: Record) -> Record:
+    """Return a dataclass of arrays with the rows of one, then those of another."""
+    return type(first)(*map(np.concatenate, zip(vars(first).values(), vars(second).values(), strict=True)))

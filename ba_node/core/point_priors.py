@@ -12,17 +12,15 @@ which is measured as D with the standard deviation s3. So the squares of all thr
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
+from ba_node.arrays import FloatArray, join_rows, take_rows
 from ba_node.core import cameras
 from ba_node.core.problem import Cameras, Observations, Problem, State
 
 # Metres; the digits that it costs are those beyond 1e-10 m.
 _FAR_M = 1e5
-Table = TypeVar("Table", Cameras, Observations, State)
 
 
 def as_observations(problem: Problem) -> Problem:
@@ -41,15 +39,14 @@ def as_observations(problem: Problem) -> Problem:
     theirs = Cameras(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), model, lens)
     known = replace(obs, depth_m=_filled(obs.depth_m, len(obs)), depth_sigma_m=_filled(obs.depth_sigma_m, len(obs)))
     which = n_kf + np.arange(n), n_cam + np.arange(n), priors.point
-    seen = _joined(known, Observations(*which, np.zeros((n, 2)), np.ones(n), np.full(n, _FAR_M), sigma[:, 2]))
-    order = np.argsort(seen.point, kind="stable")
+    seen = join_rows(known, Observations(*which, np.zeros((n, 2)), np.ones(n), np.full(n, _FAR_M), sigma[:, 2]))
     intrinsics = np.tile([1.0, 0.0, 0.0], (n if problem.free_intrinsics else 0, 1))
     return replace(
         problem,
-        start=_joined(start, State(rotation, translation, np.empty((0, 3)), intrinsics)),
+        start=join_rows(start, State(rotation, translation, np.empty((0, 3)), intrinsics)),
         fixed=np.concatenate([problem.fixed, np.ones(n, bool)]),
-        cameras=_joined(problem.cameras, theirs),
-        observations=Observations(*(values[order] for values in vars(seen).values())),
+        cameras=join_rows(problem.cameras, theirs),
+        observations=take_rows(seen, np.argsort(seen.point, kind="stable")),
         point_priors=None,
     )
 
@@ -58,11 +55,6 @@ def without(state: State, problem: Problem) -> State:
     """Return a state of :func:`as_observations` without the keyframes that this added."""
     n = problem.n_keyframes
     return State(state.rotation[:n], state.translation[:n], state.points, state.intrinsics[:n])
-
-
-def _joined(first: Table, second: Table) -> Table:
-    """Return the rows of one table, then those of another."""
-    return type(first)(*map(np.concatenate, zip(vars(first).values(), vars(second).values(), strict=True)))
 
 
 def _filled(depth: FloatArray, n: int) -> FloatArray:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray, join_rows, take_rows
 from ba_node.config import Config, FactorsConfig
 from ba_node.core import geometry
 from ba_node.core.factors import RelativePoses
@@ -63,10 +63,6 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.row)
-
-    def take(self, rows: IntArray | BoolArray) -> Pairs:
-        """Return some of them."""
-        return Pairs(*(values[rows] for values in vars(self).values()))
 
     def points(self, scene: Scene) -> FloatArray:
         """Return where the map has the points, (n, 3) m."""
@@ -132,8 +128,7 @@ def every_pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
     priors = list(known.values())
     covariance = np.array([_six(priors[i][1], config) for i in good]).reshape(-1, 6, 6)
     position = np.array([priors[i][0] for i in good]).reshape(-1, 3)
-    more = as_seen(scene, rows[good], seen, position, covariance)
-    return Pairs(*(np.concatenate(both) for both in zip(vars(pairs).values(), vars(more).values(), strict=True)))
+    return join_rows(pairs, as_seen(scene, rows[good], seen, position, covariance))
 
 
 def as_seen(scene: Scene, points: IntArray, seen: IntArray, position: FloatArray, covariance: FloatArray) -> Pairs:
@@ -170,7 +165,7 @@ def aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArr
     """Return map from world, None where too little is known."""
     if not len(pairs):
         return None
-    pairs = pairs.take(np.unique(np.linspace(0, len(pairs) - 1, _ALIGNED).astype(int)))
+    pairs = take_rows(pairs, np.unique(np.linspace(0, len(pairs) - 1, _ALIGNED).astype(int)))
     there = pairs.points(scene)
     sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     turn_rad = np.sqrt(np.trace(pairs.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0)
@@ -265,7 +260,7 @@ def factors(
     if known.absolute and known.map_from_world is not None and free.any():
         pairs = pair(scene, config.factors, int(scene.places()[rows[free]].min()))
         mine = number[pairs.row]
-        pairs = pairs.take((mine >= 0) & free[mine])
+        pairs = take_rows(pairs, (mine >= 0) & free[mine])
         if len(pairs):
             out.append(absolute(scene, config, pairs, number[pairs.row], origin))
     return out
