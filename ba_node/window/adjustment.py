@@ -298,10 +298,11 @@ def _merged(scene: Scene, config: Config, final: bool) -> Due | None:
     if both.any():
         _give_up(scene, pairs[both], "one image sees both, they are no one point")
         pairs, rows = pairs[~both], rows[~both]
-    new, seen = _most_seen(scene, rows[points.has_position[rows[:, 1]]])
-    placed = points.has_position[rows[:, 1]]
-    placed[placed] = seen
-    seen = placed
+    if np.count_nonzero(points.has_position[rows[:, 1]]) < LEAST:
+        # Windows of then gave them no place: those of now tell where the earlier keyframe is.
+        rows = rows[:, ::-1]
+    seen = points.has_position[rows[:, 1]]
+    new, seen[seen] = _most_seen(scene, rows[seen])
     if np.count_nonzero(seen) < LEAST:
         if final and known.merges:
             _give_up(scene, np.array(known.merges, np.uint64), f"no keyframe sees {LEAST} that have a place")
@@ -324,9 +325,8 @@ def _merged(scene: Scene, config: Config, final: bool) -> Due | None:
     measured = geometry.compose(*geometry.inverse(table.rotation[old], table.position[old]), *pose)
     root = np.diag(np.repeat([1.0 / sigma_rad, 1.0 / (sigma_rad * far_m)], 3))
     loop = RelativePoses(np.array([[old, new]]), measured[0][None], measured[1][None], root[None])
-    ids = table.keyframe_id
-    text = f"{len(joined)} merged tracks see keyframe {ids[new]} {moved:.2f} m beside where the map has it"
-    return Due(text, (loop,), joined)
+    off = f"{moved:.2f} m beside where the map has it"
+    return Due(f"{len(joined)} merged tracks see keyframe {table.keyframe_id[new]} {off}", (loop,), joined)
 
 
 def join(scene: Scene, pairs: tuple[tuple[int, int], ...]) -> None:

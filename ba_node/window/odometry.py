@@ -11,7 +11,8 @@ standard deviations grow with the path between them, of length l and turn a, ove
 They are those of good odometry. Where that of a recording is worse, keyframes that see much tell: with d the distances
 between their refined steps and the front-end's, in standard deviations of three axes, all are multiplied by
 ``median(d) / 1.54`` (1.54 is that of a normal distribution), for translation and rotation apart. Where it is better
-than images are, precision.py learns by what share.
+than images are, precision.py learns by what share. Where two cameras see little, refined steps lie between what images
+and front-end say, in the middle if both are as good; so half of what they are off is not seen, and d counts twice.
 
 So images decide where they see enough. Where these see little (no tracks, no parallax, a camera that stands still or
 turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
@@ -47,6 +48,8 @@ _MAX_GAP = 100
 # Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
 _LEAST_STEPS = 8
 MANY_OBSERVATIONS = 50
+# What refined steps are off by counts so many times where keyframes see little.
+_HALF_SEEN = 2.0
 # How many times as wide as stated the loss is once they have told, or where most see little to one camera; and before,
 # where all keyframes see much.
 _WIDE = 5.0
@@ -103,14 +106,18 @@ def factors(
         return ()
     many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= MANY_OBSERVATIONS
     stated = _front_end(scene, config, keyframes, tied)
-    much_moves = much_moves and not len(problem.observations.depth_m)
-    inflated = None if much_moves else _as_learned(scene, config, keyframes, many, stated)
+    depths, windowed = len(problem.observations.depth_m) > 0, len(keyframes) <= _WINDOW
+    much_moves = much_moves and not depths
+    learned_from = [(many, 1.0)]
+    if problem.has_scale and not depths and windowed:
+        learned_from.append((np.ones(len(many), bool), _HALF_SEEN))
+    inflated = None if much_moves else _as_learned(scene, config, keyframes, learned_from, stated)
     steps = stated if inflated is None else inflated
     if turned is not None:
         rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
-    few = not problem.has_scale and len(keyframes) <= _WINDOW and 2 * np.count_nonzero(many) < len(many)
+    few = not problem.has_scale and windowed and 2 * np.count_nonzero(many) < len(many)
     width = _WIDE if few or inflated is not None else 1.0
     if inflated is None and (much_moves or many.all()):
         width = _WIDEST
@@ -142,19 +149,21 @@ def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> Steps:
 
 
 def _as_learned(
-    scene: Scene, config: OdometryConfig, keyframes: IntArray, many: BoolArray, steps: Steps
+    scene: Scene, config: OdometryConfig, keyframes: IntArray, sources: list[tuple[BoolArray, float]], steps: Steps
 ) -> Steps | None:
-    """Return steps with standard deviations as well-determined keyframes show them to be.
+    """Return steps with standard deviations as refined keyframes show them to be, times a factor.
 
-    Smaller ones where precision.py has learned that. None where too few are known.
+    ``sources`` are such keyframes, (n_kf,), and their factors; the first of which there are enough tell. Smaller ones
+    where precision.py has learned that. None where too few are known.
     """
     shares = scene.step_shares
     if shares != (1.0, 1.0):
         steps = changed(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
     table = scene.keyframes
-    sure = many & table.refined[keyframes]
-    rows = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
-    if len(rows) < _LEAST_STEPS:
+    told = ((among & table.refined[keyframes], factor) for among, factor in sources)
+    steps_of = ((np.flatnonzero(sure[steps.first] & sure[steps.first + 1]), factor) for sure, factor in told)
+    rows, factor = next((one for one in steps_of if len(one[0]) >= _LEAST_STEPS), (steps.first[:0], 0.0))
+    if not len(rows):
         return None
     first = steps.first[rows]
     rotation, translation = _relative(table.rotation, table.position, keyframes[first], keyframes[first + 1])
@@ -162,7 +171,7 @@ def _as_learned(
     off = np.stack(
         [turned / steps.sigma_rad[rows, None], (translation - steps.translation[rows]) / steps.sigma_m[rows, None]]
     )
-    worse = np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1) / _MEDIAN_NORM
+    worse = factor * np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1) / _MEDIAN_NORM
     # Keyframes of before they were known to be precise are worse than they.
     times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
     return changed(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)

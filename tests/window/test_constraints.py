@@ -156,6 +156,20 @@ def test_noisy_loops_close_to_a_tenth(noise_px: float, baseline_m: float, seed: 
         assert rms[0] > 2.0 and rms[1] < 0.15 * rms[0], rms
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_loop_closes_where_the_first_keyframes_have_no_points(seed: int) -> None:
+    """All their windows are held, steps being 3 degrees off: later points tell where the earlier keyframe is."""
+    data = round_trip(0.5, seed=seed, drift_rotation_deg=3.0)
+    table = np.array(merges(data), np.uint64)
+    measurements = [*(one for _, _, one in data.timeline()), TrackMerge(0, table[:, 0], table[:, 1])]
+    backend = Backend(Config())
+    estimates = [one for one in backend.replay(measurements) if isinstance(one, Estimate)]
+    assert backend.report.merged_tracks >= 19, backend.report.rejected
+    rms = [aligned_rms(one.trajectory.position, data.truth.position[: len(one.trajectory)]) for one in estimates[-2:]]
+    assert rms[0] > 1.0 and rms[1] < 0.8 * rms[0], rms
+
+
 def test_what_cannot_be_is_counted(street: SyntheticData) -> None:
     good, pose = np.eye(6).ravel(), (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     negative = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]).ravel()
