@@ -90,6 +90,9 @@ def _convert_front_end(args: argparse.Namespace) -> int:
     topics = dict(text.split("=", 1) for text in args.topic if "=" in text)
     if len(topics) < len(args.topic):
         raise TargetError(f"--topic {' '.join(args.topic)}: expected NAME=TOPIC, each name once")
+    for name, least in (("tolerance", 0.0), ("parallax", 0.0), ("cameras", 0)):
+        if not least <= getattr(args, name) < float("inf"):
+            raise TargetError(f"--{name} {getattr(args, name):g}: expected a number, {least:g} or more")
     rig = load_rig(args.rig) if args.rig else None
     options = AdapterOptions(args.tolerance, args.parallax, rig=rig)
     adapter = adapt(args.source, args.target, args.front_end, options, args.cameras or (len(rig) if rig else 1), topics)

@@ -37,6 +37,9 @@ def adapt(
     Raises:
         BagError: topics are missing, nothing tells the cameras, or no keyframe comes of it.
     """
+    known = {one.name for name in (source, _INSTEAD.get(source, source)) for one in SOURCES[name].inputs}
+    if unknown := sorted(set(topics) - known):
+        raise BagError(f"--topic {unknown[0]}: {source} has no such input; it has: {', '.join(sorted(known))}")
     with BagReader(path) as reader:
         kinds = {one.type_name for one in SOURCES[source].inputs if one.role}
         if source in _INSTEAD and not kinds & set(reader.topics.values()) - {"nav_msgs/msg/Odometry"}:

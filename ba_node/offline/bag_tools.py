@@ -214,6 +214,8 @@ def cut(source: Path | Sequence[Path], target: Path, span: Span, progress: Progr
         BagError: the recording cannot be read, or nothing of it is of this time.
     """
     with BagReader(source) as reader:
+        if math.isnan(span.start_s) or math.isnan(span.end_s):
+            raise BagError(f"{reader.path}: from {span.start_s:g} to {span.end_s:g} s: expected numbers of seconds")
         names = None if span.topics is None else {name if name.startswith("/") else f"/{name}" for name in span.topics}
         missing = sorted((names or set()) - set(reader.topics))
         if missing:
@@ -221,7 +223,7 @@ def cut(source: Path | Sequence[Path], target: Path, span: Span, progress: Progr
         first = next((time_ns for _, time_ns, _ in reader.raw()), 0)
         start, end = first + span.start_s * _NS, first + span.end_s * _NS
         held: dict[str, tuple[BagChannel, bytes]] = {}
-        count, last = 0, int(start)
+        count, last = 0, int(min(max(start, 0.0), 2.0**63))
         with BagWriter(target) as writer:
             for done, (channel, time_ns, data) in enumerate(reader.raw(names), start=1):
                 progress(done, reader.message_count)

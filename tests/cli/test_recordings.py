@@ -141,3 +141,20 @@ def test_a_cut_of_nothing_writes_nothing(
     assert main(["cut", str(bag), "--out", str(tmp_path / "part.mcap"), *arguments]) == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--start", "nan"], "from nan to inf s: expected"),
+        (["--end", "nan"], "to nan s"),
+        (["--start", "inf"], "no message"),
+    ],
+)
+def test_a_cut_from_nowhere_is_said(
+    words: list[str], said: str, bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["cut", str(bag), "--out", str(tmp_path / "part.mcap"), *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert main(["cut", str(bag), "--out", str(tmp_path / "all.mcap"), "--start=-inf"]) == 0

@@ -136,3 +136,21 @@ def test_stamps_that_are_all_alike_are_in_the_exit_code(tmp_path: Path, capsys: 
     bag = layouts.write(tmp_path / "bag", sent)
     assert main(["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "openvins"]) == 3
     assert "repeated_keyframe = 5 (keyframe 0 came again)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--tolerance", "nan"], "--tolerance nan: expected a number, 0 or more"),
+        (["--parallax", "-1"], "--parallax -1: expected"),
+        (["--cameras", "-2"], "--cameras -2: expected"),
+        (["--topic", "loop_pos=/pose"], "--topic loop_pos: openvins has no such input; it has: loop_extrinsic"),
+    ],
+)
+def test_options_that_mean_nothing_are_said(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = layouts.write(tmp_path / "bag", layouts.openvins(layouts.scene(6)))
+    assert main(["convert", str(bag), str(tmp_path / "out.mcap"), "--from", "openvins", *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
