@@ -30,7 +30,7 @@ from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, constraints, full, retriangulation
+from ba_node.window import arrival, constraints, contradicted, full, retriangulation
 from ba_node.window.problems import problem_of
 
 # So many tracks place a keyframe; a view agrees within so many outlier gates, as the map has drifted apart.
@@ -118,7 +118,7 @@ class Adjustment:
         known = self.scene.constraints
         known.adjusted_at = len(self.scene.keyframes)
         if not why:
-            constraints.say_contradicted(self.scene, self.config.factors)
+            contradicted.say_contradicted(self.scene, self.config.factors)
             return
         if self.due.key is not None:
             known.refused.add(self.due.key)

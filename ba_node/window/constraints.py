@@ -43,8 +43,6 @@ _SETS, _IN_SET, _SCORED, _ROUNDS = 60, 5, 300, 10
 _SPREAD, _HEADING_RAD = 5.0, 0.03
 # What a relative pose is sure of to less than this (1/rad, 1/m) it does not measure.
 _NOTHING = 0.01
-# Pairs so many standard deviations beside the map contradict it; it is said if so many do, and this share.
-_BESIDE, _MANY, _TOO_MANY = 5.0, 5, 0.2
 
 # What a program that embeds the back-end adds: (scene, problem, rows of its keyframes in the scene) -> factors.
 Source = Callable[[Scene, Problem, IntArray], tuple[KeyframeFactors, ...]]
@@ -196,27 +194,6 @@ def aligned(scene: Scene, pairs: Pairs, config: FactorsConfig) -> tuple[FloatArr
     heading = sigma_m / (max(spread, 1e-9) * np.sqrt(len(pairs)))
     enough = spread >= max(config.align_m, _SPREAD * sigma_m) and heading <= _HEADING_RAD
     return best if enough or told <= _HEADING_RAD else None
-
-
-def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
-    """Say that many absolute measurements lie beside the map, where the others, or images, have outvoted them."""
-    known, log = scene.constraints, scene.log
-    log.warnings.pop("contradicted", None)
-    pairs = every_pair(scene, config)
-    if known.map_from_world is None or not len(pairs):
-        return
-    rotation, translation = known.map_from_world
-    off_m = np.linalg.norm(pairs.position @ rotation.T + translation - pairs.points(scene), axis=1)
-    wrong = off_m > _BESIDE * np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2))
-    count = int(np.count_nonzero(wrong))
-    if count >= _MANY and count > _TOO_MANY * len(pairs):
-        stamps = scene.keyframes.stamp_ns[pairs.row[wrong]]
-        log.warn(
-            "contradicted",
-            f"{count} of {len(pairs)} priors in frame {known.world_frame!r} lie {np.median(off_m[wrong]):.1f} m beside"
-            f" the map (median), from {stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s: they contradict the"
-            " others, or images and odometry, or their covariance is too small. Did their source change its reference?",
-        )
 
 
 def _kabsch(

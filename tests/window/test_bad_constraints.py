@@ -16,7 +16,12 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate
 from ba_node.measurements import GlobalFix, Keyframe, LandmarkPriors, Measurement, PosePrior, RelativePose
+<<<<<<< HEAD
 from experiments.synthetic import SyntheticData
+=======
+from ba_node.synthetic import SyntheticData
+from ba_node.window import contradicted
+>>>>>>> trust
 from tests.window.street import ANTENNA, ORIGIN, aligned_rms, first, fixes, pymap3d, stream, street_data, wheels
 
 KILOMETRE = np.array([600.0, -800.0, 0.0])
@@ -72,6 +77,31 @@ def test_fixes_that_are_a_kilometre_off_move_nothing(
     assert aligned_rms(last.trajectory.position, street.truth.position) < 0.4
     told = [line for line in backend.report.warnings if "50 of 100 priors in frame 'enu' lie 1001" in line]
     assert len(backend.report.warnings) == len(told) == said, backend.report.warnings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("off_m", "said"), [(10.0, True), (0.0, False)])
+def test_a_jump_too_short_to_show_in_one_fix_is_said(street: SyntheticData, off_m: float, said: bool) -> None:
+    """Fixes of 1 m jump by 10 m on the last third: the map bends to the middle, and few lie 5 sigmas beside it."""
+    right, steps = fixes(street, 0.0), wheels(street)
+
+    def more(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        yield from (moved(one, off_m / 1000.0 * KILOMETRE * (k >= 67)) for one in right(k, keyframe))
+        yield from steps(k, keyframe)
+
+    backend, _, _ = played(street, more, **ANTENNA)
+    told = [line for line in backend.report.warnings if "of 100 priors in frame 'enu' lie" in line]
+    assert len(backend.report.warnings) == len(told) == said, backend.report.warnings
+
+
+def test_measurements_in_a_row_on_one_side_of_the_map_tell_together() -> None:
+    rng = np.random.default_rng(3)
+    noise, sigma = rng.normal(0.0, 1.0, (100, 3)), np.full(100, np.sqrt(3.0))
+    shifted = noise + np.array([3.0, 0.0, 0.0]) * (np.arange(100) >= 60)[:, None]
+    assert not contradicted._astray_together(noise, sigma, 0.3).any()
+    assert np.flatnonzero(contradicted._astray_together(shifted, sigma, 0.3)).tolist() == list(range(60, 100))
+    assert not contradicted._astray_together(shifted, sigma, 5.0).any(), "what moves nothing is not worth a word"
+    assert not contradicted._astray_together(shifted[60:69], sigma[60:69], 0.3).any(), "too few to tell"
 
 
 def test_a_receiver_without_a_place_yet_begins_no_frame(street: SyntheticData) -> None:
