@@ -16,12 +16,8 @@ from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.estimate import Estimate
 from ba_node.measurements import GlobalFix, Keyframe, LandmarkPriors, Measurement, PosePrior, RelativePose
-<<<<<<< HEAD
-from experiments.synthetic import SyntheticData
-=======
-from ba_node.synthetic import SyntheticData
 from ba_node.window import contradicted
->>>>>>> trust
+from experiments.synthetic import SyntheticData
 from tests.window.street import ANTENNA, ORIGIN, aligned_rms, first, fixes, pymap3d, stream, street_data, wheels
 
 KILOMETRE = np.array([600.0, -800.0, 0.0])
