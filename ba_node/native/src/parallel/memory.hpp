@@ -1,7 +1,8 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Memory of the kernels: cut from slabs, in huge pages where some are at hand, and kept for the kernels that come after.
+// Memory of the kernels: cut from slabs, in huge pages where some are at hand, and kept for the kernels that come
+// after.
 //
 // To touch a page of 4 KiB for the first time takes a microsecond or more, which is more than is done with it in one
 // solve; and every window is solved by new kernels.
