@@ -46,6 +46,8 @@ settings.load_profile("ba_node")
 _LONG = ("cases", "check", "window", "offline", "backend", "cli", "front_end")
 # By how much processes give way to the one that talks over DDS, which waits most of its time.
 _GIVING_WAY = 5
+# After how many seconds a slow test counts as hanging: on a slow, loaded machine one takes ten times what it should.
+_SLOW_TIMEOUT_S = 1200
 _begun = pytest.StashKey[bool]()
 
 
@@ -57,7 +59,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Group tests for pytest-xdist: a process runs all that talk over DDS, and each other file as a whole.
 
     Two nodes that start at the same time are slow to find each other; what the tests of a file share is made once.
+    Slow tests get more time than the ``timeout`` of pyproject.toml.
     """
+    for item in items:
+        if item.get_closest_marker("slow") is not None:
+            item.add_marker(pytest.mark.timeout(_SLOW_TIMEOUT_S))
     if not config.pluginmanager.hasplugin("xdist"):
         return
 
