@@ -14,6 +14,7 @@
 #include <cstring>
 #include <type_traits>
 
+#include "linalg/blocks.hpp"
 #include "parallel/memory.hpp"
 #include "parallel/pool.hpp"
 #include "simd/simd.hpp"
@@ -36,6 +37,15 @@ class DenseCholesky {
   // Entry of the lower triangle, row >= column.
   double& at(std::int64_t row, std::int64_t column) {
     return reinterpret_cast<double*>(panel(row / kLanes) + column)[row % kLanes];
+  }
+
+  // The transpose of a block, its first entry at a row and a column of the lower triangle, or on the diagonal.
+  template <int D>
+  void put(std::int64_t row, std::int64_t column, const Block<D>& block) {
+    for (int c = 0; c < D; ++c) {
+      double* to = &at(row + c, column);
+      for (int r = 0; r < (row == column ? c + 1 : D); ++r) to[kLanes * r] = entry(block, r, c);
+    }
   }
 
   // False if S is not positive definite.
