@@ -103,8 +103,7 @@ class ReducedSystem {
     pool_.each(l_.n_free, [&](std::int64_t i, int) {
       for (std::int64_t k = s.pattern().start[i]; k < s.pattern().start[i + 1]; ++k) {
         const std::int64_t j = s.pattern().index[k];
-        for (int r = 0; r < D; ++r)
-          for (int c = (j == i ? r : 0); c < D; ++c) cholesky_.at(j * D + c, i * D + r) = entry(s.blocks()[k], r, c);
+        cholesky_.put(j * D, i * D, s.blocks()[k]);
       }
     });
     if (!cholesky_.factor(pool_)) return false;

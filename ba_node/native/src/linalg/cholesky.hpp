@@ -14,6 +14,7 @@
 #include <cstring>
 #include <type_traits>
 
+#include "linalg/blocks.hpp"
 #include "parallel/memory.hpp"
 #include "parallel/pool.hpp"
 #include "simd/simd.hpp"
@@ -36,6 +37,15 @@ class DenseCholesky {
   // Entry of the lower triangle, row >= column.
   double& at(std::int64_t row, std::int64_t column) {
     return reinterpret_cast<double*>(panel(row / kLanes) + column)[row % kLanes];
+  }
+
+  // The transpose of a block, its first entry at a row and a column of the lower triangle, or on the diagonal.
+  template <int D>
+  void put(std::int64_t row, std::int64_t column, const Block<D>& block) {
+    for (int c = 0; c < D; ++c) {
+      double* to = &at(row + c, column);
+      for (int r = 0; r < (row == column ? c + 1 : D); ++r) to[kLanes * r] = entry(block, r, c);
+    }
   }
 
   // False if S is not positive definite.
@@ -95,10 +105,10 @@ class DenseCholesky {
   }
 
  private:
-  // Panels whose columns are eliminated together; panels of rows that are worked on together, and columns of them that
-  // are in registers at once: as many as fit.
-  static constexpr std::int64_t kBlock = 4, kPanelsAtOnce = sizeof(Register) == sizeof(V8) ? 3 : 1;
-  static constexpr int kColumns = sizeof(Register) == sizeof(V8) ? 8 : 4;
+  // Rows of a register. Panels whose columns are eliminated together, panels of rows that are worked on together, and
+  // columns of them that are in registers at once: as many as fit.
+  static constexpr int kRows = sizeof(Register) / sizeof(double), kColumns = kRows;
+  static constexpr std::int64_t kBlock = kHeld && kRows < kLanes ? 8 : 4, kPanelsAtOnce = kHeld ? 3 : 1;
 
   V8* panel(std::int64_t r) { return tiles_.data() + kLanes * r * (r + 1) / 2; }
 
@@ -128,27 +138,36 @@ class DenseCholesky {
   // Tiles (i .. i + P - 1, j) less the product of their rows and those of j over the columns of panels [first, end).
   template <int P>
   void update(std::int64_t i, std::int64_t j, std::int64_t first, std::int64_t end) {
-    const V8 *a[P], *b = panel(j);
-    for (int p = 0; p < P; ++p) a[p] = panel(i + p);
-    for (int column = 0; column < kLanes; column += kColumns) {
-      V8 acc[P][kColumns];
+    // Registers of rows, and how many of them are worked on together.
+    constexpr int kParts = kLanes / kRows, kAll = P * kParts, kTogether = kAll % 3 == 0 ? 3 : kAll % 2 == 0 ? 2 : 1;
+    for (int part = 0; part < kAll; part += kTogether) {
+      double* a[kTogether];
+      for (int p = 0; p < kTogether; ++p)
+        a[p] = reinterpret_cast<double*>(panel(i + (part + p) / kParts)) + kRows * ((part + p) % kParts);
+      for (int column = 0; column < kLanes; column += kColumns) {
+        const std::int64_t at = kLanes * (kLanes * j + column);
+        Register acc[kTogether][kColumns];
 #pragma GCC unroll 3
-      for (int p = 0; p < P; ++p)
+        for (int p = 0; p < kTogether; ++p)
 #pragma GCC unroll 8
-        for (int c = 0; c < kColumns; ++c) acc[p][c] = a[p][kLanes * j + column + c];
-      for (std::int64_t k = kLanes * first; k < kLanes * end; ++k) {
-        const double* row = reinterpret_cast<const double*>(b + k) + column;
-#pragma GCC unroll 8
-        for (int c = 0; c < kColumns; ++c) {
-          const V8 factor = splat(row[c]);
+          for (int c = 0; c < kColumns; ++c) acc[p][c] = Loaded<Register>::from(a[p] + at + kLanes * c);
+        for (std::int64_t k = kLanes * first; k < kLanes * end; ++k) {
+          const double* row = reinterpret_cast<const double*>(panel(j) + k) + column;
+          Register rows[kTogether];
 #pragma GCC unroll 3
-          for (int p = 0; p < P; ++p) acc[p][c] -= a[p][k] * factor;
+          for (int p = 0; p < kTogether; ++p) rows[p] = held(Loaded<Register>::from(a[p] + kLanes * k));
+#pragma GCC unroll 8
+          for (int c = 0; c < kColumns; ++c) {
+            const Register factor = Splat<Register>::of(row[c]);
+#pragma GCC unroll 3
+            for (int p = 0; p < kTogether; ++p) acc[p][c] -= rows[p] * factor;
+          }
         }
-      }
 #pragma GCC unroll 3
-      for (int p = 0; p < P; ++p)
+        for (int p = 0; p < kTogether; ++p)
 #pragma GCC unroll 8
-        for (int c = 0; c < kColumns; ++c) panel(i + p)[kLanes * j + column + c] = acc[p][c];
+          for (int c = 0; c < kColumns; ++c) std::memcpy(a[p] + at + kLanes * c, &acc[p][c], sizeof(Register));
+      }
     }
   }
 

@@ -124,6 +124,19 @@ struct Loaded<Twice<H, M>> {
 };
 BA_INLINE V8 load(const double* p) { return Loaded<V8>::from(p); }
 
+// A number that stays in its register: where others are scarce g++ would load it anew for each product that it is in,
+// and products would wait for loads. kHeld: whether it can be told so.
+#if defined(__AVX__)
+constexpr bool kHeld = true;
+BA_INLINE Register held(Register v) {
+  asm("" : "+v"(v));
+  return v;
+}
+#else
+constexpr bool kHeld = false;
+BA_INLINE Register held(Register v) { return v; }
+#endif
+
 // The numbers f(0), f(1), ... by lane. What is stored number by number and read as a register waits for the stores.
 template <class V>
 struct Each;
