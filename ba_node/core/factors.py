@@ -183,12 +183,15 @@ class FactorSum:
         self._column = np.full(len(fixed), -1, np.intp)
         self._column[self._free] = np.arange(len(self._free))
         n = len(self._free)
-        keys = [self._keys(self._column[kind.keyframes], n) for kind in self._factors]
-        distinct = np.unique(np.concatenate([key.ravel() for key in keys])) if keys else np.empty(0, np.intp)
+        # Rotation and translation of the same steps are two kinds.
+        ends = [kind.keyframes for kind in self._factors]
+        keys = {id(one): self._keys(self._column[one], n) for one in {id(one): one for one in ends}.values()}
+        distinct = np.unique(np.concatenate([key.ravel() for key in keys.values()])) if keys else np.empty(0, np.intp)
         distinct = distinct[distinct >= 0]
         self.rows, self.columns = np.divmod(distinct, max(n, 1))
         # By kind: (n, n_places) the pair that each two places of a factor belong to, -1 if one of them is fixed.
-        self._pair = [np.where(key >= 0, np.searchsorted(distinct, key), -1) for key in keys]
+        pairs = {one: np.where(key >= 0, np.searchsorted(distinct, key), -1) for one, key in keys.items()}
+        self._pair = [pairs[id(one)] for one in ends]
 
     def value(self, state: State) -> float:
         """Return 1/2 sum Psi."""
