@@ -191,7 +191,10 @@ def project_jacobian(
     else:
         inverse_z = 1.0 / x_cam[:, 2:]
         base = x_cam[:, :2] * inverse_z
-        distorted, jacobian, by_k12 = _rational(base, params[:, DISTORTION])
+        straight = not intrinsics and not params[:, DISTORTION].any()
+        distorted, jacobian, by_k12 = (
+            (base, np.eye(2)[None], base) if straight else _rational(base, params[:, DISTORTION])
+        )
         for i in range(2):
             np.multiply(jacobian[:, i], focal[:, i, None] * inverse_z, out=d_x[:, i, :2])
         d_x[:, :, 2] = -(d_x[:, :, 0] * base[:, :1] + d_x[:, :, 1] * base[:, 1:])

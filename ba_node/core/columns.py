@@ -34,11 +34,11 @@ def put(array: FloatArray, rows: IntArray, values: FloatArray) -> None:
 
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the product of each pair of blocks: (n, i, j) and (n, j, k) -> (n, i, k)."""
-    out = empty(len(a), a.shape[1], b.shape[2])
+    out, term = empty(len(a), a.shape[1], b.shape[2]), empty(len(a), b.shape[2])
     for i in range(a.shape[1]):
         np.multiply(a[:, i, :1], b[:, 0], out=out[:, i])
         for j in range(1, a.shape[2]):
-            out[:, i] += a[:, i, j : j + 1] * b[:, j]
+            out[:, i] += np.multiply(a[:, i, j : j + 1], b[:, j], out=term)
     return out
 
 

@@ -33,7 +33,7 @@ class _Batch:
 
     Attributes:
         edges: of the batch.
-        unknowns: (d keyframes,) rows of S, in the order of the rows of the dense matrix.
+        unknowns: (d keyframes,) rows of S, in the order of the rows of the dense matrix; a slice where none is between.
         shape: of that, (d keyframes, 3 points).
     """
 
@@ -41,15 +41,18 @@ class _Batch:
         """Number the keyframes; the points (n_edges,) have numbers 0, 1, ... already."""
         keyframes, self._own = np.unique(keyframe, return_inverse=True)
         self.edges, self._point, self._size = edges, point, size
-        self.unknowns = (size * keyframes + np.arange(size)[:, None]).ravel()
-        self.shape = len(self.unknowns), 3 * (int(point[-1]) + 1)
+        first, last = int(keyframes[0]), int(keyframes[-1]) + 1
+        self.unknowns: IntArray | slice = slice(size * first, size * last)
+        if last - first > len(keyframes):
+            self.unknowns = (size * keyframes[:, None] + np.arange(size)).ravel()
+        self.shape = size * len(keyframes), 3 * (int(point[-1]) + 1)
 
     @cached_property
     def place(self) -> IntArray:
         """Return (3, d, n_edges) where the entries of their blocks belong in the dense matrix."""
-        rows, width = self.shape
-        corner = width * (rows // self._size) * np.arange(self._size) + width // 3 * np.arange(3)[:, None]
-        return corner[:, :, None] + (width * self._own + self._point)
+        width = self.shape[1]
+        corner = width * np.arange(self._size) + width // 3 * np.arange(3)[:, None]
+        return corner[:, :, None] + (width * self._size * self._own + self._point)
 
 
 def edge_order(edge_point: IntArray, edge_keyframe: IntArray) -> IntArray:
@@ -102,7 +105,10 @@ class DenseProducts:
         for batch in self._batches:
             z = np.zeros(batch.shape)
             z.reshape(-1)[batch.place] = blocks.T[..., batch.edges].copy()
-            out.reshape(-1)[n * batch.unknowns[:, None] + batch.unknowns] += _square(z)
+            if isinstance(batch.unknowns, slice):
+                out[batch.unknowns, batch.unknowns] += _square(z)
+            else:
+                out.reshape(-1)[n * batch.unknowns[:, None] + batch.unknowns] += _square(z)
         return out
 
 

@@ -27,13 +27,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
 
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
-from ba_node.core import geometry, loss
+from ba_node.core import columns, geometry, loss
 from ba_node.core.problem import KeyframeFactors, ProblemError, State
 
 # A measured rotation may differ from an orthonormal one by this much.
@@ -69,9 +70,19 @@ class RelativePoses:
         errors = self.errors(state) if errors is None else errors
         return np.asarray((self.root_information @ errors[:, :, None])[..., 0])
 
-    def jacobians(self, state: State, errors: FloatArray | None = None) -> FloatArray:
-        """Return the derivatives of the residuals by the local steps of both keyframes, (n, 2, 6, 6)."""
+    def jacobians(
+        self, state: State, errors: FloatArray | None = None, derivatives: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the derivatives of the residuals by the local steps of both keyframes, (n, 2, 6, 6).
+
+        ``errors`` and ``derivatives`` if they are known.
+        """
         errors = self.errors(state) if errors is None else errors
+        a = self.root_information @ (self.derivatives(state, errors) if derivatives is None else derivatives)
+        return np.stack([a, -a], axis=1)
+
+    def derivatives(self, state: State, errors: FloatArray) -> FloatArray:
+        """Return A, (n, 6, 6)."""
         first, second = self.keyframes.T
         rotation_i, rotation_j = state.rotation[first], state.rotation[second]
         centre = (np.swapaxes(rotation_j, 1, 2) @ state.translation[second][:, :, None])[..., 0]
@@ -79,8 +90,7 @@ class RelativePoses:
         a[:, :3, :3] = geometry.inverse_right_jacobian(errors[:, :3]) @ rotation_j
         a[:, 3:, :3] = rotation_i @ geometry.hat(centre)
         a[:, 3:, 3:] = rotation_i
-        a = self.root_information @ a
-        return np.stack([a, -a], axis=1)
+        return a
 
     def check(self, n_keyframes: int) -> None:
         """Raise ProblemError if shapes, indices or numbers are wrong; name the first offender."""
@@ -173,12 +183,15 @@ class FactorSum:
         self._column = np.full(len(fixed), -1, np.intp)
         self._column[self._free] = np.arange(len(self._free))
         n = len(self._free)
-        keys = [self._keys(self._column[kind.keyframes], n) for kind in self._factors]
-        distinct = np.unique(np.concatenate([key.ravel() for key in keys])) if keys else np.empty(0, np.intp)
+        # Rotation and translation of the same steps are two kinds.
+        ends = [kind.keyframes for kind in self._factors]
+        keys = {id(one): self._keys(self._column[one], n) for one in {id(one): one for one in ends}.values()}
+        distinct = np.unique(np.concatenate([key.ravel() for key in keys.values()])) if keys else np.empty(0, np.intp)
         distinct = distinct[distinct >= 0]
         self.rows, self.columns = np.divmod(distinct, max(n, 1))
         # By kind: (n, n_places) the pair that each two places of a factor belong to, -1 if one of them is fixed.
-        self._pair = [np.where(key >= 0, np.searchsorted(distinct, key), -1) for key in keys]
+        pairs = {one: np.where(key >= 0, np.searchsorted(distinct, key), -1) for one, key in keys.items()}
+        self._pair = [pairs[id(one)] for one in ends]
 
     def value(self, state: State) -> float:
         """Return 1/2 sum Psi."""
@@ -195,6 +208,19 @@ class FactorSum:
         value = sum(self._add(kind, number, state, terms, known) for number, kind in enumerate(self._factors))
         return self._stepped(state, replace(terms, value=value))
 
+    @cached_property
+    def _targets(self) -> list[tuple[list[_Sum], list[tuple[int, int, _Sum]]]]:
+        """Return where the terms of each kind go: by place, and by the places of the lower and the higher keyframe."""
+        targets = []
+        for kind, pair in zip(self._factors, self._pair, strict=True):
+            column = self._column[kind.keyframes]
+            of_pairs = []
+            for place, (a, b) in enumerate(itertools.combinations(range(column.shape[1]), 2)):
+                for low, high in ((a, b), (b, a)):
+                    of_pairs.append((low, high, _Sum(np.where(column[:, low] < column[:, high], pair[:, place], -1))))
+            targets.append(([_Sum(one) for one in column.T], of_pairs))
+        return targets
+
     @staticmethod
     def _value(kind: KeyframeFactors, state: State, known: Known) -> float:
         residual = kind.residuals(state, *_errors(kind, state, known))
@@ -202,20 +228,17 @@ class FactorSum:
 
     def _add(self, kind: KeyframeFactors, number: int, state: State, terms: FactorTerms, known: Known) -> float:
         """Add what the factors of a kind, by its number, have at a state to terms; return their share of the value."""
-        errors = _errors(kind, state, known)
-        residual, jacobian = kind.residuals(state, *errors), kind.jacobians(state, *errors)
+        errors = _errors(kind, state, known, derivatives=True)
+        residual, jacobian = kind.residuals(state, *errors[:1]), kind.jacobians(state, *errors)
         cost, weight = _weigh(kind, residual)
         turned = np.swapaxes(jacobian * weight[:, None, None, None], -1, -2)
-        column, pair = self._column[kind.keyframes], self._pair[number]
-        for a in range(column.shape[1]):
-            rows = np.flatnonzero(column[:, a] >= 0)
-            mine = turned[rows, a]
-            np.add.at(terms.gradient, column[rows, a], (mine @ residual[rows, :, None])[..., 0])
-            np.add.at(terms.diagonal, column[rows, a], mine @ jacobian[rows, a])
-        for place, (a, b) in enumerate(itertools.combinations(range(column.shape[1]), 2)):
-            for low, high in ((a, b), (b, a)):
-                rows = np.flatnonzero((pair[:, place] >= 0) & (column[:, low] < column[:, high]))
-                np.add.at(terms.pairs.blocks, pair[rows, place], turned[rows, low] @ jacobian[rows, high])
+        of_places, of_pairs = self._targets[number]
+        for a, to in enumerate(of_places):
+            mine = turned[to.rows, a]
+            to.add(terms.gradient, (mine @ residual[to.rows, :, None])[..., 0])
+            to.add(terms.diagonal, mine @ jacobian[to.rows, a])
+        for low, high, to in of_pairs:
+            to.add(terms.pairs.blocks, turned[to.rows, low] @ jacobian[to.rows, high])
         return 0.5 * float(np.sum(cost))
 
     @staticmethod
@@ -244,17 +267,35 @@ class FactorSum:
         )
 
 
-# Errors at a state by the arrays of what was measured: rotation and translation of the same steps are two kinds.
-Known = dict[tuple[int, ...], tuple[FloatArray]]
+class _Sum:
+    """Rows that are added to those of a sum, (n,) -1 for none: several of them to one, or each to its own."""
+
+    def __init__(self, index: IntArray) -> None:
+        rows = np.flatnonzero(index >= 0)
+        self.rows = rows[np.argsort(index[rows], kind="stable")]  # that are added, in the order of what they go to
+        self._begins = columns.starts(index[self.rows])
+        self._to = index[self.rows[self._begins]]
+
+    def add(self, out: FloatArray, values: FloatArray) -> None:
+        """Add the values of ``rows``."""
+        if len(self._to) < len(self.rows):
+            values = np.add.reduceat(values, self._begins, axis=0)
+        out[self._to] += values
 
 
-def _errors(kind: KeyframeFactors, state: State, known: Known) -> tuple[FloatArray, ...]:
+# Errors at a state by the arrays of what was measured, with their derivatives where these are wanted: rotation and
+# translation of the same steps are two kinds.
+Known = dict[tuple[int, ...], tuple[FloatArray, ...]]
+
+
+def _errors(kind: KeyframeFactors, state: State, known: Known, *, derivatives: bool = False) -> tuple[FloatArray, ...]:
     """Return the errors of relative poses, found once for kinds that share their measurements; nothing of others."""
     if not isinstance(kind, RelativePoses):
         return ()
     key = id(kind.keyframes), id(kind.rotation), id(kind.translation)
     if key not in known:
-        known[key] = (kind.errors(state),)
+        errors = kind.errors(state)
+        known[key] = (errors, kind.derivatives(state, errors)) if derivatives else (errors,)
     return known[key]
 
 

@@ -16,6 +16,8 @@ from ba_node.arrays import FloatArray
 
 # Below this angle (rad) the closed forms lose digits to cancellation and their series are used.
 _SMALL = 1e-4
+# What rounding leaves of R'R - I, and much more: its square is below rounding.
+_ROUNDED = 1e-8
 
 
 def hat(v: FloatArray) -> FloatArray:
@@ -143,7 +145,14 @@ def _side_by_side(columns: tuple[FloatArray, ...]) -> FloatArray:
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """Return the rotation nearest to a matrix in the Frobenius norm: (..., 3, 3) -> (..., 3, 3)."""
+    """Return the rotation nearest to a matrix in the Frobenius norm: (..., 3, 3) -> (..., 3, 3).
+
+    Of a rotation that is off by rounding alone one step of Newton's method finds it, ``R (3 I - R'R) / 2``, in a tenth
+    of the time of a singular value decomposition.
+    """
+    off = np.eye(3) - np.swapaxes(matrix, -1, -2) @ matrix
+    if np.abs(off).max(initial=0.0) <= _ROUNDED and (np.linalg.det(matrix) > 0.0).all():
+        return np.asarray(matrix + 0.5 * (matrix @ off))
     u, _, vt = np.linalg.svd(matrix)
     sign = np.linalg.det(u @ vt)
     u[..., :, 2] *= sign[..., None]

@@ -67,7 +67,9 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
             taken = np.flatnonzero(np.repeat(better, count))
             kept.update(rows[taken], seen, taken)
         with np.errstate(invalid="ignore"):
-            least = np.where(np.trace(flat, axis1=1, axis2=2) > 0.0, _MIN_GAIN_OUTLIER, _MIN_GAIN)
+            least: float | FloatArray = _MIN_GAIN
+            if flat is not None:
+                least = np.where(np.trace(flat, axis1=1, axis2=2) > 0.0, _MIN_GAIN_OUTLIER, _MIN_GAIN)
             active = better & ~(best_cost[ids] - cost < least * cost)
         best[ids[better]], best_cost[ids[better]] = points[ids[better]], cost[better]
         if step == steps or not active.any():
@@ -76,11 +78,12 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
         diagonal = damping * np.maximum(np.diagonal(c, axis1=1, axis2=2), _MIN_DIAGONAL)
         inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
         scaled = columns.times(inverse, gradient)
-        close = np.sum(scaled * scaled, axis=1) <= _CLOSE * cost
-        if step and flat.any() and close.any():
-            c[close] -= flat[close]
-            inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
-            scaled = columns.times(inverse, gradient)
+        if step and flat is not None:
+            close = np.sum(scaled * scaled, axis=1) <= _CLOSE * cost
+            if close.any():
+                c[close] -= flat[close]
+                inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
+                scaled = columns.times(inverse, gradient)
         active &= np.sum(scaled * scaled, axis=1) > _MIN_PROMISE * cost
         if not active.any():
             break
@@ -94,15 +97,17 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
     return InnerIterations(dataclasses.replace(state, points=best), before, after, kept)
 
 
-def _flatness(objective: Objective, seen: PointRows, start: IntArray) -> FloatArray:
-    """Return what Huber's loss takes from the curvature of each point, (n_pt, 3, 3); zero under another loss."""
+def _flatness(objective: Objective, seen: PointRows, start: IntArray) -> FloatArray | None:
+    """Return what Huber's loss takes from the curvature of each point, (n_pt, 3, 3); None if it takes nothing."""
     options = objective.options
     if options.loss != "huber" or options.loss_per != "observation":
-        return np.zeros((len(start), 3, 3))
+        return None
     # r and J are both weighted: |r|^2 is scale times the norm outside.
     residual = seen.residual[:, :2]
     norm2 = np.sum(residual * residual, axis=1)
     outside = np.flatnonzero(norm2 > options.loss_scale_px**2)
+    if not len(outside):
+        return None
     along = np.zeros((len(residual), 3))
     projected = columns.times(columns.transposed(seen.d_point[outside, :2]), residual[outside])
     along[outside] = projected * np.sqrt(_RADIAL / norm2[outside])[:, None]

@@ -48,7 +48,7 @@ class Result:
     """What a solve returns. ``state`` is finite always; on FAILED and SKIPPED it is the start.
 
     ``linear_solver`` says how the reduced systems were solved, and what that takes; empty if there was none.
-    ``loosest`` works out ``weakest``.
+    ``loosest`` works out ``weakest``, ``at_end`` the ``gradient_norm`` where the trace ends without it.
     """
 
     state: State
@@ -58,6 +58,7 @@ class Result:
     trace: tuple[Iteration, ...]
     linear_solver: str = ""
     loosest: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
+    at_end: Callable[[], float] | None = None
 
     @cached_property
     def weakest(self) -> tuple[float, float]:
@@ -80,9 +81,11 @@ class Result:
         """Return the objective at the end."""
         return self.trace[-1].objective if self.trace else 0.0
 
-    @property
+    @cached_property
     def gradient_norm(self) -> float:
-        """Return the norm of the gradient at the end."""
+        """Return the norm of the gradient at the end, worked out now if nobody had time to."""
+        if self.at_end is not None:
+            return self.at_end()
         return self.trace[-1].gradient_norm if self.trace else 0.0
 
     @property

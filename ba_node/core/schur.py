@@ -110,7 +110,10 @@ class Structure:
     def keyframe_blocks(self, d_keyframe: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return B (n_free, d, d) and gc (n_free, d)."""
         rows, bounds = self._keyframe_rows, self._keyframe_bounds
-        both = columns.take(np.concatenate([d_keyframe.T, residual.T[None]]).T, rows)
+        both = columns.empty(len(rows), d_keyframe.shape[1], d_keyframe.shape[2] + 1)
+        # Rows are in range; a check of that would make a copy.
+        d_keyframe.T.take(rows, axis=-1, out=both.T[:-1], mode="clip")
+        residual.T.take(rows, axis=-1, out=both.T[-1], mode="clip")
         products = _products(both[:, :, :-1], both, bounds)
         return products[:, :, :-1], products[:, :, -1]
 
@@ -208,12 +211,12 @@ class ReducedSystem:
         self._pairs = equations.pairs
         self._inverse_l = inverse_cholesky3(columns.plus_diagonal(equations.c, damping_p))
         self._scaled_gradient_p = columns.times(self._inverse_l, equations.gradient_p)
-        inverse = columns.take(self._inverse_l, structure.edge_point)
-        self._blocks = np.empty_like(equations.e)
+        self._blocks, term = np.empty_like(equations.e), np.empty_like(equations.e[:, :, 0])
         for j in range(3):
-            np.multiply(equations.e[:, :, j], inverse[:, j, j, None], out=self._blocks[:, :, j])
+            inverse = self._inverse_l[:, j, : j + 1].T.take(structure.edge_point, axis=-1)
+            np.multiply(equations.e[:, :, j], inverse[j, :, None], out=self._blocks[:, :, j])
             for i in range(j):
-                self._blocks[:, :, j] += equations.e[:, :, i] * inverse[:, j, i, None]
+                self._blocks[:, :, j] += np.multiply(equations.e[:, :, i], inverse[i, :, None], out=term)
         self.rhs = (structure.to_keyframes(self._blocks, self._scaled_gradient_p) - equations.gradient_c).ravel()
 
     @cached_property

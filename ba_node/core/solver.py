@@ -62,12 +62,14 @@ def solve(
     on_iteration: Callable[[Iteration], bool] | None = None,
     kernels: Kernels | None = None,
     weakest: bool = False,
+    in_haste: bool = False,
 ) -> Result:
     """Minimise the robust objective of a problem.
 
     The clock (s) is for the trace alone; ``on_iteration`` gets each row of it, and stops the solve by returning False.
     ``kernels`` work in place of those that the options ask for: for experiments. ``weakest`` asks how far off the least
-    determined of the free poses may be.
+    determined of the free poses may be. ``in_haste``: the state is waited for, and what else there is to know of the
+    end is worked out once somebody asks for it; a step that ends the solve has no gradient in the trace then, but NaN.
 
     Returns:
         The best state found, with a trace and the reason for stopping; finite always.
@@ -80,7 +82,8 @@ def solve(
     problem.check()
     if problem.point_priors is not None:
         whole = point_priors.as_observations(problem)
-        result = solve(whole, options, clock=clock, on_iteration=on_iteration, kernels=kernels, weakest=weakest)
+        asked = {"weakest": weakest, "in_haste": in_haste}
+        result = solve(whole, options, clock=clock, on_iteration=on_iteration, kernels=kernels, **asked)
         return replace(result, state=point_priors.without(result.state, problem))
     if problem.factors and options.schur == "cameras":
         raise ConfigError(
@@ -92,19 +95,21 @@ def solve(
     with np.errstate(all="ignore"):
         try:
             run = _Run(problem, options, clock, on_iteration, kernels)
+            run.in_haste = in_haste
         except native_kernels.KernelsError as error:
             return Result(problem.start, Status.FAILED, str(error), options.method, ())
         result = run.run()
         if weakest and result.status.usable:
-            result = replace(result, loosest=partial(_weakest, run.kernels, problem, result.state, options))
+            result = replace(result, loosest=partial(_weakest, run, problem, result.state, options))
             # Kernels of several ranks work it out together, or not at all.
             return result if kernels is None else result.settled()
         return result
 
 
-def _weakest(kernels: Kernels, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
+def _weakest(run: _Run, problem: Problem, state: State, options: SolverOptions) -> tuple[float, float]:
     with np.errstate(all="ignore"):
-        return covariance.weakest(kernels, problem, state, options)
+        run.finish()
+        return covariance.weakest(run.kernels, problem, state, options)
 
 
 class _Run:
@@ -130,6 +135,8 @@ class _Run:
         self.rejected = 0
         self.side = ""
         self.stopped = False
+        self.in_haste = False
+        self.finished = True  # the kernels are linearised at the state
         self.trace: list[Iteration] = []
         self.annealing: Annealing | None = None
         if options.annealing == "gnc":
@@ -149,19 +156,29 @@ class _Run:
                 return self._result(Status.MAX_ITERATIONS, f"stopped by the caller after {iteration - 1} iterations")
             before = self.value
             accepted, solution = self._step()
-            if accepted:
+            arrived = accepted and before - self.value <= self.options.function_tolerance * before
+            self.finished = not (arrived and self.in_haste) or self._annealed()
+            if accepted and self.finished:
                 self.kernels.linearise(self.state)
             if self._annealed():
                 self._anneal(accepted)
                 self._record(iteration, solution.iterations, accepted)
                 continue
             self._record(iteration, solution.iterations, accepted)
-            if accepted and before - self.value <= self.options.function_tolerance * before:
+            if arrived:
                 share = (before - self.value) / before if before > 0 else 0.0
                 return self._result(Status.CONVERGED, f"the last step lowered the objective by {share:.1e} of it")
             if self.rejected >= _MAX_REJECTED:
                 return self._result(Status.STALLED, f"{self.rejected} steps in a row did not lower the objective")
         return self._result(Status.MAX_ITERATIONS, f"stopped at the cap of {self.options.max_iterations} iterations")
+
+    def finish(self) -> float:
+        """Linearise at the end, unless that was done; return the norm of the gradient there."""
+        if not self.finished:
+            with np.errstate(all="ignore"):
+                self.kernels.linearise(self.state)
+            self.finished = True
+        return self.kernels.gradient_norm
 
     def _annealed(self) -> bool:
         """Return True while a surrogate stands in for the loss."""
@@ -237,7 +254,7 @@ class _Run:
             iteration=iteration,
             time_s=self.clock() - self.began,
             objective=self.annealing.value if self.annealing is not None and self.annealing.active else self.value,
-            gradient_norm=self.kernels.gradient_norm,
+            gradient_norm=self.kernels.gradient_norm if self.finished else np.nan,
             linear_iterations=linear_iterations,
             accepted=accepted,
             damping=self.mu if self.options.damping != "none" else 0.0,
@@ -251,4 +268,5 @@ class _Run:
     def _result(self, status: Status, reason: str) -> Result:
         if self.annealing is not None and self.annealing.active:
             self.state = self.annealing.state
-        return Result(self.state, status, reason, self.options.method, tuple(self.trace), self.reduced.text)
+        found = Result(self.state, status, reason, self.options.method, tuple(self.trace), self.reduced.text)
+        return found if self.finished else replace(found, at_end=self.finish)

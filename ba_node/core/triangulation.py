@@ -31,8 +31,8 @@ _ROBUST_ROUNDS = 5
 _HUBER = 1.5
 # Of the angle between a ray and its camera's axis, where a depth tells a distance.
 _LEAST_COSINE = 0.01
-_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_ROWS, _COLUMNS = np.transpose(_SYMMETRIC)
+# Where the six sums of a symmetric matrix belong in it.
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _DIAGONAL = np.arange(3)
 # Observations that are worked on at once: a large map's would take a multiple of the memory of their rays.
 _AT_ONCE = 2**17
@@ -140,17 +140,17 @@ def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulati
     count = np.bincount(rays.point, minlength=n_points)
     # Relative to the mean centre of each point's cameras: keeps digits far from the origin.
     origin = _sum_by_point(rays.centre, rays.point, n_points) / np.maximum(count, 1)[:, None]
-    centre = rays.centre - origin[rays.point]
+    centre = np.ascontiguousarray((rays.centre - origin[rays.point]).T)
     distance = _first_distance(rays, measured_row, n_points)
     trust = np.ones(len(distance))
     points = np.zeros((n_points, 3))
     sums = _Sums(rays, n_points)
     for i in range(_PLAIN_ROUNDS + _ROBUST_ROUNDS):
         points = sums.weighted_midpoint(centre, distance, trust)
-        away = points.take(rays.point, axis=0) - centre
+        away = points.T.take(rays.point, axis=1) - centre
         distance = _length(away)
         if i >= _PLAIN_ROUNDS - 1:
-            across = _length(_cross(rays.direction, away)) / np.maximum(distance, 1e-9)
+            across = _length(_cross(sums.direction, away)) / np.maximum(distance, 1e-9)
             trust = _HUBER / np.maximum(rays.px_per_rad * across, _HUBER)
     points = points + origin
     points[(count < 2) & ~measured] = np.nan
@@ -162,9 +162,9 @@ def errors(rays: Rays, points: FloatArray) -> FloatArray:
     out = np.empty(len(rays.point))
     for begin in range(0, len(out), _AT_ONCE):
         rows = slice(begin, begin + _AT_ONCE)
-        direction, away = rays.direction[rows], points.take(rays.point[rows], axis=0) - rays.centre[rows]
+        direction, away = rays.direction[rows].T, points.T.take(rays.point[rows], axis=1) - rays.centre[rows].T
         across = _length(_cross(direction, away)) / np.maximum(_length(away), 1e-300)
-        out[rows] = np.where((direction * away).sum(axis=1) > 0.0, rays.px_per_rad[rows] * across, np.inf)
+        out[rows] = np.where(_dot(direction, away) > 0.0, rays.px_per_rad[rows] * across, np.inf)
     return out
 
 
@@ -202,39 +202,50 @@ class _Sums:
     def __init__(self, rays: Rays, n_points: int) -> None:
         self._rays, self._n = rays, n_points
         self._along = np.nan_to_num(1.0 / rays.distance_sigma_m**2, nan=0.0)
-        self._shift = (self._along * np.nan_to_num(rays.distance_m, nan=0.0))[:, None] * rays.direction
-        n_sums = len(_SYMMETRIC) + 3
-        self._bins = (rays.point[:, None] * n_sums + np.arange(n_sums)).ravel()
+        self._measured = self._along * np.nan_to_num(rays.distance_m, nan=0.0)
+        self.direction = np.ascontiguousarray(rays.direction.T)
+        # All sums in one go, one after the other.
+        self._bins = (rays.point + n_points * np.arange(9)[:, None]).ravel()
 
     def weighted_midpoint(self, centre: FloatArray, distance: FloatArray, trust: FloatArray) -> FloatArray:
-        """Solve for given distances and weights in (0, 1]; (n_points, 3)."""
+        """Solve for given distances and weights in (0, 1]; centres are (3, n). Return (n_points, 3)."""
         across = trust * (self._rays.px_per_rad / np.maximum(distance, 1e-9)) ** 2
-        d = self._rays.direction
+        x, y, z = self.direction
         # W = across (I - d d') + along d d';  sum W x = sum W c + along m d
-        weight = ((self._along - across)[:, None] * d)[:, :, None] * d[:, None, :]
-        weight[:, _DIAGONAL, _DIAGONAL] += across[:, None]
-        values = np.empty((len(d), len(_SYMMETRIC) + 3))
-        values[:, :-3] = weight[:, _ROWS, _COLUMNS]
-        values[:, -3:] = (weight @ centre[:, :, None])[..., 0] + self._shift
-        # All sums in one go.
-        sums = np.bincount(self._bins, values.ravel(), self._n * values.shape[1]).reshape(self._n, -1)
-        matrix = np.empty((self._n, 3, 3))
-        matrix[:, _ROWS, _COLUMNS] = matrix[:, _COLUMNS, _ROWS] = sums[:, :-3]
+        less = self._along - across
+        values = np.empty((9, len(across)))
+        np.multiply(less * x, self.direction, out=values[:3])
+        np.multiply(less * y, self.direction[1:], out=values[3:5])
+        np.multiply(less * z, z, out=values[5])
+        values[:6:3] += across
+        values[5] += across
+        reach = less * _dot(self.direction, centre) + self._measured
+        np.multiply(reach, self.direction, out=values[6:])
+        values[6:] += across * centre
+        sums = np.bincount(self._bins, values.ravel(), 9 * self._n).reshape(9, -1)
+        matrix = sums[_PLACES].transpose(2, 0, 1).copy()
         trace = matrix[:, 0, 0] + matrix[:, 1, 1] + matrix[:, 2, 2]
         # A whiff of damping: parallel rays give a far point instead of a singular matrix.
         matrix[:, _DIAGONAL, _DIAGONAL] += (1e-14 * trace + np.where(trace > 0, 0.0, 1.0))[:, None]
-        return np.asarray(np.linalg.solve(matrix, sums[:, -3:, None])[..., 0])
+        return np.asarray(np.linalg.solve(matrix, sums[6:].T[..., None])[..., 0])
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the products of vectors (3, n) and (3, n), (n,)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _length(vectors: FloatArray) -> FloatArray:
-    """Return the length of each row: np.linalg.norm without its overhead."""
-    return np.asarray(np.sqrt((vectors * vectors).sum(axis=1)))
+    """Return the lengths of vectors (3, n), (n,): np.linalg.norm without its overhead."""
+    return np.asarray(np.sqrt(_dot(vectors, vectors)))
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the vector product of each pair of rows: np.cross without its overhead."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    """Return the vector products of (3, n) and (3, n), (3, n): np.cross without its overhead."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    out = np.empty((3, len(ax)))
+    out[0], out[1], out[2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return out
 
 
 def _sum_by_point(values: FloatArray, point: IntArray, n_points: int) -> FloatArray:

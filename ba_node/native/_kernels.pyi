@@ -280,6 +280,44 @@ def seem_to_move(
 ) -> tuple[Doubles, NDArray[np.bool_]]:
     """Return what window.moving._off and _leaves_more_than_noise do, where points without a place do not count."""
 
+def steps_between(rotation: Doubles, position: Doubles, first: Ints, second: Ints) -> tuple[Doubles, Doubles]:
+    """Return turns (n, 3, 3) and moves (n, 3) between poses that are world from body."""
+
+def inverse_steps_between(
+    rotation: Doubles, translation: Doubles, first: Ints, second: Ints
+) -> tuple[Doubles, Doubles]:
+    """Return the same between poses that are body from world."""
+
+def compare_steps(
+    steps: tuple[Doubles, Doubles], measured: tuple[Doubles, Doubles], worth: tuple[float, float, float, float, float]
+) -> tuple[Doubles, Doubles, Doubles, Doubles, Doubles, Doubles]:
+    """Return the fields of window.steps.Comparison.
+
+    worth: the guard's sigma of a move and its share, the same of turns, and that of turns for each metre.
+    """
+
+def scale_error(
+    steps: tuple[Doubles, Doubles],
+    measured: tuple[Doubles, Doubles],
+    sigma_m: Doubles,
+    limits: tuple[float, float, float, int],
+) -> float:
+    """Return what window.steps.scale_error does; limits are constants there."""
+
+def turn_error(
+    steps: tuple[Doubles, Doubles],
+    measured: tuple[Doubles, Doubles],
+    turned: Doubles,
+    sigma_rad: Doubles,
+    limits: tuple[float, float, float, int],
+) -> float:
+    """Return what window.steps.turn_error does."""
+
+def medians_off(
+    steps: tuple[Doubles, Doubles], others: tuple[Doubles, Doubles], sigma_rad: Doubles, sigma_m: Doubles
+) -> tuple[float, float]:
+    """Return the medians of how far steps are off others, in standard deviations: of turns and of moves."""
+
 def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, float]:
     """Return what core.covariance.weakest does, of blocks (n, 6, 6) of S and positions (n, 3)."""
 

@@ -73,7 +73,7 @@ def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Fol
         options = methods.from_config(config.solver)
         problem = _begun(selection, options)
         began = clock()
-        result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True)
+        result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True, in_haste=True)
         solve_time_s += clock() - began
         found = outcome(scene, selection, result, config.tracks, config.solver.kernels)
         if found.state is None:

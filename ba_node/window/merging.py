@@ -193,6 +193,8 @@ def scaled(selection: Selection, measured: FloatArray, state: State) -> State:
 
     ``measured`` (n_kf, 3) are the positions of the keyframes in that scale, m.
     """
+    if (selection.unscaled < 0).all():
+        return state
     obs = selection.problem.observations
     rotation, position = geometry.inverse(state.rotation, state.translation)
     points = state.points.copy()

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import OdometryConfig
 from ba_node.core import geometry
@@ -167,20 +168,35 @@ def _as_learned(
         return None
     first = steps.first[rows]
     rotation, translation = _relative(table.rotation, table.position, keyframes[first], keyframes[first + 1])
-    turned = geometry.so3_log(np.swapaxes(steps.rotation[rows], 1, 2) @ rotation)
-    off = np.stack(
-        [turned / steps.sigma_rad[rows, None], (translation - steps.translation[rows]) / steps.sigma_m[rows, None]]
-    )
-    worse = factor * np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1) / _MEDIAN_NORM
+    stated = steps.rotation[rows], steps.translation[rows]
+    worse = factor * _medians_off((rotation, translation), stated, (steps.sigma_rad[rows], steps.sigma_m[rows]))
+    worse /= _MEDIAN_NORM
     # Keyframes of before they were known to be precise are worse than they.
     times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
     return changed(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
+
+
+def _medians_off(
+    steps: tuple[FloatArray, FloatArray], others: tuple[FloatArray, FloatArray], sigmas: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """Return the medians (2,) of how far steps are off others, of rotations and translations, in standard deviations.
+
+    ``sigmas`` (n,) are those of rotations (rad) and translations (m).
+    """
+    if native.kernels is not None:
+        return np.array(native.kernels.medians_off(steps, others, *sigmas))
+    turned = geometry.so3_log(np.swapaxes(others[0], 1, 2) @ steps[0])
+    off = np.stack([turned / sigmas[0][:, None], (steps[1] - others[1]) / sigmas[1][:, None]])
+    return np.asarray(np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1))
 
 
 def _relative(
     rotation: FloatArray, position: FloatArray, first: IntArray, second: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return relative poses, (n, 3, 3) and (n, 3): body at the first row from body at the second."""
+    if native.kernels is not None:
+        found: tuple[FloatArray, FloatArray] = native.kernels.steps_between(rotation, position, first, second)
+        return found
     back = np.swapaxes(rotation[first], 1, 2)
     moved = (position[second] - position[first])[:, :, None]
     return back @ rotation[second], (back @ moved)[..., 0]
@@ -193,13 +209,16 @@ def _travelled(
 
     ``steps`` are these, rotations and translations, where they are single ones.
     """
-    factor = np.repeat(np.arange(len(place)), gap)
+    factor = None
     if steps is None:
+        factor = np.repeat(np.arange(len(place)), gap)
         at = np.arange(len(factor)) + (place - (np.cumsum(gap) - gap))[factor]
         table, order = scene.keyframes, scene.order
         steps = _relative(table.input_rotation, table.input_position, order[at], order[at + 1])
     rotation, translation = steps
-    cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0)
+    cosine = 0.5 * (rotation[:, 0, 0] + rotation[:, 1, 1] + rotation[:, 2, 2] - 1.0)
     turn = np.arccos(np.clip(cosine, -1.0, 1.0))
     length = np.sqrt(np.sum(translation * translation, axis=1))
+    if factor is None:
+        return length, turn
     return np.bincount(factor, length, len(place)).astype(float), np.bincount(factor, turn, len(place)).astype(float)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.config import GuardConfig
 from ba_node.window.trial import median
@@ -23,6 +24,7 @@ _SPREAD = 1.4826
 _MEDIAN = 1.2533
 # Fewer steps than this show no common factor; so few show no bias.
 _FEW, _LEAST_BIASED = 5, 7
+_LIMITS = _TELLING, _SPREAD, _MEDIAN, _FEW
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Steps:
 
 def between(rotation: FloatArray, translation: FloatArray, first: IntArray, second: IntArray) -> Steps:
     """Return the steps from the keyframes ``first`` (n,) to ``second``; poses (n_kf, ...) are body from world, m."""
+    if native.kernels is not None:
+        return Steps(*native.kernels.inverse_steps_between(rotation, translation, first, second))
     turn = rotation[first] @ np.swapaxes(rotation[second], 1, 2)
     return Steps(turn, translation[first] - (turn @ translation[second][:, :, None])[..., 0])
 
@@ -64,6 +68,10 @@ class Comparison:
 
 def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
     """Return how far steps are off measured ones."""
+    if native.kernels is not None:
+        of_turn = config.turn_sigma_rad, config.turn_sigma_share, config.turn_sigma_rad_per_m
+        worth = config.step_sigma_m, config.step_sigma_share, *of_turn
+        return Comparison(*native.kernels.compare_steps(_both(steps), _both(measured), worth))
     length, turned = measured.length, angle_of(measured.turn)
     sigma_m = config.step_sigma_m + config.step_sigma_share * length
     sigma_rad = config.turn_sigma_rad + config.turn_sigma_share * turned + config.turn_sigma_rad_per_m * length
@@ -74,11 +82,16 @@ def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
 
 def scale_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     """Return by what factor all steps are longer than the front-end's; 1 where that cannot be told from its errors."""
+    if native.kernels is not None:
+        return native.kernels.scale_error(_both(steps), _both(measured), found.sigma_m, _LIMITS)  # type: ignore[no-any-return]
     return _common(steps.move, measured.move, found.sigma_m)
 
 
 def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     """Return by what factor all turns are larger than the front-end's; 1 where that cannot be told from its errors."""
+    if native.kernels is not None:
+        worth = found.turned_rad, found.sigma_rad
+        return native.kernels.turn_error(_both(steps), _both(measured), *worth, _LIMITS)  # type: ignore[no-any-return]
     telling = found.turned_rad > found.sigma_rad
     if np.count_nonzero(telling) < _FEW:
         return 1.0
@@ -100,6 +113,10 @@ def bias(steps: Steps, measured: Steps) -> float:
     squared = np.mean(off, axis=0) ** 2 / np.maximum(np.var(off, axis=0, ddof=1) / n, 1e-24)
     # The square of a variable of Student's distribution with n - 1 degrees of freedom is (n - 1) / (n - 3) on average.
     return float(np.sum(squared)) * (n - 3) / (n - 1)
+
+
+def _both(steps: Steps) -> tuple[FloatArray, FloatArray]:
+    return steps.turn, steps.move
 
 
 def _axes(turn: FloatArray) -> FloatArray:

@@ -96,6 +96,17 @@ def test_one_row_of_parameters_serves_all_points(name: str) -> None:
     assert cameras.project_jacobian(x, model, params, intrinsics=False)[2].shape == (7, 2, 0)
 
 
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_derivatives_by_the_point_do_not_depend_on_what_else_is_wanted(scale: float) -> None:
+    x = points(7)
+    model, params = rows("plumb_bob", 7)
+    params[:, cameras.DISTORTION] *= scale
+    uv, d_x, _ = cameras.project_jacobian(x, model, params, intrinsics=False)
+    for one, other in zip((uv, d_x), cameras.project_jacobian(x, model, params), strict=False):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(uv, cameras.project(x, model, params), rtol=1e-14)
+
+
 def test_six_parameters_are_enough_for_radial_distortion() -> None:
     x = points(7)
     model, params = rows("plumb_bob", 7)

@@ -93,3 +93,15 @@ def test_nearest_rotation_undoes_a_small_error() -> None:
     repaired = geometry.nearest_rotation(noisy)
     np.testing.assert_allclose(repaired @ np.swapaxes(repaired, 1, 2), np.broadcast_to(np.eye(3), r.shape), atol=1e-14)
     np.testing.assert_allclose(repaired, r, atol=1e-5)
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-15, 1e-12, 1e-9, 1e-7])
+def test_nearest_rotation_is_that_of_the_singular_values(error: float) -> None:
+    noisy = geometry.so3_exp(axes(2.0)) + error * np.random.default_rng(1).normal(size=(*axes(2.0).shape, 3))
+    u, _, vt = np.linalg.svd(noisy)
+    np.testing.assert_allclose(geometry.nearest_rotation(noisy), u @ vt, atol=1e-15)
+
+
+def test_nearest_rotation_of_a_reflection_is_no_reflection() -> None:
+    found = geometry.nearest_rotation(np.diag([1.0, 1.0, -1.0])[None])
+    np.testing.assert_allclose(np.linalg.det(found), 1.0, atol=1e-15)

@@ -48,6 +48,23 @@ def test_exact_data_is_fitted_exactly(method: str, shape: dict[str, object], mak
         np.testing.assert_allclose(result.state.points, truth.points, atol=2e-3)
 
 
+@pytest.mark.parametrize("tolerance", [1e-3, 0.0])
+@pytest.mark.parametrize("kernels", ["numpy", "auto"])
+def test_haste_leaves_for_later_what_the_state_does_not_need(
+    kernels: str, tolerance: float, make_problem: Make
+) -> None:
+    problem, _ = make_problem(stereo=True)
+    options = SolverOptions(kernels=kernels, function_tolerance=tolerance, max_iterations=6)
+    calm, hasty = (solve(problem, options, weakest=True, in_haste=in_haste) for in_haste in (False, True))
+    assert all(
+        np.array_equal(*pair) for pair in zip(vars(calm.state).values(), vars(hasty.state).values(), strict=True)
+    )
+    assert np.isnan(hasty.trace[-1].gradient_norm) == (tolerance > 0.0)
+    assert [row.gradient_norm for row in hasty.trace[:-1]] == [row.gradient_norm for row in calm.trace[:-1]]
+    assert hasty.gradient_norm == calm.gradient_norm > 0.0
+    assert hasty.weakest == calm.weakest > (0.0, 0.0)
+
+
 def test_the_minimum_is_a_minimum(make_problem: Make) -> None:
     """At the end no random step lowers the robust objective: a route that uses no derivative."""
     problem, _ = make_problem(stereo=True)

@@ -19,7 +19,7 @@ from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
 from ba_node.scene import ingest
 from ba_node.scene.scene import Scene
-from ba_node.window import moving, trial
+from ba_node.window import moving, odometry, steps, trial
 from ba_node.window.initial_points import agreed_points
 from ba_node.window.problems import determined, part_of, problem_of, some_observations
 from experiments.synthetic import SyntheticOptions, generate
@@ -272,3 +272,55 @@ def test_a_single_wrong_number_is_found_wherever_it_stands() -> None:
     assert not native.kernels.is_sound(
         dataclasses.replace(problem, observations=dataclasses.replace(rows, point=unsorted))
     )
+
+
+def turned_steps(off: float) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Return poses of 30 keyframes that are ``off``, and as they turn and go."""
+    rng = np.random.default_rng(8)
+    turn = rng.normal(size=(30, 3)) * [0.02, 0.3, 0.02]
+    move = np.array([2.0, 0.0, 0.0]) + rng.normal(size=(30, 3))
+    other = turn * (1.0 + 4.0 * off) + off * rng.normal(size=turn.shape), move * (1.0 + off)
+    measured, found = ((geometry.so3_exp(np.cumsum(a, axis=0)), np.cumsum(b, axis=0)) for a, b in ((turn, move), other))
+    return found, measured
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-6, 0.01, 0.3])
+def test_steps_are_compared_as_numpy_does(off: float, both: Both) -> None:
+    found, measured = turned_steps(off)
+    first, second = np.arange(0, 28, 2), np.arange(1, 29, 2)
+
+    def compared() -> list[Any]:
+        ours, theirs = (steps.between(*poses, first, second) for poses in (found, measured))
+        comparison = steps.compare(ours, theirs, Config().guard)
+        errors = [error(ours, theirs, comparison) for error in (steps.scale_error, steps.turn_error)]
+        return [*vars(ours).values(), *vars(comparison).values(), *errors]
+
+    compiled, plain = both(compared)
+    assert (compiled[-2:] == [1.0, 1.0]) == (off < 0.3)
+    for one, other in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=2e-8)
+
+
+def test_fewer_steps_than_show_a_factor_show_none(both: Both) -> None:
+    found, measured = turned_steps(0.3)
+    few = np.arange(4)
+
+    def error() -> float:
+        ours, theirs = (steps.between(*poses, few, few + 1) for poses in (found, measured))
+        return steps.scale_error(ours, theirs, steps.compare(ours, theirs, Config().guard))
+
+    assert both(error) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("n", [7, 8])
+def test_steps_are_off_by_as_much_as_numpy_finds(n: int, both: Both) -> None:
+    found, measured = turned_steps(0.01)
+    rows, sigmas = np.arange(n), (np.full(n, 0.01), np.linspace(0.1, 0.2, n))
+
+    def medians() -> Any:
+        ours, theirs = (odometry._relative(*poses, rows, rows + 1) for poses in (found, measured))
+        return odometry._medians_off(ours, theirs, sigmas)
+
+    compiled, plain = both(medians)
+    np.testing.assert_allclose(compiled, plain, rtol=1e-9)
+    assert plain.min() > 0.01

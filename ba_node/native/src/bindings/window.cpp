@@ -369,6 +369,7 @@ py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double mos
 }  // namespace
 
 void bind_window(py::module_& m) {
+  bind_steps(m);
   m.def("views_of", &views_of_landmarks);
   m.def("distinct_landmarks", &distinct_landmarks);
   m.def("inliers_by_keyframe", &inliers_by_keyframe);
