@@ -30,7 +30,7 @@ from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, constraints, contradicted, full, retriangulation
+from ba_node.window import arrival, constraints, contradicted, full, receiver, retriangulation
 from ba_node.window.problems import problem_of
 
 # So many tracks place a keyframe; a view agrees within so many outlier gates, as the map has drifted apart.
@@ -138,6 +138,10 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
     if unaligned and (final or n - known.adjusted_at >= _TRY_AGAIN * n):
         known.adjusted_at = n
         constraints.align(scene, config)
+    jumped = ""
+    if known.absolute and (final or n - known.judged_at >= max(_FEW, _GROWN * n)):
+        known.judged_at = n
+        jumped = receiver.judge(scene, config.factors)
     if final and (known.absolute or known.landmarks) and known.map_from_world is None:
         count = len(known.absolute) + len(known.landmarks)
         scene.log.warn(
@@ -150,7 +154,7 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
     if known.steps_precise and not found:
         known.steps_precise = False
         found = Due("the front-end's steps are more precise than was stated")
-    return found or _left_the_world(scene, config, final)
+    return found or (Due(jumped) if jumped else _left_the_world(scene, config, final))
 
 
 def bend(scene: Scene, config: Config, what: Due) -> str:

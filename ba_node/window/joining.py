@@ -76,8 +76,7 @@ def _shared(scene: Scene, before: Scene) -> tuple[IntArray, IntArray]:
     None where the newest keyframe sees none of them: nothing has changed then.
     """
     ids = scene.landmarks.track_id
-    newest = np.concatenate([np.arange(b.begin, b.end) for b in scene.blocks[scene.order[-1]]] or [np.empty(0, int)])
-    of_newest = scene.observations.landmark[newest.astype(np.intp)]
+    of_newest = scene.observations.landmark[scene.rows_of(int(scene.order[-1]))]
     if not scene.constraints.merges and not (before.find_landmarks(ids[of_newest]) >= 0).any():
         return np.empty(0, np.intp), np.empty(0, np.intp)
     there = before.find_landmarks(ids)
