@@ -23,7 +23,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.scene.scene import Scene
 from ba_node.window import constraints
-from ba_node.window.adjustment import LEAST, WIDE, Due
+from ba_node.window.loops import LEAST, WIDE, Due
 from ba_node.window.problems import problem_of
 
 # Standard deviation of where a map has a point, m, beside a share of how far away it is.
