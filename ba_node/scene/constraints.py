@@ -61,6 +61,11 @@ class Absolute:
     )
     of_antenna: bool  # of the antenna, not the body
 
+    @property
+    def source(self) -> int:
+        """Return what it is from: 0 for poses, 1 for a receiver."""
+        return int(self.of_antenna)
+
 
 class Constraints:
     """What is known beside pixels.
@@ -77,6 +82,9 @@ class Constraints:
         unchecked: relative poses that the map was not compared with yet; refused: those that it cannot meet.
         steps_precise: the front-end's steps turned out to be more precise than stated; the map is still to follow.
         adjusted_at: how many keyframes there were when the map was last bent.
+        judged_at: and when what is absolute was last judged, see window/receiver.py.
+        scatter: what that found, how many times as much as stated by source.
+        left_out: likewise, stretches that jumped: source, first and last stamp (ns).
         seams: ids of keyframes with which the front-end began anew: no step leads there from the one before.
         map_from_world: rotation (3, 3) and translation (3,) m; None until enough is known.
         world_frame: name of the frame that all that is absolute is in; empty before the first.
@@ -96,6 +104,9 @@ class Constraints:
         self.refused: set[tuple[int, int]] = set()
         self.steps_precise = False
         self.adjusted_at = 0
+        self.judged_at = 0
+        self.scatter: dict[int, float] = {}
+        self.left_out: list[tuple[int, int, int]] = []
         self.seams: set[int] = set()
         self.map_from_world: tuple[FloatArray, FloatArray] | None = None
         self.world_frame = ""
@@ -261,6 +272,7 @@ class Constraints:
         self.world_frame = older.world_frame or self.world_frame
         self.origin = self.origin if older.origin is None else older.origin
         self.map_from_world = older.map_from_world or self.map_from_world
+        self.judged_at = 0
 
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
         """Drop what belongs to keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
@@ -270,7 +282,7 @@ class Constraints:
         self.steps = {key: value for key, value in self.steps.items() if key not in gone}
         self.seams -= gone
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
-        self.adjusted_at = max(0, self.adjusted_at - len(gone))
+        self.adjusted_at, self.judged_at = (max(0, n - len(gone)) for n in (self.adjusted_at, self.judged_at))
 
     def end(self, keyframes: IdArray, tracks: IdArray, span_ns: tuple[int, int], log: RejectionLog) -> None:
         """Give up what names keyframes that never came; count what lies outside the time of all, or has no track."""
@@ -285,6 +297,10 @@ class Constraints:
         for one in [one for one in self.gravity if one not in known]:
             log.reject("unknown_keyframe", f"gravity at keyframe {one}, which never came")
             del self.gravity[one]
+
+    def leaves_out(self, one: Absolute) -> bool:
+        """Return whether an absolute measurement belongs to a stretch that jumped."""
+        return any(source == one.source and since <= one.stamp_ns <= to for source, since, to in self.left_out)
 
     def _drop(self, keys: list[tuple[int, int]]) -> None:
         """Forget relative poses."""

@@ -33,6 +33,11 @@ class Views:
         """Return the indices of the cameras that delivered for a keyframe."""
         return {block.camera for block in self.blocks[keyframe_row]}
 
+    def rows_of(self, keyframe_row: int) -> IntArray:
+        """Return the rows of the observations by a keyframe."""
+        bounds = np.array([block[1:] for block in self.blocks[keyframe_row]], np.intp).reshape(-1, 2)
+        return ranges(*bounds.T)
+
     def numbers(self, rows: NDArray[np.integer[Any]], listed: IntArray) -> IntArray:
         """Return the place of each of some rows of keyframes or landmarks in a list of different ones, -1 if in none.
 

@@ -7,34 +7,26 @@ there from so far, and would take what is right for outliers. So the keyframes a
 each step between consecutive keyframes is as the map has it, to a third of what a step of the front-end is worth, and
 what is measured beside pixels pulls. Points follow the keyframe that saw them first.
 
-Where tracks are the same points as older ones, the keyframe that sees most of them is placed by where these lie, as
-one that the front-end has put in a wrong place (``arrival.py``): that is the loop. Pairs that do not agree with the
-others stay apart.
-
 All this is done to a copy of the map, on any thread, while windows go on being solved; the map then follows it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray
+from ba_node.arrays import FloatArray
 from ba_node.config import Config, OdometryConfig, SolverOptions
-from ba_node.core import geometry, native_kernels, solver
+from ba_node.core import geometry, solver
 from ba_node.core.factors import RelativePoses
 from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import arrival, constraints, contradicted, full, retriangulation
-from ba_node.window.problems import problem_of
+from ba_node.window import constraints, contradicted, full, loops, receiver, retriangulation, trial
 
-# So many tracks place a keyframe; a view agrees within so many outlier gates, as the map has drifted apart.
-LEAST, WIDE = 6, 3.0
 # What a step of the map is worth, by what one of the front-end's is; how far (rms, in sigmas) steps may be bent.
 _WORTH, _BENT = 1.0 / 3.0, 10.0
 # Between two sessions nothing was measured: they were aligned so well at least.
@@ -48,18 +40,9 @@ _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
 _ITERATIONS = 30
+_NOTHING_CAME = "nothing came of a solve of everything"
 # Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
 _BESIDE, _CONTRADICTING = 10.0, 0.6
-
-
-@dataclass(frozen=True)
-class Due:
-    """What begins a solve of everything."""
-
-    cause: str  # in words
-    loops: tuple[RelativePoses, ...] = ()  # by rows of the scene
-    joined: tuple[tuple[int, int], ...] = ()  # tracks that go on under the id of another
-    key: tuple[int, int] | None = None  # keyframes of the relative pose that the map does not meet
 
 
 @dataclass
@@ -67,7 +50,7 @@ class Adjustment:
     """A copy of the map that is bent and refined."""
 
     scene: Scene  # that it is a copy of
-    due: Due
+    due: loops.Due
     config: Config
     wanted: Extras  # what is to be worked out beside the solution
     why: str = "it broke off"  # why the map is to stay as it is, in words; empty where it is not
@@ -86,15 +69,43 @@ class Adjustment:
         """Refine all of the copy if that can be; return why the map is to stay as it is."""
         if len(self._copy.keyframes) > self.config.factors.adjust_max_keyframes:
             return ""
-        config = retriangulation.close_gaps(self._copy, self.config) if self.due.loops else self.config
-        begun = full.take_snapshot(self._copy, config, self.wanted, self.scene)
+        config = self.config
+        if self.due.loops and not retriangulation.has_scale(self._copy):
+            config = retriangulation.close_gaps(self._copy, config)
+        begun = self._solved(self._copy, config)
         if isinstance(begun, str):
             # Where no point has a place, images have nothing to say against it.
-            return f"no solve of everything can begin: {begun}" if self._copy.landmarks.has_position.any() else ""
+            return begun if begun.startswith(_NOTHING_CAME) or self._copy.landmarks.has_position.any() else ""
+        self.taken = begun
+        if self.due.loops:
+            self._close_gaps(begun, config)
+        return ""
+
+    def _solved(self, scene: Scene, config: Config) -> full.Optimization | str:
+        """Return a solve of everything in a copy, or why there is none, in words."""
+        begun = full.take_snapshot(scene, config, self.wanted, self.scene)
+        if isinstance(begun, str):
+            return f"no solve of everything can begin: {begun}"
         begun.solve(self.config.solver)
-        self.taken, result = begun, begun.result
+        result = begun.result
         usable = result.status.usable and result.state.is_finite()
-        return "" if usable else f"nothing came of a solve of everything: {result.reason}"
+        return begun if usable else f"{_NOTHING_CAME}: {result.reason}"
+
+    def _close_gaps(self, begun: full.Optimization, config: Config) -> None:
+        """Refine the keyframes that a solve of everything has left out, if poses then explain the tracks better."""
+        copy = self._copy.clone()
+        refined = begun.outcome(begun.result.state, config).state
+        if (
+            refined is None
+            or full.merge_snapshot(copy, config, dataclasses.replace(begun, scene=copy), refined) is None
+        ):
+            return
+        if copy.keyframes.refined.all():
+            return
+        before = copy.keyframes.rotation.copy(), copy.keyframes.position.copy()
+        closed = self._solved(copy, retriangulation.close_gaps(copy, config))
+        if not isinstance(closed, str) and _explains_better(copy, closed, before, config):
+            self._copy, self.taken = copy, closed
 
     def put(self) -> None:
         """Move the map as its copy was bent; what came later follows the newest keyframe of that. Join tracks."""
@@ -110,7 +121,7 @@ class Adjustment:
         scene.propagate_corrections()
         _move(scene, rotation, position)
         scene.keyframes.refined[rows[here]] |= bent.keyframes.refined[here]
-        join(scene, self.due.joined)
+        loops.join(scene, self.due.joined)
         scene.constraints.map_from_world = bent.constraints.map_from_world
 
     def end(self, why: str) -> None:
@@ -126,7 +137,21 @@ class Adjustment:
         self.scene.log.warn("not_adjusted", f"{self.due.cause}; the map stays as it is: {why}")
 
 
-def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
+def _explains_better(
+    scene: Scene, taken: full.Optimization, poses: tuple[FloatArray, FloatArray], config: Config
+) -> bool:
+    """Return whether a solve explains the tracks better than poses (rotations and positions by row) do."""
+    whole, rows = taken.selection.whole, scene.find_keyframes(taken.keyframe_id)
+    state = taken.outcome(taken.result.state, config).state
+    if state is None:
+        return False
+    before = geometry.inverse(poses[0][rows], poses[1][rows] - taken.selection.origin)
+    tried, _ = trial.choose(taken.track_id, whole.observations.point, len(taken.track_id))
+    found = trial.explained(whole, (tried, 0), before, (state.rotation, state.translation), config.solver.kernels)
+    return bool(found.mean[1, 0] < found.mean[0, 0])
+
+
+def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | None:
     """Return why the whole map is to be bent now, None if it is not; join tracks whose places agree already.
 
     ``final``: nothing more will come.
@@ -138,6 +163,10 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
     if unaligned and (final or n - known.adjusted_at >= _TRY_AGAIN * n):
         known.adjusted_at = n
         constraints.align(scene, config)
+    jumped = ""
+    if known.absolute and (final or n - known.judged_at >= max(_FEW, _GROWN * n)):
+        known.judged_at = n
+        jumped = receiver.judge(scene, config.factors)
     if final and (known.absolute or known.landmarks) and known.map_from_world is None:
         count = len(known.absolute) + len(known.landmarks)
         scene.log.warn(
@@ -145,15 +174,15 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> Due | None:
             f"{count} priors in frame {known.world_frame!r} were not used: the path is too short, or they are too few"
             " or too noisy, to tell where the map lies in it (factors.align_m)",
         )
-    found = _merged(scene, config, final) if known.merges else None
-    found = found or (_measured(scene, config) if known.unchecked else None)
+    found = loops.merged(scene, config, final) if known.merges else None
+    found = found or (loops.measured(scene, config) if known.unchecked else None)
     if known.steps_precise and not found:
         known.steps_precise = False
-        found = Due("the front-end's steps are more precise than was stated")
-    return found or _left_the_world(scene, config, final)
+        found = loops.Due("the front-end's steps are more precise than was stated")
+    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final))
 
 
-def bend(scene: Scene, config: Config, what: Due) -> str:
+def bend(scene: Scene, config: Config, what: loops.Due) -> str:
     """Bend the map, join tracks; return why not, in words, in which case nothing was changed."""
     table, order = scene.keyframes, scene.order
     scene.propagate_corrections()
@@ -187,7 +216,7 @@ def bend(scene: Scene, config: Config, what: Due) -> str:
     _move(scene, geometry.nearest_rotation(rotation)[place], (position + origin)[place])
     # Where the world holds them they need no images.
     table.refined[:] |= bool(world)
-    join(scene, what.joined)
+    loops.join(scene, what.joined)
     return ""
 
 
@@ -251,24 +280,7 @@ def _loops(scene: Scene) -> tuple[RelativePoses, ...]:
     return (RelativePoses(ends_of, rotation, position, root, "cauchy", 3.0),)
 
 
-def _measured(scene: Scene, config: Config) -> Due | None:
-    """Return a loop by pose that the map does not meet."""
-    known, table = scene.constraints, scene.keyframes
-    for key in list(known.unchecked):
-        ends = [scene.find_keyframe(end) for end in key]
-        if None in ends or not table.refined[np.array(ends, np.intp)].all():
-            continue
-        known.unchecked.remove(key)
-        first, second = np.array(ends, np.intp)
-        back = geometry.inverse(table.rotation[first], table.position[first])
-        _, there = geometry.compose(*back, table.rotation[second], table.position[second])
-        off = float(np.linalg.norm(there - known.relative[key].position))
-        if 0.0 < config.factors.adjust_m < off and known.relative[key].is_loop:
-            return Due(f"the relative pose of keyframe {key[1]} in {key[0]} is {off:.2f} m off the map", key=key)
-    return None
-
-
-def _left_the_world(scene: Scene, config: Config, final: bool) -> Due | None:
+def _left_the_world(scene: Scene, config: Config, final: bool) -> loops.Due | None:
     """Return whether recent absolute measurements agree that the map lies beside where they are."""
     known, n = scene.constraints, len(scene.keyframes)
     if known.map_from_world is None or config.factors.adjust_m <= 0.0:
@@ -283,117 +295,5 @@ def _left_the_world(scene: Scene, config: Config, final: bool) -> Due | None:
     sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
     middle = float(np.linalg.norm(np.median(off, axis=0)))
     if middle > max(config.factors.adjust_m, _TELLING * float(np.median(sigma)) / np.sqrt(len(pairs))) or final:
-        return Due(f"the map has come to lie {middle:.2f} m beside where priors have it")
+        return loops.Due(f"the map has come to lie {middle:.2f} m beside where priors have it")
     return None
-
-
-def _merged(scene: Scene, config: Config, final: bool) -> Due | None:
-    """Return the loop that pairs of tracks tell; join those whose places agree, turn away those that are none."""
-    known, points, table = scene.constraints, scene.landmarks, scene.keyframes
-    pairs = np.array(known.merges, np.uint64)
-    rows = scene.find_landmarks(pairs.ravel()).reshape(-1, 2)
-    there = np.flatnonzero((rows >= 0).all(axis=1))
-    pairs, rows = pairs[there], rows[there]
-    both = np.array([bool(_images(scene, a) & _images(scene, b)) for a, b in rows], bool)
-    if both.any():
-        _give_up(scene, pairs[both], "one image sees both, they are no one point")
-        pairs, rows = pairs[~both], rows[~both]
-    if np.count_nonzero(points.has_position[rows[:, 1]]) < LEAST:
-        # Windows of then gave them no place: those of now tell where the earlier keyframe is.
-        rows = rows[:, ::-1]
-    seen = points.has_position[rows[:, 1]]
-    new, seen[seen] = _most_seen(scene, rows[seen])
-    if np.count_nonzero(seen) < LEAST:
-        if final and known.merges:
-            _give_up(scene, np.array(known.merges, np.uint64), f"no keyframe sees {LEAST} that have a place")
-        return None
-    old = min((int(k) for k, _ in _images(scene, rows[seen][0, 1])), key=lambda k: int(scene.places()[k]))
-    found = _resected(scene, config, new, rows[seen], old)
-    if found is None:
-        _give_up(
-            scene, pairs, f"keyframe {table.keyframe_id[new]} sees them nowhere near where these are, from any place"
-        )
-        return None
-    pose, agrees, sigma_rad, far_m = found
-    if not agrees.all():
-        _give_up(scene, pairs[seen][~agrees], "the others do not see it there")
-    joined = tuple((int(a), int(b)) for a, b in np.concatenate([pairs[seen][agrees], pairs[~seen]]))
-    moved = float(np.linalg.norm(pose[1] - table.position[new]))
-    if not 0.0 < config.factors.adjust_m < moved:
-        join(scene, joined)
-        return None
-    measured = geometry.compose(*geometry.inverse(table.rotation[old], table.position[old]), *pose)
-    root = np.diag(np.repeat([1.0 / sigma_rad, 1.0 / (sigma_rad * far_m)], 3))
-    loop = RelativePoses(np.array([[old, new]]), measured[0][None], measured[1][None], root[None])
-    off = f"{moved:.2f} m beside where the map has it"
-    return Due(f"{len(joined)} merged tracks see keyframe {table.keyframe_id[new]} {off}", (loop,), joined)
-
-
-def join(scene: Scene, pairs: tuple[tuple[int, int], ...]) -> None:
-    """Let tracks go on under the ids of others."""
-    for track, other in pairs:
-        scene.join_tracks(track, other)
-    scene.constraints.merges = [pair for pair in scene.constraints.merges if pair not in pairs]
-
-
-def _give_up(scene: Scene, pairs: IdArray, why: str) -> None:
-    """Turn pairs away."""
-    given = [(int(a), int(b)) for a, b in pairs]
-    scene.log.reject("bad_merge", f"merge of track {given[0][0]} with {given[0][1]}: {why}", len(given))
-    scene.constraints.merges = [pair for pair in scene.constraints.merges if pair not in given]
-
-
-def _images(scene: Scene, landmark: int) -> set[tuple[int, int]]:
-    """Return keyframe and camera of all views of a landmark."""
-    views, seen = scene.views_of(np.array([landmark])), scene.observations
-    return set(zip(seen.keyframe[views].tolist(), seen.camera[views].tolist(), strict=True))
-
-
-def _most_seen(scene: Scene, rows: IntArray) -> tuple[int, BoolArray]:
-    """Return the keyframe that sees the first of most pairs (n, 2) of landmarks, the newest of several, and which."""
-    seen = [{keyframe for keyframe, _ in _images(scene, row)} for row in rows[:, 0]]
-    count = Counter(keyframe for one in seen for keyframe in one)
-    place = scene.places()
-    new = max(count, key=lambda keyframe: (count[keyframe], place[keyframe]), default=-1)
-    return new, np.array([new in one for one in seen], bool)
-
-
-def _resected(
-    scene: Scene, config: Config, new: int, rows: IntArray, old: int
-) -> tuple[tuple[FloatArray, FloatArray], BoolArray, float, float] | None:
-    """Return where a keyframe is that sees the places of other landmarks; None if most of its views agree with none.
-
-    ``rows`` (n, 2) are the landmarks that it sees and those that are the same points; it may be near ``old``.
-
-    Returns:
-        Rotation and position in the map; which pairs agree (n,); standard deviation of its rotation, rad; distance of
-        the points, m.
-    """
-    table, points = scene.keyframes, scene.landmarks
-    views = scene.views_of(rows[:, 0])
-    origin = table.position[old]
-    order = np.argsort(rows[:, 0])
-    problem, _ = problem_of(
-        scene, views, np.array([new]), rows[order, 0], origin, points.position[rows[order, 1]] - origin, config
-    )
-    best, least = problem.start, np.inf
-    for row in (new, old):
-        pose = geometry.inverse(table.rotation[row], table.position[row] - origin)
-        begin = State(pose[0][None], pose[1][None], problem.start.points, problem.start.intrinsics)
-        state = arrival.lowered(problem, begin)
-        off = native_kernels.residual_norms(problem, state, config.solver.kernels)
-        cost = float(np.sum(np.minimum(off, WIDE * config.tracks.outlier_px)))
-        if cost < least:
-            best, least = state, cost
-    norms = native_kernels.residual_norms(problem, best, config.solver.kernels)
-    right = np.bincount(problem.observations.point, norms <= WIDE * config.tracks.outlier_px, len(rows)) > 0
-    if np.count_nonzero(right) < max(LEAST, (len(rows) + 1) // 2):
-        return None
-    agrees = np.empty(len(rows), bool)
-    agrees[order] = right
-    rotation, position = geometry.inverse(best.rotation[0], best.translation[0])
-    far = float(np.median(np.linalg.norm(best.points[right] - position, axis=1)))
-    obs = problem.observations
-    noise = float(np.median(obs.sigma_px)) * max(1.0, float(np.median(norms)))
-    sigma_rad = 2.0 * noise / float(problem.cameras.params[0, 0]) / np.sqrt(np.count_nonzero(right))
-    return (geometry.nearest_rotation(rotation), position + origin), agrees, sigma_rad, far

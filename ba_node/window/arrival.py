@@ -128,7 +128,7 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
 def _views(scene: Scene, config: Config, row: int) -> Problem | None:
     """Return the views of known points by a keyframe, at the points as they are; None if there are too few."""
     table, points = scene.observations, scene.landmarks
-    rows = np.concatenate([np.arange(b.begin, b.end) for b in scene.blocks[row]] or [np.empty(0, np.intp)])
+    rows = scene.rows_of(row)
     rows = rows[points.has_position[table.landmark[rows]] & ~table.outlier[rows]]
     landmarks = np.unique(table.landmark[rows]).astype(np.intp)
     if len(landmarks) < _MIN_POINTS:

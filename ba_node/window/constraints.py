@@ -21,6 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray, join_rows, take_rows
 from ba_node.config import Config, FactorsConfig
@@ -34,6 +35,8 @@ _LOSS = "cauchy"
 # Standard deviation of the vertical of one frame in the other, rad; and of an orientation that was not measured.
 _LEVEL_RAD = 0.05
 UNKNOWN = 1e6
+# What a pair is from where it is a landmark.
+LANDMARK = 2
 # Pairs that map and world are aligned by, spread over all.
 _ALIGNED = 2000
 # Minimal sets that are tried, pairs in each, pairs that score them, rounds of weighting; what share of pairs is right.
@@ -58,6 +61,8 @@ class Pairs:
     position: FloatArray  # (n, 3) of the point in the world, m
     rotation: FloatArray  # (n, 3, 3) world from the keyframe's body, as measured; unit where it was not
     covariance: FloatArray  # (n, 6, 6) rotation about the body's axes, then position
+    stamp_ns: NDArray[np.int64]  # (n,) of the measurement, ns; of a landmark that of the keyframe
+    source: IntArray  # (n,) as of Constraints.scatter
 
     def __len__(self) -> int:
         return len(self.row)
@@ -68,15 +73,17 @@ class Pairs:
         return np.asarray(table.position[self.row] + (table.rotation[self.row] @ self.lever_arm[:, :, None])[..., 0])
 
 
-def pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
+def pair(scene: Scene, config: FactorsConfig, first: int = 0, *, everything: bool = False) -> Pairs:
     """Return all absolute measurements between two keyframes, by the nearer one.
 
-    Keyframes are those from the place ``first`` in the order of time on.
+    Keyframes are those from the place ``first`` in the order of time on. ``everything``: what was left out, too.
     """
     table, order = scene.keyframes, scene.order[max(first - 1, 0) :]
     stamps = table.stamp_ns[order]
     since = bisect.bisect_left(scene.constraints.absolute, int(stamps[0]), key=lambda one: one.stamp_ns)
     known = scene.constraints.absolute[since:]
+    if not everything and scene.constraints.left_out:
+        known = [one for one in known if not scene.constraints.leaves_out(one)]
     time = np.array([one.stamp_ns for one in known], np.int64)
     after = np.searchsorted(stamps, time)
     exact = stamps[np.minimum(after, len(stamps) - 1)] == time
@@ -101,21 +108,32 @@ def pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
     arm = np.array([antenna * known[i].of_antenna for i in which]).reshape(-1, 3)
     measured = [known[i].rotation for i in which]
     rotation = np.array([np.eye(3) if one is None else one for one in measured]).reshape(-1, 3, 3)
+    covariance = np.array([_six(known[i].covariance, config) for i in which]).reshape(-1, 6, 6)
+    source = np.array([known[i].source for i in which], np.intp)
+    for number, times in scene.constraints.scatter.items():
+        covariance[source == number, 3:] *= times
+        covariance[source == number, :, 3:] *= times
     return Pairs(
         order[nearer],
         move + (turn @ arm[:, :, None])[..., 0],
         np.array([known[i].position for i in which]).reshape(-1, 3),
         rotation @ np.swapaxes(turn, 1, 2),
-        np.array([_six(known[i].covariance, config) for i in which]).reshape(-1, 6, 6),
+        covariance,
+        time[which],
+        source,
     )
 
 
-def every_pair(scene: Scene, config: FactorsConfig, first: int = 0) -> Pairs:
+def every_pair(scene: Scene, config: FactorsConfig, first: int = 0, *, everything: bool = False) -> Pairs:
     """Return the same, and points whose places are known: each by the last keyframe that sees it, as a point of that.
 
     How far a point is from there is taken as known to a twentieth.
     """
-    pairs, known, points = pair(scene, config, first), scene.constraints.landmarks, scene.landmarks
+    pairs, known, points = (
+        pair(scene, config, first, everything=everything),
+        scene.constraints.landmarks,
+        scene.landmarks,
+    )
     if not known:
         return pairs
     rows = scene.find_landmarks(np.fromiter(known, np.uint64, len(known)))
@@ -136,7 +154,8 @@ def as_seen(scene: Scene, points: IntArray, seen: IntArray, position: FloatArray
     covariance[:, 3:, 3:] += (0.05**2 * np.sum(away**2, axis=1))[:, None, None] * np.eye(3)
     back = np.swapaxes(scene.keyframes.rotation[seen], 1, 2)
     unit = np.tile(np.eye(3), (len(points), 1, 1))
-    return Pairs(seen, (back @ away[:, :, None])[..., 0], position, unit, covariance)
+    arm, source = (back @ away[:, :, None])[..., 0], np.full(len(seen), LANDMARK)
+    return Pairs(seen, arm, position, unit, covariance, scene.keyframes.stamp_ns[seen], source)
 
 
 def _six(covariance: FloatArray, config: FactorsConfig) -> FloatArray:

@@ -27,7 +27,7 @@ def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
     """Say that many absolute measurements lie beside the map, where the others, or images, have outvoted them."""
     known, log = scene.constraints, scene.log
     log.warnings.pop("contradicted", None)
-    pairs = constraints.every_pair(scene, config)
+    pairs = constraints.every_pair(scene, config, everything=True)
     if known.map_from_world is None or not len(pairs):
         return
     rotation, translation = known.map_from_world
@@ -42,8 +42,13 @@ def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
             "contradicted",
             f"{count} of {len(pairs)} priors in frame {known.world_frame!r} lie {np.median(off_m[wrong]):.1f} m beside"
             f" the map (median), from {stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s: they contradict the"
-            " others, or images and odometry, or their covariance is too small. Did their source change its reference?",
+            " others, or images and odometry, or their covariance is too small. Did their source change its reference?"
+            f"{_left_out(len(pairs) - len(constraints.every_pair(scene, config)))}",
         )
+
+
+def _left_out(count: int) -> str:
+    return f" {count} are of stretches that odometry and images show to have jumped, and take no part." if count else ""
 
 
 def _astray_together(off: FloatArray, sigma: FloatArray, least_m: float) -> BoolArray:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ba_node.arrays import IntArray
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from ba_node.window.old_keyframes import window_size
@@ -45,7 +44,7 @@ def cull(scene: Scene, config: Config) -> None:
 def _seen_by_others(scene: Scene, row: int, gone: list[int]) -> float:
     """Return of which share of its points enough others see each; ``gone`` are keyframes that count no more."""
     table = scene.observations
-    own: IntArray = np.concatenate([np.arange(b.begin, b.end) for b in scene.blocks[row]] or [np.empty(0, np.intp)])
+    own = scene.rows_of(row)
     landmarks = scene.distinct(table.landmark[own[~table.outlier[own]]])
     landmarks = landmarks[scene.landmarks.has_position[landmarks]]
     if len(landmarks) < _LEAST_POINTS:

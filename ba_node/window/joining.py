@@ -23,7 +23,7 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.scene.scene import Scene
 from ba_node.window import constraints
-from ba_node.window.adjustment import LEAST, WIDE, Due
+from ba_node.window.loops import LEAST, WIDE, Due
 from ba_node.window.problems import problem_of
 
 # Standard deviation of where a map has a point, m, beside a share of how far away it is.
@@ -76,8 +76,7 @@ def _shared(scene: Scene, before: Scene) -> tuple[IntArray, IntArray]:
     None where the newest keyframe sees none of them: nothing has changed then.
     """
     ids = scene.landmarks.track_id
-    newest = np.concatenate([np.arange(b.begin, b.end) for b in scene.blocks[scene.order[-1]]] or [np.empty(0, int)])
-    of_newest = scene.observations.landmark[newest.astype(np.intp)]
+    of_newest = scene.observations.landmark[scene.rows_of(int(scene.order[-1]))]
     if not scene.constraints.merges and not (before.find_landmarks(ids[of_newest]) >= 0).any():
         return np.empty(0, np.intp), np.empty(0, np.intp)
     there = before.find_landmarks(ids)

@@ -4,11 +4,12 @@
 
 Where one camera sees few tracks and the front-end's turns are off by degrees, rays meet nowhere: points stay without a
 place, keyframes without points are not refined, and all that is known between what lies before and after them is the
-front-end's step. Once a loop has bent the map, such gaps are closed in rounds (as COLMAP's retriangulation does:
-Schoenberger and Frahm, *Structure-from-Motion Revisited*, CVPR 2016). In each, every track without a place begins where
-its rays come nearest to each other, however far off that is, or at a usual distance along them; all is solved with a
-robust loss that narrows from wide to its usual width, the steps between keyframes being squares, so that no keyframe
-of few tracks leaves them; and observations are classified anew.
+front-end's step. So it is with several cameras where such turns have held the windows. Once a loop has bent the map,
+such gaps are closed, at once where images tell no lengths, else after a solve of all the rest. It is done in rounds (as
+COLMAP's retriangulation does: Schoenberger and Frahm, *Structure-from-Motion Revisited*, CVPR 2016). In each, every
+track without a place begins where its rays come nearest to each other, however far off that is, or at a usual distance
+along them; all is solved with a robust loss that narrows from wide to its usual width, the steps between keyframes
+being squares, so that no keyframe of few tracks leaves them; and observations are classified anew.
 """
 
 from __future__ import annotations
@@ -35,13 +36,18 @@ _LEAST_GAIN, _PATIENCE = 0.001, 2
 _FAR, _NEAR = 10.0, 0.1
 
 
+def has_scale(scene: Scene) -> bool:
+    """Return whether images tell lengths: several cameras, or depths."""
+    several = scene.cameras is not None and len(scene.cameras.model) > 1
+    return several or bool(np.isfinite(scene.observations.depth_m).any())
+
+
 def close_gaps(scene: Scene, config: Config) -> Config:
-    """Triangulate and refine what was left out where one camera sees it; return the parameters to go on with.
+    """Triangulate and refine what was left out; return the parameters to go on with.
 
     With these keyframes of few points are refined: steps are factors, which hold them too.
     """
-    depths = np.isfinite(scene.observations.depth_m).any()
-    if scene.cameras is None or len(scene.cameras.model) > 1 or depths or scene.keyframes.refined.all():
+    if scene.cameras is None or scene.keyframes.refined.all():
         return config
     eager = dataclasses.replace(config, guard=dataclasses.replace(config.guard, min_points=MIN_OBSERVATIONS // 2))
     least, since = np.inf, 0
