@@ -117,7 +117,8 @@ class ImageWatch:
             self.say(
                 "skew",
                 f"the second image is {images.skew_ns / 1e6:+.1f} ms off the first, more than max_skew_s ="
-                f" {1e3 * limit:g} ms: not taken for a pair; let the cameras be triggered together",
+                f" {1e3 * limit:g} ms: not taken for a pair; let the cameras be triggered together, or raise it"
+                " where they are slow",
                 notes,
             )
             return dataclasses.replace(images, grey=images.grey[:1], depth_m=None)

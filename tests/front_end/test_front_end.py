@@ -143,6 +143,17 @@ def test_depth_camera(truth: list[Transform]) -> None:
     assert all(len(one.tracks) == 1 and np.isfinite(one.tracks[0].depth_m).all() for one in found if one.keyframe)
 
 
+def test_depths_in_another_unit(truth: list[Transform]) -> None:
+    """5000 is 1 m, and 1000 was taken for it."""
+    rig = world.rig(1)
+    frames = [world.images(rig, pose, i, depth=True) for i, pose in enumerate(truth[:8])]
+    wrong = [world.without(one, depth_m=one.depth_m * np.float32(5.0)) for one in frames if one.depth_m is not None]
+    blind = follow(FrontEnd(rig, OPTIONS), wrong)
+    told = follow(FrontEnd(rig, dataclasses.replace(OPTIONS, depth_scale=0.2)), wrong)
+    assert scale_and_error(blind, truth[:8])[0] == pytest.approx(5.0, rel=0.02)
+    assert scale_and_error(told, truth[:8])[0] == pytest.approx(1.0, abs=0.01)
+
+
 def test_one_camera_with_odometry(truth: list[Transform]) -> None:
     rig = world.rig(1)
     frames = [world.images(rig, pose, i) for i, pose in enumerate(truth)]
