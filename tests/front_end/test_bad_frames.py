@@ -123,6 +123,35 @@ def test_one_picture_for_both_cameras_is_no_pair(stereo: list[Images]) -> None:
     assert all(one.guesses is None for one in told), "no depths from it"
 
 
+@pytest.mark.parametrize("spoil", ["frozen", "black"])
+def test_a_second_camera_that_hangs_or_is_covered_is_no_partner(
+    truth: list[Transform], stereo: list[Images], spoil: str
+) -> None:
+    """It is said once; the first camera goes on alone, and the pair when there is one again."""
+    front_end = FrontEnd(world.rig(), PLAIN)
+    bad = stereo[2].grey[1] if spoil == "frozen" else np.zeros_like(stereo[2].grey[1])
+    frames = [world.without(one, grey=(one.grey[0], bad)) if 3 <= i < 7 else one for i, one in enumerate(stereo)]
+    told = follow(front_end, frames)
+    words = "is the one before again, and the first is not" if spoil == "frozen" else "shows nothing"
+    assert [[words in note for note in one.notes] for one in told] == [[]] * 3 + [[True]] + [[]] * 8
+    assert front_end.counts == {"frozen" if spoil == "frozen" else "second_dark": 4}
+    seen = [len(one.tracks) for one in told if one.keyframe is not None]
+    assert seen[0] == seen[-1] == 2
+    assert all(one.state is State.TRACKING and one.session_id == 1 for one in told[1:])
+    last = told[-1].pose
+    assert last is not None and np.linalg.norm(last.translation - truth[-1].translation) < 0.03
+
+
+def test_a_depth_camera_that_hangs_is_said(truth: list[Transform]) -> None:
+    rig = world.rig(1)
+    frames = [world.images(rig, pose, i, depth=True) for i, pose in enumerate(truth[:4])]
+    frames[2:] = [world.without(one, depth_m=frames[1].depth_m) for one in frames[2:]]
+    notes = [note for one in follow(FrontEnd(rig, OPTIONS), frames) for note in one.notes]
+    assert len(notes) == 1 and notes[0].startswith("the depth image at 1200000000 ns is the one before again"), notes
+    still = [world.without(frames[0], stamp_ns=frames[0].stamp_ns + i * world.STEP_NS) for i in range(3)]
+    assert not any(one.notes for one in follow(FrontEnd(rig, OPTIONS), still)), "nor does a pair that stands still"
+
+
 def test_left_and_right_exchanged(stereo: list[Images]) -> None:
     told = FrontEnd(world.rig(), PLAIN).process(world.without(stereo[0], grey=stereo[0].grey[::-1]))
     assert any("exchanged" in note for note in told.notes), told.notes
