@@ -40,7 +40,19 @@ EXAMPLE = (
 )
 NEEDS_A_LOOK = 3
 # What no sound recording of another front-end has.
-_FAULTS = ("malformed", "undecodable", "inexact_id", "not_finite", "bad_camera", "unknown_camera")
+_FAULTS = (
+    "malformed",
+    "undecodable",
+    "inexact_id",
+    "not_finite",
+    "bad_camera",
+    "unknown_camera",
+    "bad_pose",
+    "bad_extrinsic",
+    "not_pixels",
+)
+# A few wait for a partner where a recording begins and ends, as a share of the images.
+_MOST_APART = 0.1
 _FORMATS = ("mcap", "colmap", "colmap-text", "bundler", "bal", "tum", "kitti", "g2o", "ply")
 
 
@@ -104,4 +116,6 @@ def _convert_front_end(args: argparse.Namespace) -> int:
         print(f"  {note}")
     # Stamps that are all alike leave one keyframe, and are counted as that coming again.
     few = adapter.sent < max(2, adapter.counted["repeated_keyframe"])
-    return NEEDS_A_LOOK if few or any(adapter.counted[reason] for reason in _FAULTS) else 0
+    # Poses and images that both found no partner have stamps that do not fit.
+    apart = min(adapter.counted["no_pose"], adapter.counted["no_features"]) > _MOST_APART * adapter.images
+    return NEEDS_A_LOOK if few or apart or any(adapter.counted[reason] for reason in _FAULTS) else 0

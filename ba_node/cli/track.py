@@ -3,9 +3,9 @@
 """Track the images of a recording or of a folder; write keyframes, feature tracks and cameras for ba replay.
 
 SOURCE is a recording (MCAP, rosbag2) with sensor_msgs/Image or CompressedImage and CameraInfo, or a folder: pictures of
-one camera, or left/ and right/, rgb/ and depth/, image_0/ and image_1/ (KITTI) below it, with rig.yaml (ba rig) or
-calib.txt, and times.txt if the names of the pictures are no stamps. Two cameras are stereo, rectified or raw; colour
-with depth is RGB-D; one camera takes its scale from --odometry, or has one of its own.
+one camera, or left/ and right/, rgb/ and depth/, image_0/ and image_1/ (KITTI), cam0/ and cam1/ (EuRoC) below it, with
+rig.yaml (ba rig), calib.txt or sensor.yaml, and times.txt if the names of the pictures are no stamps. Two cameras are
+stereo, rectified or raw; colour with depth is RGB-D; one camera takes its scale from --odometry, or has one of its own.
 
 Exit code: 0 all is well, 2 nothing was written, 3 written, but something has to be looked at: images that were left
 out, tracking that was lost, cameras that are not as the rig says. Each has a line of its own.

@@ -58,6 +58,12 @@ class FrontEndOptions(Checked):
     max_depth_m: float = option(
         0.0, "Depths of a depth camera beyond this are not taken; 0 takes all.", within=(0.0, 1e4)
     )
+    depth_scale: float = option(
+        1.0,
+        "Depths of a depth camera times this are m: 0.2 for pictures of 16 bits in which 5000 is 1 m (TUM's), where"
+        " 1000 is taken for it.",
+        within=(1e-6, 1e6),
+    )
 
 
 MODES = (

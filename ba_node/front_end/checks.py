@@ -42,6 +42,7 @@ class ImageWatch:
         self._told: set[str] = set()
         self.counts: Counter[str] = Counter()  # images by cause
         self._came_ns: int | None = None  # the last stamp, believed or not
+        self._before: tuple[Grey, Grey | Floats | None] | None = None  # the last first and second image
         self._gaps_ns = (0, 0)  # the last two between stamps that were believed
 
     def say(self, cause: str, text: str, notes: list[str]) -> None:
@@ -92,7 +93,7 @@ class ImageWatch:
             )
             return None
         self.clear("dark")
-        return self._pair(images, notes)
+        return self._alone(self._pair(images, notes), notes)
 
     def believes(self, stamp_ns: int, last_ns: int | None, notes: list[str]) -> bool:
         """Return False for a stamp far ahead of the last believed one until another confirms it: it may be a pause.
@@ -110,6 +111,23 @@ class ImageWatch:
         self._gaps_ns = self._gaps_ns[1], gap_ns
         return True
 
+    def _alone(self, images: Images, notes: list[str]) -> Images:
+        """Return the images without a second one that shows nothing, or no other than before while the first does."""
+        second = images.depth_m if len(images.grey) == 1 else images.grey[1]
+        before, self._before = self._before, (images.grey[0], second)
+        if second is None:
+            return images
+        what = f"the {'depth' if len(images.grey) == 1 else 'second'} image at {images.stamp_ns} ns"
+        if len(images.grey) > 1 and float(second[::4, ::4].std()) < _DARK:
+            self.say("second_dark", f"{what} shows nothing (black, or covered): the first is followed alone", notes)
+        elif before and _same(second, before[1]) and not _same(images.grey[0], before[0]):
+            text = f"{what} is the one before again, and the first is not: does its camera hang? Followed alone"
+            self.say("frozen", text, notes)
+        else:
+            self.clear("second_dark")
+            return images
+        return dataclasses.replace(images, grey=images.grey[:1], depth_m=None)
+
     def _pair(self, images: Images, notes: list[str]) -> Images:
         """Return the images without a partner of another time or of another size."""
         limit = self._options.max_skew_s
@@ -117,7 +135,8 @@ class ImageWatch:
             self.say(
                 "skew",
                 f"the second image is {images.skew_ns / 1e6:+.1f} ms off the first, more than max_skew_s ="
-                f" {1e3 * limit:g} ms: not taken for a pair; let the cameras be triggered together",
+                f" {1e3 * limit:g} ms: not taken for a pair; let the cameras be triggered together, or raise it"
+                " where they are slow",
                 notes,
             )
             return dataclasses.replace(images, grey=images.grey[:1], depth_m=None)
@@ -166,7 +185,8 @@ class ImageWatch:
             self.say(
                 "swapped",
                 f"left and right images seem to be exchanged: {100 * theirs:.0f} % of them match the other way round,"
-                f" {100 * ours:.0f} % as given; exchange the topics, or the cameras in the rig",
+                f" {100 * ours:.0f} % as given; exchange the topics, or the cameras in the rig, or turn"
+                " both if they are upside down",
                 notes,
             )
         elif ours < _STRANGERS:
@@ -176,6 +196,10 @@ class ImageWatch:
                 " and that the rig is theirs",
                 notes,
             )
+
+
+def _same(image: Grey | Floats, before: Grey | Floats | None) -> bool:
+    return before is not None and np.array_equal(image, before)
 
 
 def _share(first: Grey, second: Grey, soft: Floats, other_soft: Floats, rig: IdealRig) -> float:

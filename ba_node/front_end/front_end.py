@@ -137,6 +137,8 @@ class FrontEnd:
             The pose and perhaps a keyframe. Nothing is raised, whatever the images hold.
         """
         self._notes = []
+        if images.depth_m is not None:
+            images = dataclasses.replace(images, depth_m=images.depth_m * np.float32(self.options.depth_scale))
         told = self._process(images, odometry)
         if odometry is not None:
             self._hold_against(odometry, told)

@@ -44,6 +44,8 @@ _OTHERS = {
     b"\x1f\x8b": "; it is packed with gzip: unpack it",
     b"PK\x03\x04": "; it is a zip archive: unpack it",
     b"#ROSBAG": "; it is a recording of ROS 1: convert it, with rosbags-convert for one",
+    **dict.fromkeys((b"\x89PNG", b"\xff\xd8\xff"), "; it is a picture: name the folder of all pictures"),
+    **dict.fromkeys((b"ftyp", b"RIFF", b"\x1aE\xdf\xa3"), "; it is a video: write its images to a folder as pictures"),
 }
 _COMPRESSIONS = ("", "lz4", "zstd")
 
@@ -95,7 +97,7 @@ def read_index(stream: IO[bytes], size: int) -> BagIndex:
         raise BagError("the file is empty (0 bytes)")
     begin = stream.read(len(MAGIC))
     if begin != MAGIC:
-        other = next((what for magic, what in _OTHERS.items() if begin.startswith(magic)), "")
+        other = next((what for magic, what in _OTHERS.items() if begin.startswith(magic) or begin[4:] == magic), "")
         raise BagError(f"not an MCAP file: it does not begin with the MCAP magic bytes{other}")
     index = _from_summary(stream, size) or _from_records(stream, size)
     if index.message_count == 0:

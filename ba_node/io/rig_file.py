@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read and write rigs as YAML: our own form, Kalibr's camchain, and the camera_info of ROS's calibrator.
+"""Read and write rigs as YAML: our own form, Kalibr's camchain, camera_info of ROS's calibrator; read EuRoC's.
 
 Our own form has a row for each camera, `position` and `orientation` being those of body from camera optical frame::
 
@@ -15,7 +15,9 @@ Our own form has a row for each camera, `position` and `orientation` being those
       orientation: [0.0, 0.0, 0.0, 1.0]           # x y z w
 
 Kalibr has ``T_cam_imu`` (camera from IMU) or, without an IMU, ``T_cn_cnm1`` (camera n from camera n - 1); the body is
-the IMU or the first camera. Of camera_info, one file is one camera; of two the second is the right one of a pair.
+the IMU or the first camera. Of camera_info, one file is one camera; of two the second is the right one of a pair. Of
+EuRoC's ``sensor.yaml`` one file is one camera too, with ``T_BS``, body from camera. Files that OpenCV has written are
+read likewise.
 """
 
 from __future__ import annotations
@@ -38,8 +40,9 @@ from ba_node.messages.rig import rig_from_infos
 
 FORMS = ("own", "kalibr", "camera_info")
 _OWN = ("intrinsics", "distortion", "image_size", "position", "orientation")
-# Kalibr's names of distortions, and ROS's.
+# Kalibr's and EuRoC's names of distortions, and ROS's.
 _KALIBR = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": ""}
+_EUROC = {"radial-tangential": "plumb_bob", "equidistant": "equidistant", "none": ""}
 
 
 class RigError(ValueError):
@@ -60,8 +63,10 @@ def read_rig(*paths: Path | str, rectified: bool = False) -> CameraRig:
         if all("camera_matrix" in content for content in contents):
             infos = [_info(content, f"camera{i}") for i, content in enumerate(contents)]
             return rig_from_infos(infos, rectified=rectified)
+        if all("T_BS" in content for content in contents):
+            return _from_euroc(contents)
         if len(contents) > 1:
-            raise RigError("several files are one rig only as camera_info, one a camera")
+            raise RigError("several files are one rig only as camera_info or EuRoC's sensor.yaml, one a camera")
         if "cameras" in contents[0]:
             return _from_own(contents[0])
         if "cam0" in contents[0]:
@@ -73,8 +78,8 @@ def read_rig(*paths: Path | str, rectified: bool = False) -> CameraRig:
     except (TypeError, ValueError, AttributeError) as error:  # whatever a wrong value leads numpy to
         raise RigError(f"{where}: an entry is of the wrong kind: {error}") from error
     raise RigError(
-        f"{where}: no rig: expected `cameras` (our own form), `cam0` (Kalibr) or `camera_matrix` (camera_info);"
-        f" there are: {', '.join(map(str, contents[0]))}"
+        f"{where}: no rig: expected `cameras` (our own form), `cam0` (Kalibr), `camera_matrix` (camera_info) or"
+        f" `T_BS` (EuRoC); there are: {', '.join(map(str, contents[0]))}"
     )
 
 
@@ -142,6 +147,27 @@ def _from_kalibr(content: Mapping[Any, Any]) -> CameraRig:
         intrinsics=_numbers(rows, "intrinsics", 4),
         distortion=tuple(np.array(row.get("distortion_coeffs") or [], np.float64) for row in rows),
         image_size=_numbers(rows, "resolution", 2).astype(np.int64),
+        position=body_from_camera[:, :3, 3],
+        orientation=geometry.quaternion_from_matrix(body_from_camera[:, :3, :3]),
+    )
+
+
+def _from_euroc(contents: Sequence[Mapping[Any, Any]]) -> CameraRig:
+    """Return the rig of EuRoC's sensor.yaml of each camera; the body is that of ``T_BS``, body from camera."""
+    names = tuple(f"cam{i}" for i in range(len(contents)))
+    for name, row in zip(names, contents, strict=True):
+        if row["camera_model"] != "pinhole" or row["distortion_model"] not in _EUROC:
+            model = f"{row['camera_model']}-{row['distortion_model']}"
+            raise RigError(f"{name}: {model}: expected pinhole with one of {', '.join(_EUROC)}")
+    flat = [{"T_BS": np.array(row["T_BS"]["data"], np.float64).reshape(4, 4)} for row in contents]
+    body_from_camera = np.array([_pose(row, "T_BS", name) for row, name in zip(flat, names, strict=True)])
+    return CameraRig(
+        frame_id="body",
+        names=names,
+        models=tuple(_EUROC[row["distortion_model"]] for row in contents),
+        intrinsics=_numbers(contents, "intrinsics", 4),
+        distortion=tuple(np.array(row["distortion_coefficients"], np.float64).reshape(-1) for row in contents),
+        image_size=_numbers(contents, "resolution", 2).astype(np.int64),
         position=body_from_camera[:, :3, 3],
         orientation=geometry.quaternion_from_matrix(body_from_camera[:, :3, :3]),
     )

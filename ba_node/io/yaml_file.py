@@ -1,9 +1,10 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read YAML as ROS does, without aliases: a few of them make a text of 1 kB as large as any memory, or endless."""
+"""Read YAML as ROS does, or as OpenCV writes it, without aliases: a few make a text of 1 kB endless, or too large."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import yaml
 from ba_node.io.files import opened
 
 MAX_BYTES = 2**20
+# What OpenCV writes that is no YAML of version 1.1: its first line, and the tag of a matrix, a mapping of its own.
+_OPENCV_HEAD, _OPENCV_TAG = re.compile(r"\A%YAML:1\.0[^\n]*\n"), re.compile(r"!!opencv-matrix")
 # Of a value without quotes, which may be a number: to read one takes a time that grows with the square of its length.
 _MAX_PLAIN = 1000
 
@@ -44,7 +47,8 @@ def read_yaml(path: Path | str, raised: type[ValueError]) -> Any:
     with opened(path, MAX_BYTES, raised) as stream:
         data = stream.read()
     try:
-        return yaml.load(data.decode("utf-8"), _Loader)
+        text = _OPENCV_HEAD.sub("", data.decode("utf-8"))
+        return yaml.load(text if len(text) == len(data) else _OPENCV_TAG.sub("", text), _Loader)
     except RecursionError:
         raise raised(f"{path}: nested too deep") from None
     except YamlError as error:

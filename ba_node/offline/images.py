@@ -1,12 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read images with their rig from a recording, or from a folder of pictures.
-
-A folder holds pictures of one camera, or in folders below it those of the left and the right one, or of colour and
-depth (names in :data:`FOLDERS`). Beside them is the rig: a YAML of any form (``rig.yaml``, or the only ones there), or
-KITTI's ``calib.txt`` of projection matrices. Stamps are the lines of ``times.txt`` (s), else the names of the pictures
-where these are seconds or nanoseconds, else the number of the picture by the rate.
-"""
+"""Read images with their rig from a recording, or from a folder of pictures (``image_folder.py``)."""
 
 from __future__ import annotations
 
@@ -16,7 +10,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -35,28 +28,16 @@ from ba_node.front_end.streams import (
 )
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import BagError, absolute
-from ba_node.io.rig_file import read_rig
 from ba_node.measurements import CameraRig
 from ba_node.messages.factory import stamp_ns_from_message
-from ba_node.messages.rig import rig_from_infos
 from ba_node.messages.topics import IMAGE_TYPES, INPUT_TYPES
+from ba_node.offline.image_folder import Picture, find_pictures
 from ba_node.offline.rig import rig_of_recording, static_tree
 
-FOLDERS = {
-    "stereo": (
-        ("left", "image_l", "image_0", "cam0/data", "cam0"),
-        ("right", "image_r", "image_1", "cam1/data", "cam1"),
-    ),
-    "rgbd": (("rgb", "color"), ("depth",)),
-}
-PICTURES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
-_BEGIN_NS = 1_000_000_000
-# Digits of nanoseconds since 1970.
-_NS_DIGITS = 16
 _QUEUE = 100
 # Bytes of a message until after its header's stamp.
 _STAMPED = 12
@@ -273,64 +254,22 @@ def _leave(source: ImageSource, reason: str, words: str) -> None:
 
 
 def _of_folder(path: Path, request: ImageRequest) -> ImageSource:
-    folders = [path]
-    mode = "mono"
-    for kind, names in FOLDERS.items():
-        found = [next((path / name for name in some if _pictures(path / name)), None) for some in names]
-        if found[0] is not None and (found[1] is not None or not _pictures(path)):
-            mode = kind if found[1] is not None else "mono"
-            folders = [folder for folder in found if folder is not None]
-            break
-    pictures = [_pictures(folder) for folder in folders]
-    if not pictures[0]:
-        raise BagError(
-            f"{path}: no pictures ({', '.join(PICTURES)}), neither here nor in left/ and right/, rgb/ and depth/"
-        )
-    rig = _first_cameras(request.rig or _rig_of_folder(path, request, len(cameras_of(mode))), mode, str(path))
+    found = find_pictures(path)
+    mode = found.mode
+    rig = _first_cameras(request.rig or found.rig(rectified=request.rectified), mode, str(path))
     entries = sorted(
         (stamp_ns, place, file)
-        for place, files in enumerate(pictures)
-        for stamp_ns, file in zip(_stamps(path, files, request.rate_hz), files, strict=True)
+        for place, (files, stamps) in enumerate(zip(found.pictures, found.stamps(request.rate_hz), strict=True))
+        for stamp_ns, file in zip(stamps, files, strict=True)
     )
     streams = MODES[mode]
 
     def read() -> Iterator[tuple[Images, Transform | None]]:
-        files = ((streams[place], stamp_ns, _Picture(file)) for stamp_ns, place, file in entries)
+        files = ((streams[place], stamp_ns, Picture(file)) for stamp_ns, place, file in entries)
         return _paired(source, files, request.poses)
 
-    source = ImageSource(rig, mode, len(pictures[0]), read)
+    source = ImageSource(rig, mode, len(found.pictures[0]), read)
     return source
-
-
-class _Picture:
-    """A file, with the fields of a CompressedImage."""
-
-    def __init__(self, file: Path) -> None:
-        self._file, self.format = file, file.suffix[1:]
-
-    @property
-    def data(self) -> bytes:
-        """Return its content, which is read when it is looked at."""
-        return self._file.read_bytes()
-
-
-def _pictures(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES) if folder.is_dir() else []
-
-
-def _rig_of_folder(path: Path, request: ImageRequest, cameras: int) -> CameraRig:
-    own = [path / name for name in ("rig.yaml", "camchain.yaml") if (path / name).exists()][:1]
-    pair = [path / name for name in ("left.yaml", "right.yaml")[:cameras] if (path / name).exists()]
-    files = own or pair or sorted([*path.glob("*.yaml"), *path.glob("*.yml")])[:2]
-    if files:
-        rig = read_rig(*files, rectified=request.rectified)
-    elif (path / "calib.txt").exists():
-        rig = _kitti_rig(path / "calib.txt", cameras)
-    else:
-        raise BagError(
-            f"{path}: nothing tells the cameras: put a rig.yaml beside the pictures (ba rig --help), or give --rig"
-        )
-    return rig
 
 
 def _first_cameras(rig: CameraRig, mode: str, where: str) -> CameraRig:
@@ -340,42 +279,3 @@ def _first_cameras(rig: CameraRig, mode: str, where: str) -> CameraRig:
         raise BagError(f"{where}: {mode} needs {count} cameras, and the rig has {len(rig)} ({', '.join(rig.names)})")
     names = ("names", "models", "intrinsics", "distortion", "image_size", "position", "orientation")
     return replace(rig, **{name: getattr(rig, name)[:count] for name in names})
-
-
-def _kitti_rig(path: Path, cameras: int) -> CameraRig:
-    """Return the rectified cameras of rows of 12 numbers, each with or without a name before it."""
-    rows = _numbers(path, 12)
-    if len(rows) < cameras:
-        raise BagError(f"{path}: {len(rows)} rows of 12 numbers, the projection of a camera each: expected {cameras}")
-    infos = [
-        SimpleNamespace(
-            header=SimpleNamespace(frame_id=f"camera{i}"), width=0, height=0, k=[], d=[], r=np.eye(3).reshape(-1),
-            p=row, distortion_model="", binning_x=0, binning_y=0,
-        )
-        for i, row in enumerate(rows[:cameras])
-    ]  # fmt: skip
-    return rig_from_infos(infos, rectified=True)
-
-
-def _numbers(path: Path, least: int) -> list[list[float]]:
-    """Return the numbers of each line of so many words at least, without a name before them."""
-    lines = [re.sub(r"^\w+:", "", line).split() for line in path.read_text(errors="replace").splitlines()]
-    try:
-        return [[float(word) for word in words] for words in lines if len(words) >= least]
-    except ValueError as error:
-        raise BagError(f"{path}: {error}") from None
-
-
-def _stamps(path: Path, files: Sequence[Path], rate_hz: float) -> list[int]:
-    """Return when each picture was taken, ns."""
-    times = path / "times.txt"
-    if times.exists():
-        seconds = [row[0] for row in _numbers(times, 1)]
-        if len(seconds) < len(files) or not np.isfinite(seconds).all():
-            raise BagError(f"{times}: {len(seconds)} lines for {len(files)} pictures, expected a time in s for each")
-        return [_BEGIN_NS + round(one * 1e9) for one in seconds[: len(files)]]
-    if all(file.stem.isdigit() and len(file.stem) >= _NS_DIGITS for file in files):
-        return [int(file.stem) for file in files]
-    if all(re.fullmatch(r"\d{6,}\.\d+", file.stem) for file in files):
-        return [round(float(file.stem) * 1e9) for file in files]
-    return [_BEGIN_NS + round(i / rate_hz * 1e9) for i in range(len(files))]

@@ -1,32 +1,23 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""The front-end on rendered images: every mode against the truth, and what it makes of images that are no good."""
+"""The front-end on rendered images: every mode against the truth."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import pytest
 
-from ba_node.config.front_end import FrontEndOptions
 from ba_node.core import cameras, geometry
 from ba_node.estimate import Cloud, Poses, Transform
 from ba_node.front_end import FrontEnd, Images, State, Tracked
 from ba_node.measurements import Keyframe
 from tests.front_end import world
+from tests.front_end.following import OPTIONS, PLAIN, follow
 
 pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
-
-OPTIONS = FrontEndOptions(max_features=300)
-PLAIN = dataclasses.replace(OPTIONS, stereo_align=False)
-
-
-def follow(front_end: FrontEnd, frames: Sequence[Images], odometry: Sequence[Transform] | None = None) -> list[Tracked]:
-    given: Sequence[Transform | None] = odometry or [None] * len(frames)
-    return [front_end.process(one, pose) for one, pose in zip(frames, given, strict=True)]
 
 
 def scale_and_error(found: Sequence[Tracked], truth: Sequence[Transform]) -> tuple[float, float]:
@@ -39,16 +30,6 @@ def scale_and_error(found: Sequence[Tracked], truth: Sequence[Transform]) -> tup
     placed = ours @ first.rotation.T + first.translation
     ratio = np.linalg.norm(np.diff(ours, axis=0), axis=1).sum() / length
     return float(ratio), float(np.linalg.norm(placed - theirs, axis=1).max() / length)
-
-
-@pytest.fixture(scope="module")
-def truth() -> list[Transform]:
-    return world.drive(12)
-
-
-@pytest.fixture(scope="module")
-def stereo(truth: list[Transform]) -> list[Images]:
-    return [world.images(world.rig(), pose, i) for i, pose in enumerate(truth)]
 
 
 def test_stereo(truth: list[Transform], stereo: list[Images]) -> None:
@@ -162,6 +143,17 @@ def test_depth_camera(truth: list[Transform]) -> None:
     assert all(len(one.tracks) == 1 and np.isfinite(one.tracks[0].depth_m).all() for one in found if one.keyframe)
 
 
+def test_depths_in_another_unit(truth: list[Transform]) -> None:
+    """5000 is 1 m, and 1000 was taken for it."""
+    rig = world.rig(1)
+    frames = [world.images(rig, pose, i, depth=True) for i, pose in enumerate(truth[:8])]
+    wrong = [world.without(one, depth_m=one.depth_m * np.float32(5.0)) for one in frames if one.depth_m is not None]
+    blind = follow(FrontEnd(rig, OPTIONS), wrong)
+    told = follow(FrontEnd(rig, dataclasses.replace(OPTIONS, depth_scale=0.2)), wrong)
+    assert scale_and_error(blind, truth[:8])[0] == pytest.approx(5.0, rel=0.02)
+    assert scale_and_error(told, truth[:8])[0] == pytest.approx(1.0, abs=0.01)
+
+
 def test_one_camera_with_odometry(truth: list[Transform]) -> None:
     rig = world.rig(1)
     frames = [world.images(rig, pose, i) for i, pose in enumerate(truth)]
@@ -214,114 +206,6 @@ def test_stand_still_and_turn_on_the_spot() -> None:
         assert np.linalg.norm(geometry.so3_log(one.pose.rotation.T @ pose.rotation)) < 0.002
 
 
-def test_dark_images_leave_the_map(truth: list[Transform], stereo: list[Images]) -> None:
-    front_end = FrontEnd(world.rig(), PLAIN)
-    follow(front_end, stereo[:4])
-    black = tuple(np.zeros_like(grey) for grey in stereo[4].grey)
-    dark = follow(front_end, [world.without(one, grey=black) for one in stereo[4:6]])
-    assert [one.state for one in dark] == [State.LOST] * 2
-    assert "shows nothing" in dark[0].notes[0] and not dark[1].notes
-    sigma_m = [float(np.sqrt(one.covariance[0, 0])) for one in dark]
-    assert sigma_m == pytest.approx([0.2, 0.3])
-    again = front_end.process(stereo[6])
-    assert again.state is State.TRACKING and again.session_id == 1
-    assert again.pose is not None
-    assert np.linalg.norm(again.pose.translation - truth[6].translation) < 0.03
-    # The step across them is told with what it was unsure by, and no other.
-    assert again.keyframe is not None
-    assert np.sqrt(again.keyframe.covariance.reshape(6, 6)[0, 0]) == pytest.approx(0.3)
-    later = [one.keyframe for one in follow(front_end, stereo[7:]) if one.keyframe]
-    assert later and not any(len(one.covariance) for one in later)
-
-
-@pytest.mark.parametrize("spoil", ["dark", "blurred"])
-def test_what_is_not_found_again_begins_a_session(stereo: list[Images], spoil: str) -> None:
-    """Nothing to see for as long as max_lost says, then another place."""
-    front_end = FrontEnd(world.rig(), dataclasses.replace(PLAIN, max_lost=3))
-    before = [one.keyframe for one in follow(front_end, stereo[:4]) if one.keyframe]
-    bad = [
-        world.without(one, grey=tuple(cv2.blur(g, (61, 61)) if spoil == "blurred" else 0 * g for g in one.grey))
-        for one in stereo[4:7]
-    ]
-    told = follow(front_end, bad)
-    assert [(one.state, one.session_id) for one in told] == [(State.LOST, 1)] * 3
-    assert np.all(np.diff([one.covariance[0, 0] for one in told]) > 0.0)
-    assert sum(len(one.notes) for one in told) == 1, "said once"
-    far = Transform(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.array([0.3, 0.0, 15.0]))
-    other = front_end.process(world.images(world.rig(), far, 7))
-    assert other.session_id == 2 and other.keyframe is not None
-    assert other.notes[-1] == "session 2 begins: 4 images without a pose; the map of the one before stays as it is"
-    assert (before[0].session_id, other.keyframe.session_id) == (1, 2)
-    assert not len(other.keyframe.covariance), "no step leads to it"
-
-
-def test_an_odometry_that_ends_begins_a_session(truth: list[Transform]) -> None:
-    """Images alone have no scale to go on with: they are lost, then a session of its own, until it comes back."""
-    rig = world.rig(1)
-    front_end = FrontEnd(rig, dataclasses.replace(OPTIONS, max_lost=2))
-    frames = [world.images(rig, pose, i) for i, pose in enumerate(truth)]
-    found = follow(front_end, frames[:4], truth[:4])
-    assert found[-1].state is not State.LOST
-    lost = [front_end.process(one) for one in frames[4:7]]
-    assert [one.state for one in lost] == [State.LOST, State.LOST, State.STARTING]
-    assert "no odometry, which the session has its scale from" in lost[0].notes[0]
-    assert [one.session_id for one in lost] == [1, 1, 2]
-    assert "the scale is free" in lost[2].notes[-1]
-    again = follow(front_end, frames[7:], truth[7:])
-    assert again[0].session_id == 3 and again[0].keyframe is not None
-    assert "an odometry is there now" in again[0].notes[0]
-    assert again[-1].pose is not None
-    assert np.array_equal(again[-1].pose.translation, truth[-1].translation)
-
-
-def test_long_pause_begins_a_session_only_where_nothing_is_known(stereo: list[Images]) -> None:
-    """One stamp after a pause may be wrong: only the next one tells, and decides."""
-    front_end = FrontEnd(world.rig(), PLAIN)
-    follow(front_end, stereo[:4])
-    later = [world.without(one, stamp_ns=one.stamp_ns + 30_000_000_000) for one in stereo[4:6]]
-    paused = follow(front_end, later)
-    assert [(one.session_id, one.state) for one in paused] == [(1, State.TRACKING)] * 2 and paused[0].keyframe is None
-    far = Transform(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.array([0.3, 0.0, 15.0]))
-    elsewhere = [
-        world.without(world.images(world.rig(), far, 0), stamp_ns=later[1].stamp_ns + 30_000_000_000 + i * 100_000_000)
-        for i in range(2)
-    ]
-    lost, other = follow(front_end, elsewhere)
-    assert (lost.state, lost.session_id, other.session_id) == (State.LOST, 1, 2)
-    assert any("30.1 s without images" in note for note in other.notes)
-    assert other.keyframe is not None and other.keyframe.session_id == 2
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"skew_ns": 30_000_000}, "+30.0 ms off the first"),
-        ({"stamp_ns": 1_000_000_000}, "is not after the one before"),
-        ({"grey": (np.full((120, 160), 9, np.uint8),) * 2}, "160 x 120 px where the calibration is for 320 x 240"),
-    ],
-)
-def test_what_is_wrong_with_images_is_said(stereo: list[Images], changes: dict[str, object], words: str) -> None:
-    front_end = FrontEnd(world.rig(), PLAIN)
-    front_end.process(stereo[0])
-    told = front_end.process(world.without(stereo[1], **changes))
-    assert any(words in note for note in told.notes), told.notes
-    assert front_end.process(stereo[2]).session_id == 1
-
-
-def test_one_picture_for_both_cameras_is_no_pair(stereo: list[Images]) -> None:
-    front_end = FrontEnd(world.rig(), PLAIN)
-    told = follow(front_end, [world.without(one, grey=one.grey[:1] * 2) for one in stereo[:6]])
-    assert "are the same picture: not taken for a pair" in told[0].notes[0]
-    assert all("the same picture" not in note for one in told[1:] for note in one.notes), "once"
-    assert front_end.counts["same"] == 6
-    assert all(one.guesses is None for one in told), "no depths from it"
-
-
-def test_left_and_right_exchanged(stereo: list[Images]) -> None:
-    told = FrontEnd(world.rig(), PLAIN).process(world.without(stereo[0], grey=stereo[0].grey[::-1]))
-    assert any("exchanged" in note for note in told.notes), told.notes
-
-
 def test_masks(stereo: list[Images]) -> None:
     left_half = np.ones(world.SIZE[::-1], bool)
     left_half[:, :160] = False
@@ -366,42 +250,3 @@ def test_refined_poses_move_the_map_and_not_what_is_published(stereo: list[Image
         a, b = one.process(frame), other.process(frame)
         assert a.pose is not None and b.pose is not None
         assert np.linalg.norm(a.pose.translation - b.pose.translation) < 1e-3
-
-
-def _noise(one: Images) -> Images:
-    rng = np.random.default_rng(7)
-    return world.without(one, grey=tuple(rng.integers(0, 256, grey.shape, dtype=np.uint8) for grey in one.grey))
-
-
-def _speckled(one: Images) -> Images:
-    rng = np.random.default_rng(8)
-    grey = tuple(np.where(rng.random(grey.shape) < 0.001, 255, 0).astype(np.uint8) for grey in one.grey)
-    return world.without(one, grey=grey)
-
-
-def _wild_depth(one: Images) -> Images:
-    rng = np.random.default_rng(9)
-    values = rng.choice([0.0, np.nan, 1e9, np.inf, 1.5], size=one.grey[0].shape)
-    return world.without(one, grey=one.grey[:1], depth_m=values.astype(np.float32))
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        _noise,
-        _speckled,
-        _wild_depth,
-        lambda one: world.without(one, grey=one.grey[:1]),
-        lambda one: world.without(one, grey=tuple(grey[:, ::-1].copy() for grey in one.grey)),
-        lambda one: world.without(one, mask=np.zeros(one.grey[0].shape, bool)),
-        lambda one: world.without(one, mask=np.ones((3, 3), bool)),
-    ],
-    ids=["noise", "speckled", "wild_depth", "one_image", "mirrored", "all_masked", "mask_of_another_size"],
-)
-def test_nothing_is_raised_and_the_map_stays(stereo: list[Images], spoil: Callable[[Images], Images]) -> None:
-    front_end = FrontEnd(world.rig(), PLAIN)
-    follow(front_end, stereo[:2])
-    follow(front_end, [spoil(stereo[2])])
-    after = front_end.process(stereo[3])
-    assert after.session_id == 1 and after.state is State.TRACKING
-    follow(FrontEnd(world.rig(), PLAIN), [spoil(one) for one in stereo[:2]])

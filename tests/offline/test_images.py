@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from ba_node.io.bag_topics import BagError
-from ba_node.io.rig_file import rig_yaml
 from ba_node.offline.images import ImageRequest, open_images
 from tests.io.test_rig_file import a_rig
 from tests.messages.adapters import layouts
@@ -192,48 +191,3 @@ def test_what_is_missing_is_counted_with_figures(tmp_path: Path) -> None:
 def test_a_recording_that_cannot_be_read_is_said(messages: list[Sent], words: str, tmp_path: Path) -> None:
     with pytest.raises(BagError, match=words):
         read(layouts.write(tmp_path / "bag", messages))
-
-
-def folder(tmp_path: Path, names: Mapping[str, list[str]], **files: str) -> Path:
-    for place, pictures in names.items():
-        (tmp_path / place).mkdir(exist_ok=True)
-        for i, name in enumerate(pictures):
-            cv2.imwrite(str(tmp_path / place / name), picture(i))
-    for name, text in files.items():
-        (tmp_path / name.replace("_", ".")).write_text(text)
-    return tmp_path
-
-
-NUMBERS = [f"{i:06d}.png" for i in range(3)]
-RIG = rig_yaml(a_rig())[0]
-
-
-def test_folders_of_pictures(tmp_path: Path) -> None:
-    source, frames = read(folder(tmp_path, {"left": NUMBERS, "right": NUMBERS}, rig_yaml=RIG), rate_hz=20.0)
-    assert (source.mode, len(frames), source.rig.position[1, 0]) == ("stereo", 3, 0.11)
-    assert np.diff([images.stamp_ns for images, _ in frames]).tolist() == [STEP_NS // 2] * 2
-    assert np.array_equal(frames[2][0].grey[1], picture(2))
-
-
-@pytest.mark.parametrize(
-    ("names", "files", "step_ns"),
-    [
-        ([f"170000000{i}000000000.png" for i in range(3)], {}, 10**9),
-        ([f"130503110{i}.250000.jpg" for i in range(3)], {}, 10**9),
-        (NUMBERS, {"times_txt": "0.0\n0.05\n0.1\n"}, 50_000_000),
-    ],
-)
-def test_stamps_of_pictures(names: list[str], files: Mapping[str, str], step_ns: int, tmp_path: Path) -> None:
-    source, frames = read(folder(tmp_path, {".": names}, rig_yaml=RIG, **files))
-    assert (source.mode, len(source.rig)) == ("mono", 1)
-    assert np.diff([images.stamp_ns for images, _ in frames]).tolist() == [step_ns] * 2
-
-
-def test_folders_that_cannot_be_read_are_said(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="no pictures"):
-        read(tmp_path)
-    with pytest.raises(BagError, match="nothing tells the cameras"):
-        read(folder(tmp_path, {"left": NUMBERS, "right": NUMBERS}))
-    (tmp_path / "times.txt").write_text("0.0\n")
-    with pytest.raises(BagError, match="1 lines for 3 pictures"):
-        read(folder(tmp_path, {}, rig_yaml=RIG))

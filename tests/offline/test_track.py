@@ -83,7 +83,7 @@ def test_mask_and_odometry_file(pictures: Path, tmp_path: Path, capsys: pytest.C
     mask[:, :100] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     lines = [
-        " ".join(map(str, [1.0 + 0.1 * i, *pose.translation, *geometry.quaternion_from_matrix(pose.rotation)]))
+        " ".join(map(str, [0.1 * i, *pose.translation, *geometry.quaternion_from_matrix(pose.rotation)]))
         for i, pose in enumerate(world.drive(12))
     ]
     (tmp_path / "odometry.tum").write_text("\n".join(reversed(lines)))
@@ -102,9 +102,7 @@ def test_an_odometry_in_millimetres_is_said_last_and_in_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = [
-        " ".join(
-            map(str, [1.0 + 0.1 * i, *(1000.0 * pose.translation), *geometry.quaternion_from_matrix(pose.rotation)])
-        )
+        " ".join(map(str, [0.1 * i, *(1000.0 * pose.translation), *geometry.quaternion_from_matrix(pose.rotation)]))
         for i, pose in enumerate(world.drive(24))
     ]
     (tmp_path / "odometry.tum").write_text("\n".join(lines))
@@ -156,7 +154,7 @@ def test_black_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
             "check that its calibration is of this",
             3,
         ),
-        ("times.txt", "0.0\nlater\n" + "1.0\n" * 10, "could not convert string to float: 'later'", 2),
+        ("times.txt", "0.0\nlater\n" + "1.0\n" * 10, "'later': expected a time at the beginning of each line", 2),
         ("times.txt", "0.0\n0.1", "2 lines for 12 pictures", 2),
     ],
 )

@@ -39,6 +39,9 @@ _BACK_NS = 1_000_000_000
 _MOVED = (0.005, 0.01, 0.01)
 # Pixels that a camera_info of the source's own camera leaves between its points and its pixels, median, px.
 _MAX_DISAGREEMENT_PX = 2.0
+# Half of all pixels lie within no less, px, and are so many times as far apart as their rays. Of both, most are on the
+# same side of the middle.
+_LEAST_SPREAD_PX, _SAME_SIDE = 5.0, 0.75
 # Fewest points that tell a focal length, and the one that is taken where they do not, px.
 _FIT_POINTS, _FOCAL_PX = 8, 460.0
 
@@ -98,7 +101,11 @@ class Adapter:
         """
         try:
             for piece in self._source.read(name, message):
-                if isinstance(piece, Pose):
+                if isinstance(piece, Pose | Extrinsic) and not _is_pose(piece):
+                    kind = "pose" if isinstance(piece, Pose) else "extrinsic"
+                    words = f"position {piece.position} m, quaternion {piece.orientation}"
+                    self.leave(f"bad_{kind}", f"{name}: {words}: expected finite, and not zero")
+                elif isinstance(piece, Pose):
                     yield from self._pair(piece, self._poses, self._features, "no_features")
                 elif isinstance(piece, Features):
                     self.images += 1
@@ -136,9 +143,15 @@ class Adapter:
 
     def finish(self) -> None:
         """Count what still waits when no more messages come."""
-        for reason, waiting in (("no_features", self._poses), ("no_pose", self._features), ("no_rig", self._frames)):
-            if waiting:
-                self.leave(reason, _NO_RIG if reason == "no_rig" else f"{len(waiting)} at the end", len(waiting))
+        for reason, own, others in (
+            ("no_features", self._poses, self._features),
+            ("no_pose", self._features, self._poses),
+        ):
+            if own:
+                apart_ns = [min((abs(stamp - other) for other in others), default=-1) for stamp in own]
+                self.leave(reason, self._gap(int(np.median(apart_ns))), len(own))
+        if self._frames:
+            self.leave("no_rig", _NO_RIG, len(self._frames))
 
     def leave(self, reason: str, words: str, count: int = 1) -> None:
         """Count what is left out."""
@@ -183,8 +196,12 @@ class Adapter:
         own[piece.stamp_ns] = piece
         if len(own) > MAX_WAITING:
             del own[next(iter(own))]
-            gap = "none came" if nearest is None else f"the nearest is {abs(nearest - piece.stamp_ns) / 1e6:.3f} ms off"
-            self.leave(reason, f"{gap}; taken are up to {limit_ns / 1e6:g} ms")
+            self.leave(reason, self._gap(-1 if nearest is None else abs(nearest - piece.stamp_ns)))
+
+    def _gap(self, apart_ns: int) -> str:
+        """Return in words how far the nearest stamp is off; less than 0 for none."""
+        gap = "none came" if apart_ns < 0 else f"the nearest is {apart_ns / 1e6:.3f} ms off"
+        return f"{gap}; taken are up to {self._options.tolerance_s * 1e3:g} ms (--tolerance)"
 
     def _frame(self, pose: Pose, features: Features) -> Iterator[tuple[str, int, Measurement]]:
         """Send on an image with its pose, if it is a keyframe."""
@@ -198,6 +215,9 @@ class Adapter:
             self.leave("repeated_keyframe", f"keyframe {key} came again")
             return
         features = self._usable(features)
+        if wrong := _mismatch(features):
+            self.leave("not_pixels", wrong)
+            return
         if not len(features.ids):
             self.leave("no_tracks", "an image without a track that can be used")
             return
@@ -222,7 +242,7 @@ class Adapter:
             **features.wrong,
             "inexact_id": inexact,
             "not_finite": ~np.isfinite(features.uv).all(axis=1),
-            "unknown_camera": features.camera >= cameras,
+            "unknown_camera": (features.camera < 0) | (features.camera >= cameras),
         }
         good = np.ones(len(ids), bool)
         for reason, wrong in reasons.items():
@@ -319,6 +339,34 @@ class Adapter:
         offset = features.point - self.rig.position[features.camera]
         depth = np.einsum("ni,ni->n", rotation[:, :, 2], offset)
         return np.where(depth > 0.0, depth, np.nan)
+
+
+def _is_pose(piece: Pose | Extrinsic) -> bool:
+    finite = np.isfinite(piece.position).all() and np.isfinite(piece.orientation).all()
+    return bool(finite and piece.orientation.any())
+
+
+def _mismatch(features: Features) -> str:
+    """Return in words why pixels and rays cannot be those of the same points, empty if they can.
+
+    It holds for every lens: what is farther right of the others in one is so in the other, and a camera of a focal
+    length below some pixels there is none.
+    """
+    uv, rays = features.uv, features.normalised
+    if len(uv) < _FIT_POINTS:
+        return ""
+    spread_px = np.subtract(*np.percentile(uv, [75, 25], axis=0))
+    if (spread_px < _LEAST_SPREAD_PX).all():
+        return f"half of the pixels lie within {spread_px.max():.2g} px: are they divided by the focal length?"
+    if not np.isfinite(rays).all():
+        return ""
+    spread = np.subtract(*np.percentile(rays, [75, 25], axis=0))
+    if (spread_px < _LEAST_SPREAD_PX * spread).all():
+        return f"half of x / z and y / z lie within {spread.max():.3g}, of the pixels {spread_px.max():.3g}: exchanged?"
+    same = ((uv > np.median(uv, axis=0)) == (rays > np.median(rays, axis=0))).mean(axis=0)
+    if (same < _SAME_SIDE).any():
+        return f"{100 * same.min():.0f} % of x / z and y / z are on the side of u and v: are these exchanged?"
+    return ""
 
 
 def _disagreement_px(rig: CameraRig, features: Features) -> float:

@@ -13,6 +13,7 @@ way, which is good for 120 ns.
 
 The tracker of VINS-Mono sends a PointCloud for every image with one channel for each kind of value: id * cameras +
 camera, u, v and velocities; its points are normalised. Poses come from the estimator, of keyframes or of all images.
+The estimator of VINS-Fusion takes such clouds of a tracker too, with id, camera, u, v and velocities.
 
 Ids are float32 in all of them.
 """
@@ -45,6 +46,8 @@ from ba_node.messages.conversion import measurement_from_message
 from ba_node.messages.factory import stamp_ns_from_message
 
 _VALUES_OF_A_POINT = 5
+# What the estimator of VINS-Fusion takes from a tracker has one more than VINS-Mono's, or more.
+_CHANNELS_OF_INPUT = 6
 
 
 class _Vins(Source):
@@ -130,23 +133,38 @@ class VinsMono(_Vins):
     def features(self, cloud: Any) -> Features:
         """Return what is in a cloud with a channel a kind of value."""
         points = _points(cloud)
-        n, columns = len(points), [channel.values for channel in cloud.channels[:3]]
-        lengths = [len(column) for column in columns]
-        if lengths != [n] * 3:
+        n, where = len(points), _columns(cloud)
+        columns = {name: cloud.channels[i].values for name, i in where.items() if i < len(cloud.channels)}
+        lengths = [len(column) for column in columns.values()]
+        if lengths != [n] * len(where):
             raise LayoutError(
                 f"{n} points and channels of {lengths} values: expected id, u, v of each point; a channel a point is"
                 " what VINS-Fusion sends (--from vins_fusion)"
             )
-        ids, u, v = (np.array(column, np.float64) for column in columns)
+        of = {name: np.array(column, np.float64) for name, column in columns.items()}
+        ids, camera = of["id"], of.get("camera")
+        if camera is None:
+            camera = ids % self.cameras
+            # Beyond what a float32 holds nothing can be said of the quotient either.
+            ids = np.where(ids < self.max_id, np.floor(ids / self.cameras), ids)
         return Features(
             stamp_ns_from_message(cloud.header.stamp),
-            # Beyond what a float32 holds nothing can be said of the quotient either.
-            ids=np.where(ids < self.max_id, np.floor(ids / self.cameras), ids),
-            uv=np.column_stack([u, v]),
-            camera=(ids % self.cameras).astype(np.int64),
+            ids=ids,
+            uv=np.column_stack([of["u"], of["v"]]),
+            camera=np.where(np.isfinite(camera), camera, -1.0).astype(np.int64),
             normalised=points[:, :2],
             point=nowhere(n, 3),
         )
+
+
+def _columns(cloud: Any) -> dict[str, int]:
+    """Return which channel holds what: by their names where these tell it, else by their number."""
+    names = [str(channel.name).lower().removesuffix("_of_point").removesuffix("_id") for channel in cloud.channels]
+    if {"id", "u", "v"} <= set(names):
+        return {name: names.index(name) for name in ("id", "camera", "u", "v") if name in names}
+    if len(names) >= _CHANNELS_OF_INPUT:
+        return {"id": 0, "camera": 1, "u": 2, "v": 3}
+    return {"id": 0, "u": 1, "v": 2}
 
 
 def _points(cloud: Any) -> FloatArray:
