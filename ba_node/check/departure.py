@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Ask of a young map whether its steps are all longer or shorter than the front-end's by one factor.
+"""Ask of a young map whether its steps are all longer or shorter than the front-end's by one factor, or all aside.
 
 A focal length, a baseline or a unit of depths that is wrong by a few percent stretches the map along the view, and on a
 straight way nothing in the images contradicts that: each solve explains its tracks and stays within the bounds of a
@@ -8,9 +8,12 @@ single step. Its error grows with the way. So the steps of all refined keyframes
 of the k-th refined step to the front-end's, both along the mean of the two, the trimmed mean of log r_k is compared
 with its standard error. Noise of the front-end averages out, a factor stays.
 
+A principal point that is wrong by some pixels shears the map where the cameras do not turn, and a camera that is turned
+on the body turns its steps: so their directions, in the body, are compared in the same way, axis by axis.
+
 Which of the two is right cannot be told from here, so what came in stands and both are named. Nothing is asked where
-images have no scale of their own (one camera, no depths), where something absolute gives the map its scale, and of a
-map that is no longer young.
+something absolute places the map, and of a map that is no longer young; of lengths nothing where images have no scale
+of their own (one camera, no depths).
 """
 
 from __future__ import annotations
@@ -18,13 +21,16 @@ from __future__ import annotations
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
-from ba_node.check.diagnosis import Diagnosis, Finding
+from ba_node.check.diagnosis import Diagnosis, Finding, angle
 from ba_node.check.watch import Check
+from ba_node.core.cameras import FX, FY
 from ba_node.scene.scene import Scene
 
 # Factors beyond which lengths are said to differ, each if it is so many standard errors from 1: rigs and wheels are
-# known better, and odometry that shows a smaller factor so clearly is precise.
-_FACTORS = ((1.025, 5.0), (1.012, 8.0))
+# known better, and odometry that shows a smaller factor so clearly is precise. Directions differ by as much aside.
+_FACTORS = ((1.015, 4.5), (1.012, 8.0))
+# Few steps tell their own spread badly: n of them need (1 + this / n) times as many standard errors.
+_FEW = 6.0
 # Steps that are needed, and keyframes up to which a map is young.
 _STEPS, _YOUNG = 15, 120
 # It is asked once in so many keyframes.
@@ -36,15 +42,29 @@ _TELLING, _TRIMMED = 0.3, 0.1
 
 
 def departed(scene: Scene) -> Check | None:
-    """Return what is wrong if the refined steps of a young map are off the front-end's by one factor; else None."""
+    """Return what is wrong if the refined steps of a young map are off the front-end's by one factor or to one side."""
     count = len(scene.keyframes)
-    if count % _EVERY or not _STEPS < count <= _YOUNG or not _has_scale(scene):
+    if count % _EVERY or not _STEPS < count <= _YOUNG or scene.cameras is None:
         return None
-    ratio = _ratios(scene)
-    if len(ratio) < _STEPS:
+    if scene.constraints.absolute or scene.constraints.landmarks:
         return None
+    refined, given = _steps(scene)
+    if len(refined) < _STEPS:
+        return None
+    finding = _by_a_factor(scene, refined, given) if _has_scale(scene) else None
+    finding = finding or _aside(scene, refined, given)
+    if finding is None:
+        return None
+    found = Diagnosis([finding])
+    return Check(scene, lambda: found, found)
+
+
+def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | None:
+    """Return what is wrong if refined steps (n, 3) are longer or shorter than the given ones."""
+    along = refined + given
+    ratio = np.sum(refined * along, axis=1) / np.sum(given * along, axis=1)
     mean, error = _trimmed_mean(np.log(ratio))
-    if not any(abs(mean) >= max(np.log(factor), errors * error) for factor, errors in _FACTORS):
+    if not _differs(mean, error, len(given)):
         return None
     factor = float(np.exp(mean))
     evidence = f"refined steps are {factor:.3g} times as long as the front-end's, over {len(ratio)} of them"
@@ -56,24 +76,45 @@ def departed(scene: Scene) -> Check | None:
         ours = f"scale of focal length or baseline: lengths are {factor:.3g} times what the front-end's steps tell"
         change = "k in the camera_info, or body_from_camera, of the camera_rig"
     steps = f"scale of the front-end's steps: they are {1.0 / factor:.3g} times what {by}"
-    change_of_steps = "the position in the keyframes, expected metres"
-    found = Diagnosis([Finding((ours, steps), evidence, (change, change_of_steps))])
-    return Check(scene, lambda: found, found)
+    return Finding((ours, steps), evidence, (change, "the position in the keyframes, expected metres"))
+
+
+def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | None:
+    """Return what is wrong if refined steps (n, 3) point to another side of the body than the given ones."""
+    lengths = np.linalg.norm(refined, axis=1) * np.linalg.norm(given, axis=1)
+    turns = np.cross(given, refined) / lengths[:, None]
+    found = [_trimmed_mean(of_axis) for of_axis in turns.T]
+    if not any(_differs(mean, error, len(given)) for mean, error in found):
+        return None
+    assert scene.cameras is not None
+    turn = np.array([mean for mean, _ in found])
+    focal = float(np.mean(scene.cameras.params[0, [FX, FY]]))
+    px = focal * float(np.linalg.norm((scene.cameras.rotation[0] @ turn)[:2]))
+    degrees = angle(float(np.degrees(np.linalg.norm(turn))))
+    evidence = f"refined steps point {degrees} aside of the front-end's, over {len(turns)} of them"
+    region = f"region of interest not applied, or principal point wrong, by about {px:.0f} px"
+    place = f"camera 0 does not fit its place on the body by about {degrees}"
+    changes = (
+        "roi in camera_info in camera_rig, or subtract its offset from the principal point in k",
+        "body_from_camera in camera_rig (or tf_static), or the pose in the keyframes if it is not that of the body",
+    )
+    return Finding((region, place), evidence, changes)
+
+
+def _differs(mean: float, error: float, count: int) -> bool:
+    return any(abs(mean) >= max(np.log(factor), (1.0 + _FEW / count) * errors * error) for factor, errors in _FACTORS)
 
 
 def _has_scale(scene: Scene) -> bool:
-    known = scene.constraints
-    if scene.cameras is None or known.absolute or known.landmarks:
-        return False
-    return len(scene.cameras.model) > 1 or _measures_depths(scene)
+    return scene.cameras is not None and (len(scene.cameras.model) > 1 or _measures_depths(scene))
 
 
 def _measures_depths(scene: Scene) -> bool:
     return bool(np.isfinite(scene.observations.depth_m[:1000]).any())
 
 
-def _ratios(scene: Scene) -> FloatArray:
-    """Return the ratio of each refined step to the front-end's, of those that are long enough to tell, (n,)."""
+def _steps(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Return refined and given steps, (n, 3) m in the body, of those that are long enough to tell."""
     table, order = scene.keyframes, scene.order
     both = table.refined[order[1:]] & table.refined[order[:-1]]
     first, second = order[:-1][both], order[1:][both]
@@ -81,10 +122,10 @@ def _ratios(scene: Scene) -> FloatArray:
     given = _moves(table.input_rotation, table.input_position, first, second)
     along = refined + given
     length = np.sqrt(np.sum(along**2, axis=1))
-    ours, theirs = (np.sum(one * along, axis=1) / np.maximum(length, 1e-12) for one in (refined, given))
     least = max(_LEAST_M, 0.5 * _TELLING * float(np.median(length))) if len(length) else 0.0
-    telling = (ours > 0.0) & (theirs > 0.0) & (0.5 * length > least)
-    return np.asarray(ours[telling] / theirs[telling])
+    telling = np.sum(refined * along, axis=1) > 0.0
+    telling &= (np.sum(given * along, axis=1) > 0.0) & (0.5 * length > least)
+    return refined[telling], given[telling]
 
 
 def _moves(rotation: FloatArray, position: FloatArray, first: IntArray, second: IntArray) -> FloatArray:

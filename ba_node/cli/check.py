@@ -6,8 +6,9 @@ Prints how well the usual mistakes explain the tracks, the likely one, and what 
 stand the share of the tracks that agree with a hypothesis, and by how much it is off what the tracks say by themselves.
 
 Exit code: 0 the set-up fits the tracks, 2 the recording cannot be read or has too little to tell, 3 a mistake is
-likely, or something else is to be looked at: stamps that jump, messages that were turned away. Of several recordings a
-table says what each gives; the code is the highest of any but one that cannot be read, which is named: 3.
+likely, or something else is to be looked at: stamps that jump, messages that were turned away, files that are missing.
+Of several recordings a table says what each gives; the code is the highest of any but one that cannot be read, which is
+named: 3.
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ def run(args: argparse.Namespace) -> int:
     config = parameters(args)
     if len(args.bag) > 1 or args.scheduler or "://" in args.bag[0]:
         return _check_all(args, config)
-    sessions = check_recording(Path(args.bag[0]), config)
+    checked = check_recording(Path(args.bag[0]), config)
+    sessions = checked.sessions
+    for text in checked.warnings:
+        print(f"ba: warning: {text}", file=sys.stderr)
     for number, session in enumerate(sessions, start=1):
         if len(sessions) > 1:
             first, last = (stamp_ns * 1e-9 for stamp_ns in session.stamps_ns)
@@ -68,8 +72,8 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         for text in session.warnings:
             print(f"ba: warning: {text}", file=sys.stderr)
-    write_result(args.json, {"sessions": [session.as_dict() for session in sessions]})
-    if any(session.found.findings or session.warnings for session in sessions):
+    write_result(args.json, checked.as_dict())
+    if checked.all_warnings or any(session.found.findings for session in sessions):
         return MISTAKE
     return 0 if any(session.found.sound for session in sessions) else TOO_LITTLE
 

@@ -19,9 +19,25 @@ if TYPE_CHECKING:
 
 
 STANDARD_OUTPUT = Path("-")
-# Names of arguments for recordings that are read, and for files that are written.
-_READ, _WRITTEN = ("bag", "bags", "source", "odometry", "mask"), ("out", "target", "json", "csv")
+# Names of arguments for what is read, and for what is written.
+_READ = (
+    "bag",
+    "bags",
+    "source",
+    "odometry",
+    "mask",
+    "files",
+    "rig",
+    "problem",
+    "map",
+    "estimate",
+    "reference",
+    "params",
+)
+_WRITTEN = ("out", "target", "json", "csv", "plot", "tum", "ply")
 _RECORDINGS = (".mcap", ".db3")
+# A folder with one of these is a model of COLMAP.
+_MODEL = ("cameras.bin", "cameras.txt")
 _out: list[IO[str]] = []
 _written: list[Path | None] = []
 
@@ -87,13 +103,18 @@ def require_folder(path: Path | None) -> None:
 
 
 def require_others(args: argparse.Namespace) -> None:
-    """Raise TargetError if a file to write is one of the recordings to read, or a part of one: it would be lost."""
-    for target in (path for name in _WRITTEN for path in _paths(args, name) if path.is_file()):
+    """Raise TargetError if what is to be written is what is to be read, or a part of it: it would be lost."""
+    for target in (path for name in _WRITTEN for path in _paths(args, name) if _holds_work(path)):
         for source in (path for name in _READ for path in _paths(args, name) if path.exists()):
             inside = source.is_dir() and target.suffix in _RECORDINGS and target.parent.samefile(source)
             if inside or target.samefile(source):
-                where = "in the recording" if inside else "the recording"
-                raise TargetError(f"{target}: is {where} that is read, and would be lost: write to another name")
+                kind = "in the folder" if inside else "the folder" if target.is_dir() else "the file"
+                raise TargetError(f"{target}: is {kind} that is read, and would be lost: write to another name")
+
+
+def _holds_work(path: Path) -> bool:
+    """Return True if writing there would write over something: a file, or a folder that is a model."""
+    return path.is_file() or any((path / name).is_file() for name in _MODEL)
 
 
 def _paths(args: argparse.Namespace, name: str) -> list[Path]:

@@ -155,17 +155,16 @@ def check_one(task: ReplayTask) -> dict[str, Any]:
     """Check a recording and return its sessions, or why it cannot be checked."""
     try:
         with fetched(task.recording[0]) as first:
-            sessions = check_recording(first, task.config)
+            checked = check_recording(first, task.config)
     except (ValueError, OSError) as error:
         return _failed(task, words_of(error))
-    causes = [cause for one in sessions for finding in one.found.findings for cause in finding.causes]
-    warnings = [text for one in sessions for text in one.warnings]
-    notes = [*dict.fromkeys(causes), *warnings]
+    causes = [cause for one in checked.sessions for finding in one.found.findings for cause in finding.causes]
+    notes = [*dict.fromkeys(causes), *checked.all_warnings]
     return {
         "recording": task.recording[0],
         "state": LOOK if notes else OK,
         "note": "; ".join(notes) or "the set-up fits the tracks",
-        "sessions": [one.as_dict() for one in sessions],
+        **checked.as_dict(),
     }
 
 

@@ -36,7 +36,24 @@ class CheckedSession:
         return {**facts, **self.found.as_dict(), "warnings": self.warnings}
 
 
-def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
+@dataclass(frozen=True)
+class CheckedRecording:
+    """What a recording tells."""
+
+    sessions: list[CheckedSession]  # what the tracks of each tell, at least one
+    warnings: tuple[str, ...]  # what could not be read of it: files that are missing, messages that are damaged
+
+    @property
+    def all_warnings(self) -> tuple[str, ...]:
+        """Return what somebody has to know beside the findings, of the recording and of its sessions."""
+        return (*self.warnings, *(text for session in self.sessions for text in session.warnings))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a JSON file."""
+        return {"sessions": [session.as_dict() for session in self.sessions], "warnings": self.warnings}
+
+
+def check_recording(bag: Path, config: Config) -> CheckedRecording:
     """Return what the tracks of each session tell about the set-up.
 
     Raises:
@@ -55,11 +72,12 @@ def check_recording(bag: Path, config: Config) -> list[CheckedSession]:
         backend.flush(final=True)
         maps += [backend.map] if backend.map is not maps[-1] else []
         notes = reader.rejection_notes
+        warnings = (*reader.warnings.values(), *turned_away(reader.rejected), *list(notes)[-1:])
     found = [checked for one in maps if (checked := _checked(one)) is not None]
     if not found:
         reason = notes[-1] if notes else backend.map.summary().rejection_cause
         raise CheckError(f"{bag}: no keyframes with tracks and a camera rig in it{': ' + reason if reason else ''}")
-    return found
+    return CheckedRecording(found, warnings)
 
 
 def _checked(one: CurrentMap) -> CheckedSession | None:

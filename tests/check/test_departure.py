@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose steps are all off the front-end's by one factor is given up, and both that may be wrong are named."""
+"""A map whose steps are all off the front-end's, by one factor or to one side, is given up, and the causes are named."""
 
 from __future__ import annotations
 
@@ -20,15 +20,24 @@ STEP_NOISE_M = 0.02
 
 
 def refined(
-    data: SyntheticData, factor: float, keyframes: int = 30, seed: int = 0, noise_m: float = STEP_NOISE_M
+    data: SyntheticData,
+    factor: float,
+    keyframes: int = 30,
+    seed: int = 0,
+    noise_m: float = STEP_NOISE_M,
+    aside_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
-    """Return a scene whose keyframes count as refined: poses as given, stretched by a factor and with noise."""
+    """Return a scene whose keyframes count as refined: poses as given, stretched by a factor and with noise.
+
+    The camera is turned about axes of the body by ``aside_deg``, so that each body is turned back.
+    """
     scene = scene_of(data, keyframes)
     table, rng = scene.keyframes, np.random.default_rng(seed)
     noise = np.cumsum(noise_m * rng.normal(size=(keyframes, 3)), axis=0)
     table.position[:] = factor * table.input_position + noise
     table.rotation[:] = geometry.so3_exp(np.array([0.1, 0.0, 0.4])) @ table.input_rotation
     table.position[:] = table.position @ geometry.so3_exp(np.array([0.1, 0.0, 0.4])).T
+    table.rotation[:] = table.rotation @ geometry.so3_exp(-np.radians(aside_deg))
     table.refined[:] = True
     return scene
 
@@ -65,6 +74,28 @@ def test_precise_odometry_tells_small_factors(mode: str) -> None:
         found = departed(refined(data, factor, noise_m=noise_m))
         assert (found is not None) == told, f"factor {factor}, noise {noise_m} m"
     assert departed(refined(data, 1.008, noise_m=0.001)) is None, "rigs and wheels are known no better"
+
+
+@pytest.mark.parametrize("mode", ["mono", "stereo", "rgbd"])
+@pytest.mark.parametrize("aside_deg", [(0.0, 0.0, 2.0), (0.0, -2.0, 0.0)])
+def test_one_side_is_named(mode: str, aside_deg: tuple[float, float, float]) -> None:
+    data = recording(mode=mode, path="line")
+    check = departed(refined(data, 1.0, noise_m=0.005, aside_deg=aside_deg))
+    assert check is not None and check.found is not None
+    text = check.found.causes()
+    found = re.search(r"principal point wrong, by about (\d+) px.*camera 0 does not fit .* by about 2 degrees", text)
+    assert found, text
+    expected = np.radians(2.0) * data.rig.intrinsics[0, 0]
+    assert abs(int(found[1]) - expected) < 0.25 * expected, f"{text}: expected about {expected:.0f} px"
+
+
+@pytest.mark.parametrize("mode", ["mono", "stereo"])
+def test_noise_is_no_side(mode: str) -> None:
+    """A camera that is mounted to half a degree is as good as most; a roll along the way turns no step."""
+    data = recording(mode=mode, path="line")
+    for seed in range(40):
+        for aside_deg in ((0.0, 0.5, 0.0), (0.0, 0.0, -0.5), (3.0, 0.0, 0.0)):
+            assert departed(refined(data, 1.0, seed=seed, aside_deg=aside_deg)) is None, f"seed {seed}, {aside_deg}"
 
 
 def test_where_it_cannot_be_asked() -> None:

@@ -206,17 +206,25 @@ def test_missing_ros_is_named() -> None:
         ["track", "a.mcap", "link.mcap"],
         ["info", "a.mcap", "--json", "a.mcap"],
         ["cut", "folder", "--out", "folder/part_0.mcap"],
+        ["rig", "b.mcap", "a.mcap", "--out", "c.yaml", "./a.mcap"],
+        ["solve", "a.mcap", "--out", "link.mcap"],
+        ["solve", "model", "--out", "model/"],
+        ["convert", "model", "model"],
+        ["map", "export", "a.mcap", "--ply", "a.mcap"],
+        ["evaluate", "a.mcap", "b.mcap", "--csv", "b.mcap"],
+        ["track", "folder", "out.mcap", "--rig", "a.mcap", "--json", "a.mcap"],
     ],
 )
 def test_what_is_read_is_not_written_over(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "folder").mkdir()
-    for name in ("a.mcap", "b.mcap", "folder/part_0.mcap"):
+    names = ("a.mcap", "b.mcap", "folder/part_0.mcap", "model/cameras.bin")
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"months of work")
     (tmp_path / "link.mcap").symlink_to("a.mcap")
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
     error = capsys.readouterr().err
     assert "that is read, and would be lost: write to another name" in error and error.count("\n") == 1
-    assert all((tmp_path / name).read_bytes() == b"months of work" for name in ("a.mcap", "folder/part_0.mcap"))
+    assert all((tmp_path / name).read_bytes() == b"months of work" for name in names)

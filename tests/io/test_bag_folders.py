@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -129,25 +130,34 @@ def test_one_part_of_several_says_so(tmp_path: Path, single: Path, capsys: pytes
     assert main(["replay", *map(str, paths[::-1]), "--out", str(tmp_path / "out"), "--no-report"]) == 0
 
 
-def test_missing_parts_are_named(tmp_path: Path, single: Path) -> None:
+def test_missing_parts_are_named(tmp_path: Path, single: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = split(tmp_path / "bag", messages_of(single), 3)
     write_metadata(tmp_path / "bag", [path.name for path in paths])
     paths[1].unlink()
     with BagReader(tmp_path / "bag") as reader:
         assert "1 of its 3 files are missing: part_1.mcap" in reader.warnings["missing_files"]
+    assert main(["check", str(tmp_path / "bag"), "--json", str(tmp_path / "found.json")]) == 3
+    words = "1 of its 3 files are missing: part_1.mcap"
+    assert words in capsys.readouterr().err
+    assert words in json.loads((tmp_path / "found.json").read_text())["warnings"][0]
+    assert main(["check", str(tmp_path / "bag"), str(paths[0]), "--json", str(tmp_path / "found.json")]) == 3
+    assert words in json.loads((tmp_path / "found.json").read_text())["recordings"][0]["note"]
     for path in (paths[0], paths[2]):
         path.unlink()
     with pytest.raises(BagError, match="none of the files that its"), BagReader(tmp_path / "bag"):
         pass
 
 
-def test_a_damaged_part_costs_itself(tmp_path: Path, single: Path) -> None:
+def test_a_damaged_part_costs_itself(tmp_path: Path, single: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = split(tmp_path / "bag", messages_of(single), 3)
     paths[1].write_bytes(b"")
     with BagReader(tmp_path / "bag") as reader:
         assert reader.rejected == {"unreadable_file": 1}
         assert "part_1.mcap: the file is empty" in reader.rejection_notes[0]
         assert len(list(reader.messages())) > 0
+    assert main(["check", str(tmp_path / "bag")]) == 3
+    told = capsys.readouterr().err
+    assert "turned away: 1 unreadable_file" in told and "part_1.mcap: the file is empty" in told
 
 
 def test_a_folder_of_several_recordings_is_refused(tmp_path: Path, single: Path) -> None:
