@@ -42,8 +42,12 @@ def triangulate(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -
         return found, agrees
     # A point that lost views by it keeps those it had.
     fewer = np.bincount(rays.point, near, n_points) < np.bincount(rays.point, agrees, n_points)
-    agrees = np.where(fewer.take(rays.point), agrees, near)
-    return triangulation.triangulate(rays.part(agrees), n_points, kernels), agrees
+    near = np.where(fewer.take(rays.point), agrees, near)
+    # Few points have other rays than before.
+    changed = np.bincount(rays.point, near != agrees, n_points) > 0
+    again = triangulation.triangulate(rays.part(near & changed.take(rays.point)), n_points, kernels)
+    columns = zip(vars(again).values(), vars(found).values(), strict=True)
+    return Triangulation(*(np.where(changed.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in columns)), near
 
 
 def agreeing(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -> BoolArray:

@@ -92,14 +92,17 @@ class Objective:
         images, image = np.flatnonzero(used), (np.cumsum(used) - 1).take(key)
         self._image_keyframe, self._image_camera = images // n_cam, images % n_cam
         self._has_depth = len(obs.depth_m) > 0
-        depth_weight = np.nan_to_num(1.0 / obs.depth_sigma_m) * np.isfinite(obs.depth_m)
+        depth_m = depth_weight = obs.depth_m
+        if self._has_depth:
+            depth_weight = np.nan_to_num(1.0 / obs.depth_sigma_m) * np.isfinite(depth_m)
+            depth_m = np.nan_to_num(depth_m)
         self._all = _Observed(
             image,
             obs.point,
             np.asfortranarray(obs.uv),
             1.0 / _once(obs.sigma_px),
             *_lenses(problem, self._image_camera),
-            np.nan_to_num(obs.depth_m),
+            depth_m,
             depth_weight,
             np.zeros(0, dtype=bool),
         )

@@ -222,7 +222,8 @@ class _Sums:
         reach = less * _dot(self.direction, centre) + self._measured
         np.multiply(reach, self.direction, out=values[6:])
         values[6:] += across * centre
-        sums = np.bincount(self._bins, values.ravel(), 9 * self._n).reshape(9, -1)
+        # Without rays numpy counts in integers.
+        sums = np.bincount(self._bins, values.ravel(), 9 * self._n).astype(float, copy=False).reshape(9, -1)
         matrix = sums[_PLACES].transpose(2, 0, 1).copy()
         trace = matrix[:, 0, 0] + matrix[:, 1, 1] + matrix[:, 2, 2]
         # A whiff of damping: parallel rays give a far point instead of a singular matrix.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ba_node import native
-from ba_node.core import consensus, geometry
+from ba_node.core import consensus, geometry, triangulation
 from ba_node.core.triangulation import Rays
 
 both = pytest.mark.parametrize(
@@ -47,6 +47,20 @@ def test_the_right_views_agree_however_many_are_wrong(backend: str, views: int, 
     assert np.mean(~agrees[~bad]) <= lost, f"{np.mean(~agrees[~bad]):.2%} of the right views are lost"
     if bad.any():
         assert np.mean(agrees[bad]) < 0.15, f"{np.mean(agrees[bad]):.2%} of the wrong views are believed"
+
+
+@both
+@pytest.mark.parametrize(("gate", "some_change"), [(1.5, True), (60.0, False)])
+def test_points_are_where_all_rays_that_agree_see_them(backend: str, gate: float, some_change: bool) -> None:
+    """Some rays of a few points agree with what all others give, and not with the best pair, or the other way round."""
+    rays, _ = make_rays(3, 12)
+    found, agrees = consensus.triangulate(rays, 51, gate, backend)
+    changed = np.unique(rays.point[agrees != consensus.agreeing(rays, 51, gate, backend)])
+    assert (0 < len(changed) < 50) == some_change
+    of_these = triangulation.triangulate(rays.part(agrees), 51, backend)
+    for one, other in zip(vars(found).values(), vars(of_these).values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert np.isnan(found.points[50]).all()
 
 
 @pytest.mark.skipif(native.kernels is None, reason="no C++ kernels built")

@@ -56,6 +56,14 @@ def take(problem: Problem, rows: np.ndarray) -> Problem:
 
 
 @both
+def test_without_rays_no_point_has_a_place(backend: str) -> None:
+    none = rays_of(make_problem(1)).part(np.zeros(240, bool))
+    found = triangulate(none, 2, backend)
+    assert np.isnan(found.points).all()
+    assert not found.measured.any()
+
+
+@both
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 def test_exact_rays_give_the_exact_point(backend: str, offset: float) -> None:
     problem = make_problem(1, offset=offset)
