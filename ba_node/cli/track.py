@@ -46,7 +46,8 @@ def add_track_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=TOPIC",
-        help="which images are meant: left, right, rgb, depth, image; odometry=TOPIC of nav_msgs/Odometry; repeatable",
+        help="which images are meant: left, right, rgb, depth, image; odometry=TOPIC of nav_msgs/Odometry, or"
+        " odometry=/tf:FRAME of transforms from a fixed frame (odom); repeatable",
     )
     parser.add_argument("--rig", type=Path, nargs="+", metavar="YAML", help="cameras, in any form that ba rig reads")
     parser.add_argument("--rectified", action="store_true", help="images are rectified: take p of camera_info, no d")

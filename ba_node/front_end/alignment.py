@@ -23,6 +23,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Transform
+from ba_node.front_end.patches import inverses
 from ba_node.front_end.rectify import IdealRig
 
 # What a calibration is trusted to, px: yaw and roll.
@@ -159,7 +160,7 @@ class StereoAlignment:
             error = pair.after - (f * m[:, :2] / z[:, None] + self._rig.centre) - by_d * off[:, None]
             smear = by_d * sigma_d[:, None]
             covariance = np.eye(2) * (sigma * sigma)[:, None, None] + smear[:, :, None] * smear[:, None]
-            inverse = np.linalg.inv(covariance)
+            inverse = inverses(covariance)
             likely = d + off + sigma_d * np.einsum("ni,nij,nj->n", smear, inverse, error)
             squared = np.einsum("ni,nij,nj->n", error, inverse, error)
             inverse /= (1.0 + squared / 4.0)[:, None, None]

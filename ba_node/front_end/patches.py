@@ -158,17 +158,19 @@ def align(
     p, w = grid(templates.side), window(templates.side)
     place, a = uv.astype(np.float64).copy(), affine.astype(np.float64).copy()
     # A patch without texture has no Hessian to speak of; what it is given moves it by nothing.
-    inverse = np.linalg.inv(templates.hessian + _LEAST_HESSIAN * np.eye(k))
+    inverse = inverses(templates.hessian + _LEAST_HESSIAN * np.eye(k))
     correlation, left = np.zeros(n), np.full(n, np.inf)
     depth = None if bend is None else 1.0 / (1.0 + bend.astype(np.float32) @ p.T)
     rows = np.arange(n)
-    jacobian, weighted, std, back = templates.jacobian, templates.weighted, templates.std, inverse
+    std, back = templates.std, inverse
+    compared = np.concatenate([templates.weighted[:, None], templates.jacobian], axis=1)
     for _ in range(iterations if n else 0):
         s = _at(image, place[rows], a[rows], p, depth)
         s -= (s @ w)[:, None]
         spread = np.sqrt(np.maximum((s * s) @ w, 1e-6))
-        agree = np.matmul(weighted[:, None], s[:, :, None])[:, 0, 0] / spread / np.maximum(std, 1e-6)
-        right = np.matmul(jacobian, s[:, :, None])[:, :, 0].astype(np.float64) * (std / spread)[:, None]
+        alike = np.matmul(compared, s[:, :, None])[:, :, 0]
+        agree = alike[:, 0] / spread / np.maximum(std, 1e-6)
+        right = alike[:, 1:].astype(np.float64) * (std / spread)[:, None]
         e = np.matmul(back, right[:, :, None])[:, :, 0]
         correlation[rows] = agree
         left[rows] = 2.0 * std**2 * np.maximum(1.0 - agree, 0.0)
@@ -179,12 +181,21 @@ def align(
             break
         # Those that have arrived are left out once they are many: to copy the others takes time too.
         if going.mean() < _MANY:
-            rows, jacobian, weighted, std, back = (one[going] for one in (rows, jacobian, weighted, std, back))
+            rows, compared, std, back = (one[going] for one in (rows, compared, std, back))
             depth = None if depth is None else depth[going]
     # As many independent values as pixels under the window.
     independent = 1.0 / float((w * w).sum())
     covariance = inverse * (left / independent)[:, None, None]
     return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance)
+
+
+def inverses(matrices: FloatArray) -> FloatArray:
+    """Return inverses (n, k, k); of 2 x 2 by hand, as LAPACK takes ten times as long."""
+    if matrices.shape[1] != 2:
+        return np.asarray(np.linalg.inv(matrices))
+    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
+    out = np.stack([d, -b, -c, a], axis=1) / (a * d - b * c)[:, None]
+    return out.reshape(-1, 2, 2)
 
 
 def _at(image: Floats, place: FloatArray, a: FloatArray, p: Floats, depth: Floats | None) -> Floats:

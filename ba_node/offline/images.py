@@ -35,7 +35,9 @@ from ba_node.offline.image_folder import Picture, find_pictures
 from ba_node.offline.rig import rig_of_recording, static_tree
 
 _INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
-_ODOMETRY = "nav_msgs/msg/Odometry"
+_ODOMETRY, _TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+# The fixed frame of transforms, of which none is said (REP 105).
+_FIXED = "odom"
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _QUEUE = 100
@@ -87,11 +89,11 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
     chosen = _image_topics(reader, request)
     mode = next(mode for mode, names in MODES.items() if set(names) == set(chosen))
     rig = _first_cameras(request.rig or _recorded_rig(reader, request, chosen, mode), mode, str(reader.path))
-    odometry = _odometry_topic(reader, request)
+    odometry = _odometry_of(reader, request)
     topics = {topic: name for name, topic in chosen.items()}
 
     def read() -> Iterator[tuple[Images, Transform | None]]:
-        poses = OdometryBuffer() if odometry else request.poses
+        poses = OdometryBuffer() if odometry.topic else request.poses
         return _paired(source, _messages(reader, source, topics, odometry, poses), poses)
 
     source = ImageSource(rig, mode, 0, read)
@@ -122,15 +124,51 @@ def _changes(reader: BagReader, infos: Sequence[str], rig: CameraRig) -> dict[st
     return found
 
 
-def _odometry_topic(reader: BagReader, request: ImageRequest) -> str:
-    """Return the topic of the odometry, empty if none was asked for."""
+@dataclass(frozen=True)
+class _Odometry:
+    """Where poses of the body come from."""
+
+    topic: str = ""  # of nav_msgs/Odometry or of tf2_msgs/TFMessage; empty for none
+    frame: str = ""  # the fixed frame of transforms; empty for odometry
+
+    def poses(self, message: Any) -> Iterator[tuple[int, str, Transform]]:
+        """Yield stamp (ns), frame on the body and its pose in the fixed frame of what a message says."""
+        if not self.frame:
+            pose = message.pose.pose
+            stamp_ns = stamp_ns_from_message(message.header.stamp)
+            yield stamp_ns, str(message.child_frame_id), transform_of(pose.position, pose.orientation)
+            return
+        for one in message.transforms:
+            if str(one.header.frame_id).removeprefix("/") == self.frame:
+                place = transform_of(one.transform.translation, one.transform.rotation)
+                yield stamp_ns_from_message(one.header.stamp), str(one.child_frame_id).removeprefix("/"), place
+
+
+def _odometry_of(reader: BagReader, request: ImageRequest) -> _Odometry:
+    """Return the odometry that was asked for: a topic, or a topic of transforms with the fixed frame behind a colon."""
     if "odometry" not in request.topics:
-        return ""
-    topic = absolute(request.topics["odometry"])
-    if reader.topics.get(topic) != _ODOMETRY:
-        there = ", ".join(name for name, kind in sorted(reader.topics.items()) if kind == _ODOMETRY) or "none"
-        raise BagError(f"{reader.path}: odometry={topic}: no topic of {_ODOMETRY}; there are: {there}")
-    return topic
+        return _Odometry()
+    name, _, frame = request.topics["odometry"].partition(":")
+    topic = absolute(name)
+    kind = reader.topics.get(topic)
+    if kind == _TF:
+        found = _Odometry(topic, frame or _FIXED)
+        parents = _parents(reader, topic)
+        if found.frame not in parents:
+            there = ", ".join(sorted(parents)) or "none"
+            raise BagError(f"{reader.path}: {topic} has no transform from {found.frame!r}: say --topic"
+                           f" odometry={topic}:FRAME; there are transforms from: {there}")  # fmt: skip
+        return found
+    if kind != _ODOMETRY:
+        there = ", ".join(name for name, kind in sorted(reader.topics.items()) if kind in (_ODOMETRY, _TF)) or "none"
+        raise BagError(f"{reader.path}: odometry={topic}: no topic of {_ODOMETRY} or {_TF}; there are: {there}")
+    return _Odometry(topic)
+
+
+def _parents(reader: BagReader, topic: str) -> set[str]:
+    """Return the frames from which transforms of a topic lead."""
+    messages = (reader.decode(topic, data) for topic, _, _, data in reader.messages([topic]))
+    return {str(one.header.frame_id).removeprefix("/") for message in messages for one in message.transforms}
 
 
 def _recorded_rig(reader: BagReader, request: ImageRequest, chosen: Mapping[str, str], mode: str) -> CameraRig:
@@ -211,27 +249,36 @@ def _paired(
 
 
 def _messages(
-    reader: BagReader, source: ImageSource, topics: Mapping[str, str], odometry: str, poses: OdometryBuffer | None
+    reader: BagReader,
+    source: ImageSource,
+    topics: Mapping[str, str],
+    odometry: _Odometry,
+    poses: OdometryBuffer | None,
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield images of a recording; poses of its odometry go into the buffer."""
-    tree = static_tree(reader)
-    for topic, _, _, data in reader.messages([*topics, *([odometry] if odometry else [])]):
+    tree, body = static_tree(reader), source.rig.frame_id
+    fitting, others = set[str](), set[str]()
+    for topic, _, _, data in reader.messages([*topics, *filter(None, [odometry.topic])]):
         try:
             message = reader.decode(topic, data)
         except BagError as error:
             _leave(source, "undecodable", str(error))
             continue
-        stamp_ns = stamp_ns_from_message(message.header.stamp)
-        if topic != odometry or poses is None:
-            yield topics[topic], stamp_ns, message
+        if topic != odometry.topic or poses is None:
+            yield topics[topic], stamp_ns_from_message(message.header.stamp), message
             continue
-        pose = transform_of(message.pose.pose.position, message.pose.pose.orientation)
-        child, body = str(message.child_frame_id), source.rig.frame_id
-        place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
-        if place is None:
-            words = f"the odometry is of {child!r}, and /tf_static has no way from there to {body!r}: taken as the same"
-            source.warnings["odometry of another frame"] = words
-        poses.add(stamp_ns, pose if place is None else pose.after(place))
+        for stamp_ns, child, pose in odometry.poses(message):
+            place = tree.find(child, body) if child not in ("", body) else Transform(np.eye(3), np.zeros(3))
+            (others if place is None else fitting).add(child)
+            if place is None and odometry.frame:
+                continue  # transforms of all kinds come on one topic
+            if place is None:
+                words = f"the odometry is of {child!r}, and /tf_static has no way from there to {body!r}"
+                source.warnings["odometry of another frame"] = f"{words}: taken as the same"
+            poses.add(stamp_ns, pose if place is None else pose.after(place))
+    if odometry.frame and not fitting:
+        words = f"transforms from {odometry.frame!r} are to {', '.join(sorted(others))}, and /tf_static has no way from"
+        source.warnings["odometry of another frame"] = f"{words} there to {body!r}: record it, or say --base"
 
 
 def _read(source: ImageSource, frame: Frame, poses: OdometryBuffer | None) -> Iterator[tuple[Images, Transform | None]]:

@@ -129,6 +129,52 @@ def test_odometry_of_another_frame_is_said(tmp_path: Path) -> None:
     assert "no way from there to 'cam'" in source.warnings["odometry of another frame"]
 
 
+def transforms(stamp_ns: int, *links: tuple[str, str, list[float]]) -> Any:
+    """Return a tf2_msgs/TFMessage of links (parent, child, place)."""
+    made = [
+        layouts.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=layouts.header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=layouts.transform_at(place, [0, 0, 0, 1]),
+        )
+        for parent, child, place in links
+    ]
+    return layouts.make("tf2_msgs/msg/TFMessage", transforms=made)
+
+
+def with_transforms(parent: str = "odom") -> list[Sent]:
+    """Return images of a camera 0.2 m above a base that moves 1 m an image, among other transforms."""
+    kind = "tf2_msgs/msg/TFMessage"
+    sent = [
+        info("/camera_info", "cam"),
+        Sent("/tf_static", kind, transforms(1, ("base_link", "cam", [0.0, 0.0, 0.2])), 1),
+    ]
+    for i in range(4):
+        stamp = (i + 1) * STEP_NS
+        links = ("map", "odom", [7.0, 0, 0]), (parent, "marker", [99.0, 0, 0]), (parent, "base_link", [float(i), 0, 0])
+        sent.append(Sent("/tf", kind, transforms(stamp, *links), stamp))
+        sent.append(image("/image_raw", stamp, i))
+    return sent
+
+
+def test_odometry_by_transforms(tmp_path: Path) -> None:
+    """Those from the fixed frame to what the cameras sit on, and no others."""
+    bag = layouts.write(tmp_path / "bag", with_transforms())
+    for topic in ("/tf", "tf:odom"):
+        source, frames = read(bag, topics={"odometry": topic})
+        assert [pose.translation.tolist() for _, pose in frames] == [[i, 0.0, 0.2] for i in range(4)]
+        assert not source.counted and not source.warnings
+    source, frames = read(bag, topics={"odometry": "/tf"}, base="base_link")
+    assert [pose.translation.tolist() for _, pose in frames] == [[i, 0.0, 0.0] for i in range(4)]
+    source, frames = read(bag, topics={"odometry": "/tf:map"})
+    assert not frames and source.counted == {"no odometry": 4}
+    words = source.warnings["odometry of another frame"]
+    assert words.startswith("transforms from 'map' are to odom, and /tf_static has no way from there to 'cam'")
+    with pytest.raises(BagError, match=r"from 'odom': say --topic odometry=/tf:FRAME; there are .* from: map, world"):
+        read(layouts.write(tmp_path / "world", with_transforms("world")), topics={"odometry": "/tf"})
+
+
 def test_a_calibration_that_changes_is_said(tmp_path: Path) -> None:
     messages = [*stereo(), info("/left/camera_info", "left")]
     source, _ = read(layouts.write(tmp_path / "same", messages))
@@ -143,7 +189,10 @@ def test_a_calibration_that_changes_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("request_", "words"),
     [
-        ({"topics": {"odometry": "/left/image_raw"}}, "no topic of nav_msgs/msg/Odometry; there are: none"),
+        (
+            {"topics": {"odometry": "/left/image_raw"}},
+            "no topic of nav_msgs/msg/Odometry or tf2_msgs/msg/TFMessage; there are: none",
+        ),
         ({"topics": {"odometry": "/nope"}}, "odometry=/nope: no topic of nav_msgs/msg/Odometry"),
         ({"base": "nope"}, "no way from 'nope'"),
     ],

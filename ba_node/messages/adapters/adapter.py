@@ -26,22 +26,21 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.core import cameras, geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
-from ba_node.messages.adapters.sources import Extrinsic, Features, LayoutError, Pose, Source
+from ba_node.messages.adapters.sources import Extrinsic, Features, LayoutError, Pose, Source, mismatch
 
 # Images that wait for their pose or for the rig, and poses that wait for their image.
 MAX_WAITING = 200
 _NO_RIG = "nothing tells the cameras: give them with --rig FILE"
 # Tracks and keyframes that are remembered; a guess that is sent twice does no harm.
-_MAX_KNOWN = 1_000_000
+_MAX_KNOWN = 200_000
 # A pose so much older than the newest is of another session, ns.
 _BACK_NS = 1_000_000_000
 # How far a calibration may move before it is said: focal length and principal point by fx; m; rad.
 _MOVED = (0.005, 0.01, 0.01)
+# Points of known ids that lie in other directions (median) are other points, rad.
+_ELSEWHERE = 0.17
 # Pixels that a camera_info of the source's own camera leaves between its points and its pixels, median, px.
 _MAX_DISAGREEMENT_PX = 2.0
-# Half of all pixels lie within no less, px, and are so many times as far apart as their rays. Of both, most are on the
-# same side of the middle.
-_LEAST_SPREAD_PX, _SAME_SIDE = 5.0, 0.75
 # Fewest points that tell a focal length, and the one that is taken where they do not, px.
 _FIT_POINTS, _FOCAL_PX = 8, 460.0
 
@@ -86,7 +85,7 @@ class Adapter:
         self._frames: list[tuple[Pose, Features]] = []  # wait for the rig
         self._newest_ns: int | None = None
         self._last: _Last | None = None
-        self._guessed: set[int] = set()
+        self._points: dict[int, FloatArray] = {}  # where each track was last
         self._keys: set[int] = set()
 
     @property
@@ -137,7 +136,7 @@ class Adapter:
     def restart(self) -> None:
         """Begin a new session: ids begin anew."""
         self._session += self.sent > 0
-        for waiting in (self._poses, self._features, self._frames, self._guessed, self._keys):
+        for waiting in (self._poses, self._features, self._frames, self._points, self._keys):
             waiting.clear()
         self._last, self._newest_ns = None, None
 
@@ -215,7 +214,7 @@ class Adapter:
             self.leave("repeated_keyframe", f"keyframe {key} came again")
             return
         features = self._usable(features)
-        if wrong := _mismatch(features):
+        if wrong := mismatch(features):
             self.leave("not_pixels", wrong)
             return
         if not len(features.ids):
@@ -229,6 +228,9 @@ class Adapter:
                 del self._frames[0]
                 self.leave("no_rig", _NO_RIG)
             return
+        if self._is_anew(pose, features):
+            self.notes["begun_anew"] = f"track ids are those of other points from {pose.stamp_ns} ns on: a new session"
+            self.restart()
         if not self._is_keyframe(pose, features):
             return
         yield from self._send(key, pose, features)
@@ -278,6 +280,16 @@ class Adapter:
             f"{why}: the source's undistorted points are taken, in a camera of fx = {fx:.1f}, fy = {fy:.1f} px"
         )
 
+    def _is_anew(self, pose: Pose, features: Features) -> bool:
+        """Return True if points of known ids are seen elsewhere: the source has begun anew and counts from 0."""
+        told = np.flatnonzero(np.isfinite(features.point).all(axis=1)).tolist()
+        known = [i for i in told if int(features.ids[i]) in self._points]
+        if features.point_in_body or len(known) < _FIT_POINTS:
+            return False
+        before = np.array([self._points[int(features.ids[i])] for i in known])
+        angle = _angles(features.point[known] - pose.position, before - pose.position)
+        return bool(np.median(angle) > _ELSEWHERE)
+
     def _is_keyframe(self, pose: Pose, features: Features) -> bool:
         last = self._last
         if last is None or not self._source.every_image or features.is_keyframe or pose.is_keyframe:
@@ -292,8 +304,7 @@ class Adapter:
             moved = np.linalg.norm((features.uv[now] - last.features.uv[before]) / focal, axis=1)
             angle = float(np.median(np.arctan(moved)))
         else:
-            cosine = np.sum(rays[0] * rays[1], axis=1) / np.prod(np.linalg.norm(rays, axis=2), axis=0).clip(min=1e-12)
-            angle = float(np.median(np.arccos(cosine.clip(-1.0, 1.0))))
+            angle = float(np.median(_angles(*rays)))
         return bool(np.degrees(angle) >= self._options.parallax_deg)
 
     def _send(self, key: int, pose: Pose, features: Features) -> Iterator[tuple[str, int, Measurement]]:
@@ -304,7 +315,7 @@ class Adapter:
             self._rig_sent = self.rig
             yield "camera_rig", stamp_ns, self.rig
         self._last = _Last(features.ids, pose.position, features)
-        for known in (self._keys, self._guessed):
+        for known in (self._keys, self._points):
             if len(known) > _MAX_KNOWN:
                 known.clear()
         self._keys.add(key)
@@ -322,9 +333,10 @@ class Adapter:
             depth_m = self._depth_m(features) if features.has_depth else depth_m
             point = point @ geometry.matrix_from_quaternion(pose.orientation).T + pose.position
         ids = features.ids.astype(np.uint64)
-        new = [i for i, track in enumerate(ids.tolist()) if track not in self._guessed and np.isfinite(point[i]).all()]
+        told = np.flatnonzero(np.isfinite(point).all(axis=1))
+        new = [i for i in told.tolist() if int(ids[i]) not in self._points]
+        self._points.update(zip(ids[told].tolist(), point[told], strict=True))
         if new:
-            self._guessed.update(ids[new].tolist())
             yield "landmark_guesses", stamp_ns, LandmarkGuesses(self._session, ids[new], point[new])
         for camera in np.unique(features.camera):
             rows = features.camera == camera
@@ -341,32 +353,15 @@ class Adapter:
         return np.where(depth > 0.0, depth, np.nan)
 
 
+def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angles between vectors (n, 3), rad."""
+    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    return np.asarray(np.arccos((np.sum(a * b, axis=1) / lengths.clip(min=1e-12)).clip(-1.0, 1.0)))
+
+
 def _is_pose(piece: Pose | Extrinsic) -> bool:
     finite = np.isfinite(piece.position).all() and np.isfinite(piece.orientation).all()
     return bool(finite and piece.orientation.any())
-
-
-def _mismatch(features: Features) -> str:
-    """Return in words why pixels and rays cannot be those of the same points, empty if they can.
-
-    It holds for every lens: what is farther right of the others in one is so in the other, and a camera of a focal
-    length below some pixels there is none.
-    """
-    uv, rays = features.uv, features.normalised
-    if len(uv) < _FIT_POINTS:
-        return ""
-    spread_px = np.subtract(*np.percentile(uv, [75, 25], axis=0))
-    if (spread_px < _LEAST_SPREAD_PX).all():
-        return f"half of the pixels lie within {spread_px.max():.2g} px: are they divided by the focal length?"
-    if not np.isfinite(rays).all():
-        return ""
-    spread = np.subtract(*np.percentile(rays, [75, 25], axis=0))
-    if (spread_px < _LEAST_SPREAD_PX * spread).all():
-        return f"half of x / z and y / z lie within {spread.max():.3g}, of the pixels {spread_px.max():.3g}: exchanged?"
-    same = ((uv > np.median(uv, axis=0)) == (rays > np.median(rays, axis=0))).mean(axis=0)
-    if (same < _SAME_SIDE).any():
-        return f"{100 * same.min():.0f} % of x / z and y / z are on the side of u and v: are these exchanged?"
-    return ""
 
 
 def _disagreement_px(rig: CameraRig, features: Features) -> float:

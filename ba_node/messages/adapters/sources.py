@@ -17,6 +17,11 @@ from ba_node.messages.factory import stamp_ns_from_message
 
 ODOMETRY, CLOUD = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+# Half of all pixels lie within no less, px, and are so many times as far apart as their rays. Of both, most are on the
+# same side of the middle.
+_LEAST_SPREAD_PX, _SAME_SIDE = 5.0, 0.75
+# Fewest points that tell so.
+_FEWEST = 8
 
 
 class LayoutError(ValueError):
@@ -119,3 +124,26 @@ def pose(odometry: Any, session: int = 0, *, is_keyframe: bool = False) -> Pose:
 def nowhere(n: int, size: int) -> FloatArray:
     """Return (n, size) NaN."""
     return np.full((n, size), np.nan)
+
+
+def mismatch(features: Features) -> str:
+    """Return in words why pixels and rays cannot be those of the same points, empty if they can.
+
+    It holds for every lens: what is farther right of the others in one is so in the other, and a camera of a focal
+    length below some pixels there is none.
+    """
+    uv, rays = features.uv, features.normalised
+    if len(uv) < _FEWEST:
+        return ""
+    spread_px = np.subtract(*np.percentile(uv, [75, 25], axis=0))
+    if (spread_px < _LEAST_SPREAD_PX).all():
+        return f"half of the pixels lie within {spread_px.max():.2g} px: are they divided by the focal length?"
+    if not np.isfinite(rays).all():
+        return ""
+    spread = np.subtract(*np.percentile(rays, [75, 25], axis=0))
+    if (spread_px < _LEAST_SPREAD_PX * spread).all():
+        return f"half of x / z and y / z lie within {spread.max():.3g}, of the pixels {spread_px.max():.3g}: exchanged?"
+    same = ((uv > np.median(uv, axis=0)) == (rays > np.median(rays, axis=0))).mean(axis=0)
+    if (same < _SAME_SIDE).any():
+        return f"{100 * same.min():.0f} % of x / z and y / z are on the side of u and v: are these exchanged?"
+    return ""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ba_node.core import geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from tests.messages.adapters import layouts
 from tests.messages.adapters.layouts import CLOUD, ODOMETRY, Sent
@@ -162,3 +163,38 @@ def test_a_camera_that_is_none_is_counted() -> None:
 
     made, out = feed("vins_mono", changed("vins_mono", CLOUD, spoil))
     assert made.counted["unknown_camera"] == 3 * len(of(Keyframe, out)) > 0
+
+
+@pytest.mark.parametrize("source", ["openvins", "vins_fusion"])
+def test_a_source_that_begins_anew_while_its_clock_goes_on(source: str) -> None:
+    """Ids count from 0 again, and stand for other points: the session before keeps what it has."""
+    data, options = layouts.scene(12), {"late": 0} if source == "vins_fusion" else {}
+    began = sorted({int(one.stamp_ns) for one in data.keyframes})[6]
+    first = next(one for one in data.keyframes if one.stamp_ns == began)
+    turn = geometry.matrix_from_quaternion(first.orientation).T
+    number: dict[float, float] = {}
+
+    def anew(xyz: Any) -> None:
+        xyz.x, xyz.y, xyz.z = (float(v) for v in turn @ (np.array([xyz.x, xyz.y, xyz.z]) - first.position))
+
+    sent = []
+    for one in getattr(layouts, source)(data, **options):
+        message = copy.deepcopy(one.message)
+        if message.header.stamp.sec * 10**9 + message.header.stamp.nanosec >= began - 200:
+            if one.topic.endswith("_pose"):
+                at = message.pose.pose
+                q = np.array([at.orientation.x, at.orientation.y, at.orientation.z, at.orientation.w])
+                turned = geometry.quaternion_from_matrix(turn @ geometry.matrix_from_quaternion(q))
+                at.orientation.x, at.orientation.y, at.orientation.z, at.orientation.w = map(float, turned)
+                anew(at.position)
+            for channel, point in zip(getattr(message, "channels", []), getattr(message, "points", []), strict=True):
+                channel.values[4] = number.setdefault(float(channel.values[4]), float(len(number)))
+                anew(point)
+        sent.append(one._replace(message=message))
+    made, out = feed(source, sent)
+    keyframes = of(Keyframe, out)
+    assert [one.session_id for one in keyframes] == [int(one.stamp_ns >= began) for one in keyframes]
+    assert {one.session_id for one in keyframes} == {0, 1}
+    assert made.notes["begun_anew"].endswith("a new session")
+    assert made.summary().endswith("in 2 sessions")
+    assert "begun_anew" not in feed(source, getattr(layouts, source)(data, **options))[0].notes
