@@ -83,7 +83,8 @@ def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
 def scale_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     """Return by what factor all steps are longer than the front-end's; 1 where that cannot be told from its errors."""
     if native.kernels is not None:
-        return native.kernels.scale_error(_both(steps), _both(measured), found.sigma_m, _LIMITS)  # type: ignore[no-any-return]
+        factor: float = native.kernels.scale_error(_both(steps), _both(measured), found.sigma_m, _LIMITS)
+        return factor
     return _common(steps.move, measured.move, found.sigma_m)
 
 
@@ -91,7 +92,8 @@ def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     """Return by what factor all turns are larger than the front-end's; 1 where that cannot be told from its errors."""
     if native.kernels is not None:
         worth = found.turned_rad, found.sigma_rad
-        return native.kernels.turn_error(_both(steps), _both(measured), *worth, _LIMITS)  # type: ignore[no-any-return]
+        factor: float = native.kernels.turn_error(_both(steps), _both(measured), *worth, _LIMITS)
+        return factor
     telling = found.turned_rad > found.sigma_rad
     if np.count_nonzero(telling) < _FEW:
         return 1.0
