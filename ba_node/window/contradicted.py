@@ -34,7 +34,10 @@ def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
     off = pairs.position @ rotation.T + translation - pairs.points(scene)
     sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2))
     off_m = np.linalg.norm(off, axis=1)
-    wrong = (off_m > _BESIDE * sigma) | _astray_together(off, sigma, config.adjust_m)
+    jumped = np.zeros(len(pairs), bool)
+    for source, since, to in known.left_out:
+        jumped |= (pairs.source == source) & (pairs.stamp_ns >= since) & (pairs.stamp_ns <= to)
+    wrong = jumped | (off_m > _BESIDE * sigma) | _astray_together(off, sigma, config.adjust_m)
     count = int(np.count_nonzero(wrong))
     if count >= _MANY and count > _TOO_MANY * len(pairs):
         stamps = scene.keyframes.stamp_ns[pairs.row[wrong]]
@@ -43,7 +46,7 @@ def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
             f"{count} of {len(pairs)} priors in frame {known.world_frame!r} lie {np.median(off_m[wrong]):.1f} m beside"
             f" the map (median), from {stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s: they contradict the"
             " others, or images and odometry, or their covariance is too small. Did their source change its reference?"
-            f"{_left_out(len(pairs) - len(constraints.every_pair(scene, config)))}",
+            f"{_left_out(int(np.count_nonzero(jumped)))}",
         )
 
 

@@ -8,9 +8,9 @@ steps, q a step. With ``d_i = c_{i+1} - c_i``::
     var(d_i - d_{i+1}) = 6 sigma^2 + 2 q^2,    var(d_i + d_{i+1}) = 2 sigma^2 + 2 q^2
 
 so the source's own noise shows whatever the steps are worth. Where it is well above what was stated, all of the source
-count by so much less. A source that changes its reference shows as a step of c, of more than both noises leave of
-medians of ten on either side, where images or wheels confirm that the body has not jumped. Stretches between such steps
-that lie elsewhere than most of the measurements take no part in a solve.
+count by so much less. A source that changes its reference shows as a step of c: medians of ten on either side differ by
+far more than noise leaves of them, and than they do elsewhere, and images or wheels confirm that the body has not
+jumped. Stretches between such steps that lie elsewhere than most of the measurements take no part in a solve.
 
 Spreads are taken from lower quartiles, so that one in three may be wrong.
 """
@@ -44,7 +44,6 @@ class _Compared:
     difference: FloatArray  # (n - 1, 3) d, m
     path_m: FloatArray  # (n,) along the front-end's path
     noise_m: float  # sigma
-    walk_m: float  # q
 
 
 def judge(scene: Scene, config: FactorsConfig) -> str:
@@ -89,7 +88,7 @@ def _compared(scene: Scene, pairs: constraints.Pairs) -> _Compared:
     less, more = _spread(d[:-1] - d[1:]), _spread(d[:-1] + d[1:])
     noise2 = max(0.25 * (less**2 - more**2), 0.0)
     path = np.append(0.0, np.cumsum(np.linalg.norm(step, axis=1)))
-    return _Compared(pairs, d, path, float(np.sqrt(noise2)), float(np.sqrt(max(0.5 * more**2 - noise2, 0.0))))
+    return _Compared(pairs, d, path, float(np.sqrt(noise2)))
 
 
 def _spread(vectors: FloatArray) -> float:
@@ -123,22 +122,30 @@ def _jumped(scene: Scene, one: _Compared, least_m: float) -> list[tuple[int, int
     jump = middle[_SIDE:] - middle[:-_SIDE]  # (n - 2 side + 1, 3) before c[side + i]
     size = np.linalg.norm(jump, axis=1)
     length = one.path_m[2 * _SIDE - 1 :] - one.path_m[: n - 2 * _SIDE + 1]
-    walk = one.walk_m * np.maximum(length / max(float(np.median(length)), 1e-9), 1.0)
+    usual = _spread(jump) * np.maximum(length / max(float(np.median(length)), 1e-9), 1.0)
     noise = max(one.noise_m, float(np.median(_stated(one.pairs))))
-    least = np.maximum(_SURE * np.sqrt(2.0 * _MEDIAN / _SIDE * noise**2 + 2.0 / 3.0 * _SIDE * walk**2), least_m)
+    least = np.maximum(_SURE * np.maximum(np.sqrt(2.0 * _MEDIAN / _SIDE) * noise, usual), least_m)
     found: list[int] = []
     for i in np.argsort(-size, kind="stable").tolist():
         if size[i] <= least[i]:
             continue
-        if all(abs(i - other) >= _SIDE for other in found) and _confirmed(scene, one.pairs.row, i + _SIDE, size[i]):
+        begins = _begin(c[i : i + 2 * _SIDE], middle[i], middle[i + _SIDE])
+        if all(abs(i - other) >= _SIDE for other in found) and _confirmed(scene, one.pairs.row, i + begins, size[i]):
             found.append(i)
     found.sort()
-    begin = np.array([0, *(i + _SIDE for i in found), n])
+    begins_at = [i + _begin(c[i : i + 2 * _SIDE], middle[i], middle[i + _SIDE]) for i in found]
+    begin = np.array([0, *sorted(begins_at), n])
     level = np.append(np.zeros((1, 3)), np.cumsum(jump[found], axis=0), axis=0)
     same = np.linalg.norm(level[:, None] - level, axis=2) <= np.max(least[found], initial=0.0)
     believed = same[int(np.argmax(same @ np.diff(begin)))]
     ends = [*stamps[begin[1:-1]].tolist(), np.iinfo(np.int64).max]
     return [(int(stamps[begin[k]]), int(ends[k]) - 1) for k in np.flatnonzero(~believed)]
+
+
+def _begin(c: FloatArray, before: FloatArray, after: FloatArray) -> int:
+    """Return from which of some measurements on they lie nearer to where they are after a jump than before it."""
+    nearer = np.linalg.norm(c - before, axis=1) - np.linalg.norm(c - after, axis=1)
+    return int(np.argmin(np.cumsum(nearer)[:-1])) + 1
 
 
 def _confirmed(scene: Scene, row: IntArray, at: int, size_m: float) -> bool:
