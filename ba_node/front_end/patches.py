@@ -190,7 +190,7 @@ def align(
 
 
 def inverses(matrices: FloatArray) -> FloatArray:
-    """Return inverses (n, k, k); of 2 x 2 by hand, as LAPACK takes ten times as long."""
+    """Invert matrices (n, k, k), those of 2 x 2 by hand, as LAPACK takes ten times as long."""
     if matrices.shape[1] != 2:
         return np.asarray(np.linalg.inv(matrices))
     a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
