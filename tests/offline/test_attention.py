@@ -70,3 +70,12 @@ def test_a_result_that_is_worse_than_its_input_is_said() -> None:
     ]
     nothing = {"rms_px": {"input": None, "refined": None}, "median_px": {"input": 0.5, "refined": None}}
     assert attention(_report(**nothing)) == []
+
+
+def test_one_outlier_that_is_farther_off_is_no_worse_result() -> None:
+    """As where a mismatch of 60 px is one of 250 px once its point is well placed."""
+    rms = {"rms_px": {"input": 3.1, "refined": 5.1}, "median_px": {"input": 1.2, "refined": 0.6}}
+    assert attention(_report(**rms, bounded_px={"input": 2.0, "refined": 1.5})) == []
+    worse = "the result explains the observations worse than what came in: rms of all 3.1 -> 5.1 px"
+    assert attention(_report(**rms, bounded_px={"input": 1.5, "refined": 1.52})) == [worse]
+    assert attention(_report(**rms, bounded_px={"input": None, "refined": None})) == [worse]
