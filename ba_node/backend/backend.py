@@ -99,8 +99,7 @@ class Backend:
     @property
     def due(self) -> tuple[int, int] | None:
         """Return session and id of the newest keyframe that the next solve is for, None if it is for none."""
-        rows = self.map.due()
-        if self.scene.session_id is None or not len(rows):
+        if self.scene.session_id is None or not len(rows := self.map.due()):
             return None
         return self.scene.session_id, int(self.scene.keyframes.keyframe_id[rows[-1]])
 
@@ -251,13 +250,16 @@ class Backend:
         while self.ready:
             if (estimate := self.solve()) is not None:
                 yield estimate
-        last = self.adjust(final=True) if not self.setup.reason(self.scene) else None
+        undone = self.take_check(departed(self.scene, final=True))
+        last = undone if self.setup.reason(self.scene) else self.adjust(final=True)
         if last is not None:
             yield last
 
     def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
         if self.completes(admitted) and (estimate := self.solve()) is not None:
             yield estimate
+        if admitted.begins is not None and (undone := self.take_check(departed(self.scene, final=True))):
+            yield undone
         before = self.map
         self.take(admitted)
         if self.map is not before:
@@ -308,8 +310,7 @@ class Backend:
         Returns:
             What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
         """
-        taken, result = optimization, optimization.result
-        self.refusal = ""
+        taken, result, self.refusal = optimization, optimization.result, ""
         if not result.status.usable or not result.state.is_finite():
             return None
         found = taken.outcome(result.state, self.config)
@@ -327,12 +328,12 @@ class Backend:
         if followed is None:
             return None
         self.solve_count += 1
-        newest = int(self.scene.order[-1])
-        self.map.adjustments += 1
+        self.map.adjustments, newest = self.map.adjustments + 1, int(self.scene.order[-1])
         statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
-        return self.map.with_covariances(self.estimate(), taken), followed
+        undone = self.take_check(departed(self.scene, final=True))
+        return undone or self.map.with_covariances(self.estimate(), taken), followed
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""

@@ -29,11 +29,12 @@ from ba_node.scene.scene import Scene
 # Factors beyond which lengths are said to differ, each if it is so many standard errors from 1: rigs and wheels are
 # known better, and odometry that shows a smaller factor so clearly is precise. Directions differ by as much aside.
 _FACTORS = ((1.015, 4.5), (1.012, 8.0))
-# Few steps tell their own spread badly: n of them need (1 + this / n) times as many standard errors.
-_FEW = 6.0
+# Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
+# Student's distribution asks for.
+_FEW = 8.0
 # Steps that are needed, and keyframes up to which a map is young.
-_STEPS, _YOUNG = 15, 120
-# It is asked once in so many keyframes.
+_STEPS, _YOUNG = 7, 120
+# It is asked once in so many keyframes, and at the end.
 _EVERY = 5
 # Shorter steps are noise, as those of a robot that stands or turns on the spot, m.
 _LEAST_M = 0.02
@@ -41,10 +42,13 @@ _LEAST_M = 0.02
 _TELLING, _TRIMMED = 0.3, 0.1
 
 
-def departed(scene: Scene) -> Check | None:
-    """Return what is wrong if the refined steps of a young map are off the front-end's by one factor or to one side."""
+def departed(scene: Scene, *, final: bool = False) -> Check | None:
+    """Return what is wrong if the refined steps of a young map are off the front-end's by one factor or to one side.
+
+    ``final``: no more keyframes will come, so that it is asked at any number of them.
+    """
     count = len(scene.keyframes)
-    if count % _EVERY or not _STEPS < count <= _YOUNG or scene.cameras is None:
+    if (count % _EVERY and not final) or not _STEPS < count <= _YOUNG or scene.cameras is None:
         return None
     if scene.constraints.absolute or scene.constraints.landmarks:
         return None
@@ -102,7 +106,8 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | No
 
 
 def _differs(mean: float, error: float, count: int) -> bool:
-    return any(abs(mean) >= max(np.log(factor), (1.0 + _FEW / count) * errors * error) for factor, errors in _FACTORS)
+    more = 1.0 + (_FEW / count) ** 1.5
+    return any(abs(mean) >= max(np.log(factor), more * errors * error) for factor, errors in _FACTORS)
 
 
 def _has_scale(scene: Scene) -> bool:

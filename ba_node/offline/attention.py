@@ -4,18 +4,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 # What arrives twice changes nothing.
 HARMLESS = ("duplicate_keyframe", "duplicate_observation")
-# What must not rise by more than a share, and px. Outliers decide the rms of all, and good points do not follow them.
+# What must not rise by more than a share, and px. Outliers decide the rms of all, and good points do not follow them;
+# one alone may be three times as far off, so that the rms with none above 20 px must not fall.
 _MEASURES = (
     ("rms_px", "rms of all", 0.5),
     ("bounded_px", "rms with none above 20 px", 0.05),
     ("median_px", "median residual", 0.05),
 )
 _SLACK_PX = 0.05
+# Half of all observations are nearer than this by their sigma_px, or the result explains little. By noise alone half
+# are within 1.2.
+_MAX_MEDIAN_SIGMAS = 3.0
 
 
 def attention(report: Mapping[str, Any]) -> list[str]:
@@ -43,15 +48,32 @@ def _not_taken(session: Mapping[str, Any]) -> list[str]:
 
 
 def _worse(session: Mapping[str, Any]) -> list[str]:
-    """Return by which measures the result of a session is worse than what came in."""
-    found = []
+    """Return that the result of a session explains little, or by which measures it is worse than what came in."""
+    found = {}
     for key, name, share in _MEASURES:
-        before, after = (session.get(key, {}).get(state) for state in ("input", "refined"))
-        if before is not None and after is not None and after > (1.0 + share) * before + _SLACK_PX:
-            found.append(f"{name} {before:.3g} -> {after:.3g} px")
-    if not found:
+        before, after = _both(session, key)
+        if after > (1.0 + share) * before + _SLACK_PX:
+            found[key] = f"{name} {before:.3g} -> {after:.3g} px"
+    before, after = _both(session, "bounded_px")
+    sigmas = _both(session, "median_sigmas")[1]
+    if session.get("keyframes_refined") and sigmas > _MAX_MEDIAN_SIGMAS:
+        px = _both(session, "median_px")[1]
+        text = (
+            f"the result explains little of what was observed: half of it is over {sigmas:.2g} sigmas ({px:.2g} px)"
+            " off: cameras, body_from_camera, poses, track ids or sigma_px are not what they are said to be; see what"
+            " ba check says"
+        )
+        return [text]
+    if not found or (set(found) == {"rms_px"} and after <= before):
         return []
-    return [f"the result explains the observations worse than what came in: {', '.join(found)}"]
+    return [f"the result explains the observations worse than what came in: {', '.join(found.values())}"]
+
+
+def _both(session: Mapping[str, Any], key: str) -> tuple[float, float]:
+    """Return a measure before and after; NaN, which compares with nothing, for one that is not known."""
+    values = (session.get(key, {}).get(state) for state in ("input", "refined"))
+    before, after = (math.nan if value is None else value for value in values)
+    return before, after
 
 
 def turned_away(rejected: Mapping[str, int]) -> list[str]:

@@ -37,6 +37,7 @@ from ba_node.scene.constraints import Constraints, joined_step
 from ba_node.scene.map_tables import MapTables
 from ba_node.scene.records import Block
 from ba_node.scene.rejections import WARNINGS, Refusal, RejectionLog
+from ba_node.scene.still_images import StillImages
 
 # What takes in each kind of what is known beside pixels.
 _CONSTRAINTS: dict[type, Callable[[Constraints, Any, RejectionLog], None]] = {
@@ -69,6 +70,7 @@ class Scene(MapTables):
         self.constraints = Constraints()  # what is known beside pixels
         self.culled_ns = np.iinfo(np.int64).min  # stamp of the last keyframe that was looked at, see window/culling.py
         self._reused: set[int] = set()
+        self._still = StillImages()
 
     def clone(self) -> Scene:
         """Return a scene of its own with the same content but for what waits and what was turned away."""
@@ -266,6 +268,11 @@ class Scene(MapTables):
         if tracks.keyframe_id in self._reused and tracks.camera_index in self.cameras_of(row):
             what = f"tracks of camera {tracks.camera_index} in keyframe {tracks.keyframe_id}, an id that came twice"
             self.log.reject("duplicate_observation", what, len(tracks.track_id))
+            return
+        still = self._still.why(tracks, self.keyframes.input_rotation[row], self.keyframes.input_position[row])
+        if still:
+            self.log.reject("still_image", still, len(tracks.track_id))
+            self.log.warn("still_image", f"{still}; such images are turned away")
             return
         tracks = self._renamed(tracks)
         landmarks = self._rows_of(tracks.track_id)

@@ -90,17 +90,19 @@ def summary(scene: Scene, config: Config, state: str) -> dict[str, float | int |
 
     Returns:
         ``rms_px`` of all observations, ``rms_px_without_outliers`` of those that solves use now, ``median_px`` of the
-        lengths of all residuals, ``bounded_px`` the rms of all with none above 20 px, ``observations_behind``, which
-        count in none of these. None where no point is placed.
+        lengths of all residuals, ``median_sigmas`` the same by their ``sigma_px``, ``bounded_px`` the rms of all with
+        none above 20 px, ``observations_behind``, which count in none of these. None where no point is placed.
     """
-    error = _all_errors(scene, config, state, outliers=True)
+    problem, _, error = _evaluated(scene, config, state, outliers=True)
     behind = int(np.count_nonzero(np.isnan(error[:, 0])))
+    sigmas = np.hypot(*error.T) / (1.0 if problem is None else problem.observations.sigma_px)
     error, inliers = _in_front(error), errors_px(scene, config, state, outliers=False)
     length = np.hypot(error[:, 0], error[:, 1])
     return {
         "rms_px": _rms(error) if len(error) else None,
         "rms_px_without_outliers": _rms(inliers) if len(inliers) else None,
         "median_px": float(np.median(length)) if len(error) else None,
+        "median_sigmas": float(np.nanmedian(sigmas)) if len(error) else None,
         "bounded_px": float(np.sqrt(np.mean(np.minimum(length, _COMPARED_PX) ** 2) / 2.0)) if len(error) else None,
         "observations_behind": behind,
     }

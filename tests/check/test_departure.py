@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose steps are all off the front-end's, by one factor or to one side, is given up, and causes are named."""
+"""A map whose steps are all off the front-end's, by one factor or to one side, is given up; causes are named."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,17 @@ def test_every_keyframe_is_refined(source: str, tmp_path: Path, capsys: pytest.C
     report = json.loads((tmp_path / "replay" / "report.json").read_text())
     assert report["keyframes_refined"] == report["keyframes"] == EVERY[source]
     assert report["rms_px"]["refined"] < 0.32, report["rms_px"]
+
+
+def test_too_few_keyframes_for_a_check_are_said_to_be_explained_badly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = layouts.scene(12, "plumb_bob")
+    rig = dataclasses.replace(data.rig, orientation=np.tile([0.0, 0.0, 0.0, 1.0], (len(data.rig), 1)))
+    bag, out = layouts.write(tmp_path / "bag", layouts.vins_mono(dataclasses.replace(data, rig=rig))), tmp_path / "out"
+    assert main(["convert", str(bag), f"{out}.mcap", "--from", "vins_mono"]) == 0
+    assert main(["replay", f"{out}.mcap", "--out", str(out), "--no-report"]) == 3
+    assert "explains little of what was observed" in capsys.readouterr().err
 
 
 def real_drive(path: Path) -> SyntheticData:

@@ -70,3 +70,20 @@ def test_a_result_that_is_worse_than_its_input_is_said() -> None:
     ]
     nothing = {"rms_px": {"input": None, "refined": None}, "median_px": {"input": 0.5, "refined": None}}
     assert attention(_report(**nothing)) == []
+
+
+def test_one_outlier_that_is_farther_off_is_no_worse_result() -> None:
+    """As where a mismatch of 60 px is one of 250 px once its point is well placed."""
+    rms = {"rms_px": {"input": 3.1, "refined": 5.1}, "median_px": {"input": 1.2, "refined": 0.6}}
+    assert attention(_report(**rms, bounded_px={"input": 2.0, "refined": 1.5})) == []
+    worse = "the result explains the observations worse than what came in: rms of all 3.1 -> 5.1 px"
+    assert attention(_report(**rms, bounded_px={"input": 1.5, "refined": 1.52})) == [worse]
+    assert attention(_report(**rms, bounded_px={"input": None, "refined": None})) == [worse]
+
+
+def test_a_result_that_explains_little_is_said() -> None:
+    """As of five keyframes with wrong extrinsics, which are too few for a check to tell these."""
+    of = {"keyframes_refined": 5, "median_px": {"input": 14.2, "refined": 3.4}}
+    (line,) = attention(_report(median_sigmas={"input": 47.0, "refined": 11.4}, **of))
+    assert "half of it is over 11 sigmas (3.4 px) off" in line and "body_from_camera" in line
+    assert attention(_report(median_sigmas={"input": 47.0, "refined": 1.3}, **of)) == []
