@@ -32,8 +32,12 @@ _FACTORS = ((1.015, 4.5), (1.012, 8.0))
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
 # Student's distribution asks for.
 _FEW = 8.0
-# Steps that are needed, and keyframes up to which a map is young.
-_STEPS, _YOUNG = 7, 120
+# Where images have no scale, noise turns all steps of a straight way to one side together: directions differ by so many
+# times as much.
+_ONE_CAMERA = 2.0
+# Steps that are needed, at the end and before it, where the tests of the set-up may yet name a cause more closely; and
+# keyframes up to which a map is young.
+_STEPS, _STEPS_BEFORE, _YOUNG = 7, 15, 120
 # It is asked once in so many keyframes, and at the end.
 _EVERY = 5
 # Shorter steps are noise, as those of a robot that stands or turns on the spot, m.
@@ -45,18 +49,20 @@ _TELLING, _TRIMMED = 0.3, 0.1
 def departed(scene: Scene, *, final: bool = False) -> Check | None:
     """Return what is wrong if the refined steps of a young map are off the front-end's by one factor or to one side.
 
-    ``final``: no more keyframes will come, so that it is asked at any number of them.
+    ``final``: no more keyframes will come, so that it is asked at any number of them, and of directions too: another
+    test of the set-up would have told by now that two cameras do not fit each other.
     """
-    count = len(scene.keyframes)
-    if (count % _EVERY and not final) or not _STEPS < count <= _YOUNG or scene.cameras is None:
+    count, least = len(scene.keyframes), _STEPS if final else _STEPS_BEFORE
+    if (count % _EVERY and not final) or not least < count <= _YOUNG or scene.cameras is None:
         return None
     if scene.constraints.absolute or scene.constraints.landmarks:
         return None
     refined, given = _steps(scene)
-    if len(refined) < _STEPS:
+    if len(refined) < least:
         return None
     finding = _by_a_factor(scene, refined, given) if _has_scale(scene) else None
-    finding = finding or _aside(scene, refined, given)
+    if final:
+        finding = finding or _aside(scene, refined, given)
     if finding is None:
         return None
     found = Diagnosis([finding])
@@ -88,7 +94,8 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | No
     lengths = np.linalg.norm(refined, axis=1) * np.linalg.norm(given, axis=1)
     turns = np.cross(given, refined) / lengths[:, None]
     found = [_trimmed_mean(of_axis) for of_axis in turns.T]
-    if not any(_differs(mean, error, len(given)) for mean, error in found):
+    times = 1.0 if _has_scale(scene) else _ONE_CAMERA
+    if not any(_differs(mean / times, error, len(given)) for mean, error in found):
         return None
     assert scene.cameras is not None
     turn = np.array([mean for mean, _ in found])
