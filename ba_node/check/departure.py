@@ -34,7 +34,7 @@ _FACTORS = ((1.015, 4.5), (1.012, 8.0))
 _FEW = 8.0
 # Where images have no scale, noise turns all steps of a straight way to one side together: directions differ by so many
 # times as much.
-_ONE_CAMERA = 2.0
+_ONE_CAMERA = 1.5
 # Steps that are needed, at the end and before it, where the tests of the set-up may yet name a cause more closely; and
 # keyframes up to which a map is young.
 _STEPS, _STEPS_BEFORE, _YOUNG = 7, 15, 120
@@ -95,7 +95,7 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | No
     turns = np.cross(given, refined) / lengths[:, None]
     found = [_trimmed_mean(of_axis) for of_axis in turns.T]
     times = 1.0 if _has_scale(scene) else _ONE_CAMERA
-    if not any(_differs(mean / times, error, len(given)) for mean, error in found):
+    if not any(_differs(mean, error, len(given), times) for mean, error in found):
         return None
     assert scene.cameras is not None
     turn = np.array([mean for mean, _ in found])
@@ -112,9 +112,9 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | No
     return Finding((region, place), evidence, changes)
 
 
-def _differs(mean: float, error: float, count: int) -> bool:
+def _differs(mean: float, error: float, count: int, times: float = 1.0) -> bool:
     more = 1.0 + (_FEW / count) ** 1.5
-    return any(abs(mean) >= max(np.log(factor), more * errors * error) for factor, errors in _FACTORS)
+    return any(abs(mean) >= max(times * np.log(factor), more * errors * error) for factor, errors in _FACTORS)
 
 
 def _has_scale(scene: Scene) -> bool:

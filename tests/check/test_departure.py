@@ -95,7 +95,9 @@ def test_noise_is_no_side(mode: str) -> None:
     data = recording(mode=mode, path="line")
     for seed in range(40):
         for aside_deg in ((0.0, 0.5, 0.0), (0.0, 0.0, -0.5), (3.0, 0.0, 0.0)):
-            assert departed(refined(data, 1.0, seed=seed, aside_deg=aside_deg), final=True) is None, f"seed {seed}, {aside_deg}"
+            assert departed(refined(data, 1.0, seed=seed, aside_deg=aside_deg), final=True) is None, (
+                f"seed {seed}, {aside_deg}"
+            )
 
 
 def test_where_it_cannot_be_asked() -> None:
