@@ -27,7 +27,7 @@ from ba_node.measurements import CameraRig, Keyframe
 from ba_node.messages import conversion
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import OUTPUT_TYPES
-from ba_node.ros.message_factory import RclpyFactory, message_class
+from ba_node.ros.message_factory import RclpyFactory
 from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.ros.harness import NodeProcess, Peer, solve_until_stopped
 
@@ -314,11 +314,16 @@ def test_starts_with_a_file_and_a_namespace(
     _play(peer, scene)
     assert _in_solve(peer) == 4
     stranger.until(lambda: ("ba_node", "/car") in stranger.node.get_node_names_and_namespaces(), "the node's name")
-    types = dict(stranger.node.get_publisher_names_and_types_by_node("ba_node", "/car"))
-    types |= dict(stranger.node.get_subscriber_names_and_types_by_node("ba_node", "/car"))
-    for topic, kind in OUTPUT_TYPES.items():
-        assert types[f"/car/ba_node/{topic}"] == [kind], message_class(kind)
-    assert "/car/keyframes" in types
+    expected = {f"/car/ba_node/{topic}": [kind] for topic, kind in OUTPUT_TYPES.items()}
+    types: dict[str, list[str]] = {}
+
+    def all_known() -> bool:
+        types.update(stranger.node.get_publisher_names_and_types_by_node("ba_node", "/car"))
+        types.update(stranger.node.get_subscriber_names_and_types_by_node("ba_node", "/car"))
+        return types.keys() >= {*expected, "/car/keyframes"}
+
+    stranger.until(all_known, "every topic")
+    assert {name: types[name] for name in expected} == expected
     assert not [topic for topic in types if topic.startswith(("/ba_node", "/keyframes"))]
     assert node.stop(signal.SIGTERM) == 0
 

@@ -54,10 +54,15 @@ def test_the_policy_allows_what_the_node_has_and_no_more(
     for of, may in allowed.items():
         peer.until(lambda of=of, may=may: names(of) >= may - OPTIONAL, f"every {of}")
         assert names(of) <= may, f"{of}: not in its policy: {sorted(names(of) - may)}"
+
     # Those of nodes in other namespaces that still end are not its own.
-    services = look.get_service_names_and_types_by_node("ba_node", "/")
-    served = {name.split("/_action/")[0] for name, _ in services if "/_action/" in name}
-    assert served == _allowed("actions", "execute")
+    def served() -> set[str]:
+        services = look.get_service_names_and_types_by_node("ba_node", "/")
+        return {name.split("/_action/")[0] for name, _ in services if "/_action/" in name}
+
+    actions = _allowed("actions", "execute")
+    peer.until(lambda: served() >= actions, "every action")
+    assert served() == actions
 
 
 @pytest.mark.parametrize(
@@ -104,7 +109,8 @@ def test_the_policies_of_front_ends_allow_what_they_have(
     }
     for of, may in expected.items():
         peer.until(lambda of=of, may=may: names(of) == may, f"every {of}")
+    # A node tells its graph of its endpoints after these have found each other.
+    peer.until(lambda: names("subscriber") >= {f"/{topic}" for topic in topics}, "every subscriber")
     taken = names("subscriber")
-    assert taken >= {f"/{topic}" for topic in topics}
     assert taken <= _allowed("topics", "subscribe", node), taken - _allowed("topics", "subscribe", node)
     assert running.stop() == 0
