@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from ba_node.cli.main import main
 from ba_node.io.trajectory import read_tum
 from tests.ply import read_ply
 
@@ -21,22 +20,17 @@ demo = pytest.importorskip("experiments.demo.demo", reason="needs ROS 2")
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def run_demo(out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "ba_node.cli.main", "demo", "--out", str(out), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=150, check=False, cwd=ROOT)
-
-
 @pytest.mark.dds
 @pytest.mark.slow
-def test_demo_improves_the_trajectory(tmp_path: Path) -> None:
-    run = run_demo(tmp_path)
-    assert run.returncode == 0, run.stdout + run.stderr
+def test_demo_improves_the_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = main(["demo", "--out", str(tmp_path)]), capsys.readouterr()
+    assert code == 0, output.out + output.err
     error = {
-        name: float(re.search(rf"translation {name} \[m\]\s+(\S+)", run.stdout)[1])  # type: ignore[index]
+        name: float(re.search(rf"translation {name} \[m\]\s+(\S+)", output.out)[1])  # type: ignore[index]
         for name in ("before", "after")
     }
-    assert error["after"] < 0.25 * error["before"], run.stdout
-    assert "60 of 60 came back refined" in run.stdout
+    assert error["after"] < 0.25 * error["before"], output.out
+    assert "60 of 60 came back refined" in output.out
     assert len(read_tum(tmp_path / "trajectory.tum")) == 60
     assert len(read_tum(tmp_path / "ground_truth.tum")) == 60
     points, frame = read_ply(tmp_path / "points.ply")
@@ -45,11 +39,14 @@ def test_demo_improves_the_trajectory(tmp_path: Path) -> None:
     assert "stopped: 60 keyframes refined" in (tmp_path / "node.log").read_text(), "the node ends by SIGINT"
 
 
-def test_recording_without_truth_is_refused(tmp_path: Path, shared_data: Path) -> None:
-    run = run_demo(tmp_path, "--bag", str(shared_data / "kitti-stereo-vo" / "kitti_stereo.mcap"))
-    assert run.returncode == 2
-    assert "no keyframes with ground_truth/pose" in run.stderr
-    assert run.stderr.count("\n") == 1
+def test_recording_without_truth_is_refused(
+    tmp_path: Path, shared_data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = shared_data / "kitti-stereo-vo" / "kitti_stereo.mcap"
+    assert main(["demo", "--out", str(tmp_path), "--bag", str(bag)]) == 2
+    error = capsys.readouterr().err
+    assert "no keyframes with ground_truth/pose" in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.dds
