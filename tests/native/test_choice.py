@@ -290,10 +290,13 @@ def test_steps_are_compared_as_numpy_does(off: float, both: Both) -> None:
     first, second = np.arange(0, 28, 2), np.arange(1, 29, 2)
 
     def compared() -> list[Any]:
+        beside = steps.against(found, measured, first, second, Config().guard)
         ours, theirs = (steps.between(*poses, first, second) for poses in (found, measured))
-        comparison = steps.compare(ours, theirs, Config().guard)
-        errors = [error(ours, theirs, comparison) for error in (steps.scale_error, steps.turn_error)]
-        return [*vars(ours).values(), *vars(comparison).values(), *errors]
+        apart = steps.compare(ours, theirs, Config().guard)
+        for one, other in ((beside.solved, ours), (beside.measured, theirs), (beside.off, apart)):
+            for name, values in vars(one).items():
+                np.testing.assert_array_equal(values, getattr(other, name), err_msg=name)
+        return [*vars(ours).values(), *vars(apart).values(), beside.scale, beside.turn]
 
     compiled, plain = both(compared)
     assert (compiled[-2:] == [1.0, 1.0]) == (off < 0.3)
@@ -306,8 +309,7 @@ def test_fewer_steps_than_show_a_factor_show_none(both: Both) -> None:
     few = np.arange(4)
 
     def error() -> float:
-        ours, theirs = (steps.between(*poses, few, few + 1) for poses in (found, measured))
-        return steps.scale_error(ours, theirs, steps.compare(ours, theirs, Config().guard))
+        return steps.against(found, measured, few, few + 1, Config().guard).scale
 
     assert both(error) == (1.0, 1.0)
 
@@ -318,7 +320,7 @@ def test_steps_are_off_by_as_much_as_numpy_finds(n: int, both: Both) -> None:
     rows, sigmas = np.arange(n), (np.full(n, 0.01), np.linspace(0.1, 0.2, n))
 
     def medians() -> Any:
-        ours, theirs = (odometry._relative(*poses, rows, rows + 1) for poses in (found, measured))
+        ours, theirs = (geometry.steps_between(*poses, rows, rows + 1) for poses in (found, measured))
         return odometry._medians_off(ours, theirs, sigmas)
 
     compiled, plain = both(medians)

@@ -4,6 +4,7 @@
 
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <array>
 #include <tuple>
 #include <utility>
@@ -56,13 +57,30 @@ CommonLimits limits_of(const Limits& limits) {
   return {telling, spread, median, few};
 }
 
-double scale_error_of(const Steps& steps, const Steps& measured, const Doubles& sigma_m, const Limits& limits) {
-  return scale_error(view_of(steps), view_of(measured), sigma_m.data(), limits_of(limits));
+// poses: of a solution and of the front-end, body from world, each rotation and translation. pairs: first and second.
+py::tuple steps_against(const std::array<Doubles, 4>& poses, const std::pair<Ints, Ints>& pairs,
+                        const std::array<double, 5>& worth, const Limits& limits) {
+  const Steps steps = inverse_steps_between(poses[0], poses[1], pairs.first, pairs.second);
+  const Steps measured = inverse_steps_between(poses[2], poses[3], pairs.first, pairs.second);
+  const py::tuple comparison = compared(steps, measured, worth);
+  const auto column = [&comparison](int i) { return comparison[i].cast<Doubles>(); };
+  const Doubles turned = column(3), sigma_m = column(4), sigma_rad = column(5);
+  const CommonLimits at = limits_of(limits);
+  const double scale = scale_error(view_of(steps), view_of(measured), sigma_m.data(), at);
+  const double turn = turn_error(view_of(steps), view_of(measured), turned.data(), sigma_rad.data(), at);
+  return py::make_tuple(steps, measured, comparison, scale, turn);
 }
 
-double turn_error_of(const Steps& steps, const Steps& measured, const Doubles& turned, const Doubles& sigma_rad,
-                     const Limits& limits) {
-  return turn_error(view_of(steps), view_of(measured), turned.data(), sigma_rad.data(), limits_of(limits));
+// Of each camera, how many of its observations have a residual up to a gate, and how many there are.
+py::tuple agreeing_by_camera(const Ints& camera, const Doubles& norms, double gate, py::ssize_t n_cameras) {
+  Ints agreeing({n_cameras}), every({n_cameras});
+  std::fill_n(agreeing.mutable_data(), n_cameras, 0);
+  std::fill_n(every.mutable_data(), n_cameras, 0);
+  for (py::ssize_t o = 0; o < norms.size(); ++o) {
+    ++every.mutable_data()[camera.data()[o]];
+    agreeing.mutable_data()[camera.data()[o]] += norms.data()[o] <= gate;
+  }
+  return py::make_tuple(agreeing, every);
 }
 
 std::pair<double, double> medians_off_of(const Steps& steps, const Steps& others, const Doubles& sigma_rad,
@@ -76,8 +94,8 @@ void bind_steps(py::module_& m) {
   m.def("steps_between", &steps_between);
   m.def("inverse_steps_between", &inverse_steps_between);
   m.def("compare_steps", &compared);
-  m.def("scale_error", &scale_error_of);
-  m.def("turn_error", &turn_error_of);
+  m.def("steps_against", &steps_against);
+  m.def("agreeing_by_camera", &agreeing_by_camera);
   m.def("medians_off", &medians_off_of);
 }
 
