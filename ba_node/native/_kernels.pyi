@@ -307,6 +307,11 @@ def steps_against(
     limits are constants of window.steps.
     """
 
+def shared_pixels(
+    ids: tuple[NDArray[np.uint64], NDArray[np.uint64]], uv: tuple[Doubles, Doubles]
+) -> tuple[int, int] | None:
+    """Return what scene.still_images._shared does; None unless the ids of both images rise."""
+
 def agreeing_by_camera(camera: Ints, norms: Doubles, gate: float, n_cameras: int) -> tuple[Ints, Ints]:
     """Return how many observations of each camera have residuals up to a gate, and how many it has."""
 

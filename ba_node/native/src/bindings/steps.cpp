@@ -6,6 +6,8 @@
 
 #include <algorithm>
 #include <array>
+#include <cstdint>
+#include <functional>
 #include <tuple>
 #include <utility>
 
@@ -88,6 +90,28 @@ std::pair<double, double> medians_off_of(const Steps& steps, const Steps& others
   return medians_off(view_of(steps), view_of(others), sigma_rad.data(), sigma_m.data());
 }
 
+// Of two images, how many ids they share, and how many of these have the same pixel; None unless the ids of both rise.
+py::object shared_pixels(const std::pair<Array<std::uint64_t>, Array<std::uint64_t>>& ids,
+                         const std::pair<Doubles, Doubles>& uv) {
+  const auto rise = [](const Array<std::uint64_t>& of) {
+    return std::adjacent_find(of.data(), of.data() + of.size(), std::greater_equal<>()) == of.data() + of.size();
+  };
+  if (!rise(ids.first) || !rise(ids.second)) return py::none();
+  const std::uint64_t *a = ids.first.data(), *b = ids.second.data();
+  const double *p = uv.first.data(), *q = uv.second.data();
+  std::int64_t shared = 0, same = 0;
+  for (py::ssize_t i = 0, j = 0; i < ids.first.size() && j < ids.second.size();) {
+    if (a[i] == b[j]) {
+      ++shared;
+      same += p[2 * i] == q[2 * j] && p[2 * i + 1] == q[2 * j + 1];
+    }
+    const bool first = a[i] <= b[j], second = b[j] <= a[i];
+    i += first;
+    j += second;
+  }
+  return py::make_tuple(shared, same);
+}
+
 }  // namespace
 
 void bind_steps(py::module_& m) {
@@ -96,6 +120,7 @@ void bind_steps(py::module_& m) {
   m.def("compare_steps", &compared);
   m.def("steps_against", &steps_against);
   m.def("agreeing_by_camera", &agreeing_by_camera);
+  m.def("shared_pixels", &shared_pixels);
   m.def("medians_off", &medians_off_of);
 }
 
