@@ -81,10 +81,8 @@ class Backend:
     @property
     def report(self) -> SolveReport:
         """Return the report of the last solve, with what has been turned away since."""
-        counts = dict(sorted(self.map.rejected.items()))
-        return dataclasses.replace(
-            self.map.report, session_id=self.map.session_id, rejected=counts, warnings=self.map.warnings
-        )
+        known, counts = self.map, dict(sorted(self.map.rejected.items()))
+        return dataclasses.replace(known.report, session_id=known.session_id, rejected=counts, warnings=known.warnings)
 
     @property
     def rejection_notes(self) -> deque[str]:
@@ -181,15 +179,17 @@ class Backend:
         wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
         self.solve_count += 1
 
+        asked: list[Check | None] = []
+
         def taken(refinement: Refinement) -> None:
-            if departed(self.scene) is None:  # else it is taken back at once
+            asked.append(departed(self.scene))
+            if asked == [None]:  # else it is taken back at once
                 on_poses(refinement)
 
-        following = Following(self._clock, on_iteration, taken)
-        estimate = self.map.solve(self.solve_count, wrong, self.extras, following)
+        estimate = self.map.solve(self.solve_count, wrong, self.extras, Following(self._clock, on_iteration, taken))
         if (study := self.map.begun_study()) is not None:
             self._work(study)
-        return estimate if wrong else self.take_check(departed(self.scene)) or self.adjust() or estimate
+        return estimate if wrong else self.take_check(*(asked or [departed(self.scene)])) or self.adjust() or estimate
 
     def adjust(self, *, final: bool = False) -> Estimate | None:
         """Bend the map and refine all of it, if a loop or what is absolute asks for it, see ``window/adjustment.py``.

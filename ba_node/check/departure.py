@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ba_node.arrays import FloatArray, IntArray
+from ba_node.arrays import FloatArray
 from ba_node.check.diagnosis import Diagnosis, Finding, angle
 from ba_node.check.watch import Check
+from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
 from ba_node.scene.scene import Scene
 
@@ -130,20 +131,14 @@ def _steps(scene: Scene) -> tuple[FloatArray, FloatArray]:
     table, order = scene.keyframes, scene.order
     both = table.refined[order[1:]] & table.refined[order[:-1]]
     first, second = order[:-1][both], order[1:][both]
-    refined = _moves(table.rotation, table.position, first, second)
-    given = _moves(table.input_rotation, table.input_position, first, second)
+    _, refined = geometry.steps_between(table.rotation, table.position, first, second)
+    _, given = geometry.steps_between(table.input_rotation, table.input_position, first, second)
     along = refined + given
     length = np.sqrt(np.sum(along**2, axis=1))
     least = max(_LEAST_M, 0.5 * _TELLING * float(np.median(length))) if len(length) else 0.0
     telling = np.sum(refined * along, axis=1) > 0.0
     telling &= (np.sum(given * along, axis=1) > 0.0) & (0.5 * length > least)
     return refined[telling], given[telling]
-
-
-def _moves(rotation: FloatArray, position: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
-    """Return the moves between keyframes in the body of the first, (n, 3) m."""
-    back = np.swapaxes(rotation[first], 1, 2)
-    return np.asarray((back @ (position[second] - position[first])[:, :, None])[..., 0])
 
 
 def _trimmed_mean(values: FloatArray) -> tuple[float, float]:

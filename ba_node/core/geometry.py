@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ba_node import native
-from ba_node.arrays import FloatArray
+from ba_node.arrays import FloatArray, IntArray
 
 # Below this angle (rad) the closed forms lose digits to cancellation and their series are used.
 _SMALL = 1e-4
@@ -170,3 +170,18 @@ def compose(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the transform that applies ``b`` first, then ``a``."""
     return rotation_a @ rotation_b, (rotation_a @ translation_b[..., None])[..., 0] + translation_a
+
+
+def steps_between(
+    rotation: FloatArray, position: FloatArray, first: IntArray, second: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the steps between poses (n, 3, 3), (n, 3) that are world from body: the second as the first sees it.
+
+    ``first`` and ``second`` (m,) are numbers of poses; returned are turns (m, 3, 3) and moves (m, 3).
+    """
+    if native.kernels is not None:
+        found: tuple[FloatArray, FloatArray] = native.kernels.steps_between(rotation, position, first, second)
+        return found
+    back = np.swapaxes(rotation[first], 1, 2)
+    moved = (position[second] - position[first])[:, :, None]
+    return back @ rotation[second], (back @ moved)[..., 0]

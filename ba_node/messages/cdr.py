@@ -42,9 +42,7 @@ class Cdr:
 
     def pack(self, layout: str, *values: float) -> None:
         """Append numbers, given by the letters of ``struct``, each aligned to its size; ``3d`` is three of them."""
-        for kind, value in zip(_kinds(layout), values, strict=True):
-            self._align(kind.size)
-            self._append(kind.pack(value))
+        self._append(_numbers(layout, self._size % 8).pack(*values))
 
     def text(self, text: str) -> None:
         """Append a string."""
@@ -84,10 +82,15 @@ class Cdr:
 
 
 @functools.cache
-def _kinds(layout: str) -> tuple[struct.Struct, ...]:
-    """Return the numbers of a layout one by one."""
-    letters = re.sub(r"(\d+)(.)", lambda found: found[2] * int(found[1]), layout)
-    return tuple(struct.Struct(f"<{letter}") for letter in letters)
+def _numbers(layout: str, begin: int) -> struct.Struct:
+    """Return the numbers of a layout, with the gaps between them if it begins at a place modulo 8."""
+    out, size = "<", begin
+    for letter in re.sub(r"(\d+)(.)", lambda found: found[2] * int(found[1]), layout):
+        width = struct.calcsize(f"<{letter}")
+        gap = -size % width
+        out += "x" * gap + letter
+        size += gap + width
+    return struct.Struct(out)
 
 
 def refined_message(poses: Poses, stamp_ns: int, frame_id: str, session_id: int) -> bytes:

@@ -107,7 +107,8 @@ def _keyframe(msg: Any) -> Keyframe:
 
 def _tracks(msg: Any) -> FeatureTracks:
     read = _of_tracks(msg, ("sigma_px", "depth_m"), u=(), v=(), sigma_px=(), depth_m=())
-    uv = np.stack([read.pop("u"), read.pop("v")], axis=1)
+    uv = np.empty((len(read["u"]), 2))
+    uv[:, 0], uv[:, 1] = read.pop("u"), read.pop("v")
     return FeatureTracks(**_integers(msg, "keyframe_id", "camera_index"), uv=uv, **read)
 
 

@@ -296,22 +296,24 @@ def compare_steps(
     worth: the guard's sigma of a move and its share, the same of turns, and that of turns for each metre.
     """
 
-def scale_error(
-    steps: tuple[Doubles, Doubles],
-    measured: tuple[Doubles, Doubles],
-    sigma_m: Doubles,
+def steps_against(
+    poses: tuple[Doubles, Doubles, Doubles, Doubles],
+    pairs: tuple[Ints, Ints],
+    worth: tuple[float, float, float, float, float],
     limits: tuple[float, float, float, int],
-) -> float:
-    """Return what window.steps.scale_error does; limits are constants there."""
+) -> tuple[tuple[Doubles, Doubles], tuple[Doubles, Doubles], tuple[Doubles, ...], float, float]:
+    """Return what window.steps.against does: two sets of poses that are body from world; worth as of compare_steps.
 
-def turn_error(
-    steps: tuple[Doubles, Doubles],
-    measured: tuple[Doubles, Doubles],
-    turned: Doubles,
-    sigma_rad: Doubles,
-    limits: tuple[float, float, float, int],
-) -> float:
-    """Return what window.steps.turn_error does."""
+    limits are constants of window.steps.
+    """
+
+def shared_pixels(
+    ids: tuple[NDArray[np.uint64], NDArray[np.uint64]], uv: tuple[Doubles, Doubles]
+) -> tuple[int, int] | None:
+    """Return what scene.still_images._shared does; None unless the ids of both images rise."""
+
+def agreeing_by_camera(camera: Ints, norms: Doubles, gate: float, n_cameras: int) -> tuple[Ints, Ints]:
+    """Return how many observations of each camera have residuals up to a gate, and how many it has."""
 
 def medians_off(
     steps: tuple[Doubles, Doubles], others: tuple[Doubles, Doubles], sigma_rad: Doubles, sigma_m: Doubles

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.measurements import FeatureTracks
@@ -60,7 +61,17 @@ class StillImages:
 
 
 def _is_same(tracks: FeatureTracks, before: FeatureTracks) -> bool:
+    shared, same = _shared(tracks, before)
+    return shared >= _LEAST and same >= _SAME * shared
+
+
+def _shared(tracks: FeatureTracks, before: FeatureTracks) -> tuple[int, int]:
+    """Return how many tracks two images share, and how many of these are where they were."""
+    if native.kernels is not None:
+        found: tuple[int, int] | None = native.kernels.shared_pixels(
+            (tracks.track_id, before.track_id), (tracks.uv, before.uv)
+        )
+        if found is not None:  # ids rise, as those of most front-ends do
+            return found
     _, now, then = np.intersect1d(tracks.track_id, before.track_id, assume_unique=True, return_indices=True)
-    if len(now) < _LEAST:
-        return False
-    return bool(np.count_nonzero((tracks.uv[now] == before.uv[then]).all(axis=1)) >= _SAME * len(now))
+    return len(now), int(np.count_nonzero((tracks.uv[now] == before.uv[then]).all(axis=1)))

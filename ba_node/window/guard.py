@@ -21,9 +21,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core.problem import Problem, State
@@ -71,13 +73,11 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     config = trust.bounds(config)
     if selection.much_moves:
         config = _narrowed(config)
-    gate = config.tracks.outlier_px or np.inf
-    agrees = found.norms <= gate
-    share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
+    agreeing = _agreeing(selection, found.norms, config)
     sigma = median(selection.observations.sigma_px[:: 1 + len(found.norms) // _LOOKED_AT])
     held_out = found.explained.held_out * sigma
     health = {
-        "inlier_share": share,
+        "inlier_share": agreeing.share,
         "parallax_deg": float(np.degrees(found.explained.parallax_rad)),
         "held_out_px_before": float(held_out[0]),
         "held_out_px_after": float(held_out[1]),
@@ -88,7 +88,7 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     if reason:
         return Verdict(reason, health, systematic=True, waits=True)
     compared = _Compared.of(config, selection, found.state, found.norms)
-    reason = _misfit(selection, found.state, agrees, config) or compared.systematic()
+    reason = _misfit(selection, found.state, agreeing, config) or compared.systematic()
     reason = reason or _unexplained(found.explained, config)
     if reason:
         return Verdict(reason, health, systematic=True)
@@ -103,21 +103,41 @@ def _narrowed(config: Config) -> Config:
     )
 
 
-def _misfit(selection: Selection, state: State, agrees: BoolArray, config: Config) -> str:
+class _Agreeing(NamedTuple):
+    """Observations that agree with a solution."""
+
+    agree: list[int]  # by camera
+    of: list[int]  # so many by each camera
+
+    @property
+    def share(self) -> float:
+        """Return the share of all."""
+        return sum(self.agree) / max(sum(self.of), 1)
+
+
+def _agreeing(selection: Selection, norms: FloatArray, config: Config) -> _Agreeing:
+    camera, n = selection.observations.camera, len(selection.problem.cameras.model)
+    gate = config.tracks.outlier_px or np.inf
+    if native.kernels is not None:
+        found = native.kernels.agreeing_by_camera(camera, norms, gate, n)
+    else:
+        found = np.bincount(camera[norms <= gate], minlength=n), np.bincount(camera, minlength=n)
+    return _Agreeing(*(counts.tolist() for counts in found))
+
+
+def _misfit(selection: Selection, state: State, agreeing: _Agreeing, config: Config) -> str:
     """Return in words whether fewer observations agree with a solution, or fewer measured depths, than have to."""
     least, gate = config.guard.min_inlier_share, config.tracks.outlier_px or np.inf
-    share = float(np.count_nonzero(agrees)) / max(len(agrees), 1)
+    share = agreeing.share
     if share < least:
         return (
             f"only {100 * share:.0f} % of the observations agree with it within {gate:g} sigmas: cameras, their places"
             " on the body, or track ids are not what they are said to be"
         )
-    n_cam = len(selection.problem.cameras.model)
+    n_cam, count = len(agreeing.of), sum(agreeing.of)
     for camera in range(n_cam if 1 < n_cam <= _FEW_CAMERAS else 0):
-        own = selection.observations.camera == camera
-        count = int(np.count_nonzero(own))
-        share = float(np.count_nonzero(agrees & own)) / max(count, 1)
-        if share < least and count > len(agrees) // (2 * n_cam):
+        share = agreeing.agree[camera] / max(agreeing.of[camera], 1)
+        if share < least and agreeing.of[camera] > count // (2 * n_cam):
             return (
                 f"only {100 * share:.0f} % of the observations of camera {camera} agree with it within {gate:g} sigmas:"
                 " it does not sit on the body as the rig says, or its calibration is wrong"
@@ -147,7 +167,8 @@ def _depth_errors(problem: Problem, state: State) -> FloatArray:
 
 def _without_parallax(problem: Problem, found: Explained, sigma_px: float, config: Config) -> str:
     """Return in words whether rays tell no distances; empty where they do, or depths are measured."""
-    noise = sigma_px / float(np.mean(problem.cameras.params[0, :2]))
+    fx, fy = problem.cameras.params[0, :2].tolist()
+    noise = sigma_px / (0.5 * (fx + fy))
     if not config.guard.held_out_tracks or len(problem.observations.depth_m):
         return ""
     if found.parallax_rad >= MIN_PARALLAX * noise:
@@ -182,41 +203,41 @@ class _Compared:
     config: Config
     first: IntArray
     second: IntArray
-    solved: steps.Steps
-    measured: steps.Steps
-    off: steps.Comparison
+    found: steps.Against
+
+    @property
+    def off(self) -> steps.Comparison:
+        """Return how far its steps are off the front-end's."""
+        return self.found.off
 
     @classmethod
     def of(cls, config: Config, selection: Selection, state: State, norms: FloatArray) -> _Compared:
         fixed = selection.problem.fixed
         # Keyframes of the problem are oldest first; those between which others are left out make one step too.
-        adjacent = np.diff(selection.place) <= 1 + len(selection.window)
-        first = np.flatnonzero(adjacent & ~(fixed[1:] & fixed[:-1]))
+        adjacent = selection.place[1:] - selection.place[:-1] <= 1 + len(selection.window)
+        first = (adjacent & ~(fixed[1:] & fixed[:-1])).nonzero()[0]
         second = first + 1
-        solved = steps.between(state.rotation, state.translation, first, second)
-        front_end = steps.between(*selection.measured, first, second)
-        off = steps.compare(solved, front_end, config.guard)
-        return cls(selection, norms, config, first, second, solved, front_end, off)
+        poses = (state.rotation, state.translation), selection.measured
+        return cls(selection, norms, config, first, second, steps.against(*poses, first, second, config.guard))
 
     def systematic(self) -> str:
         """Return what is wrong with the steps as a whole, in words."""
         if len(self.first) < _MIN_STEPS:
             return ""
         guard, limit = self.config.guard, np.log1p(self.config.guard.max_scale_error)
-        scale = steps.scale_error(self.solved, self.measured, self.off)
+        solved, measured, scale, turn = self.found.solved, self.found.measured, self.found.scale, self.found.turn
         if abs(np.log(scale)) > limit:
             text = f"its steps are {scale:.3g} times as long as the front-end's"
             problem = self.selection.problem
             if len(problem.cameras.model) == 1 and not len(problem.observations.depth_m):
                 return f"{text}: one camera does not see the scale, and here it has drifted away"
             return f"{text}: the scale of depths, baseline or focal length is not that of the front-end"
-        turn = steps.turn_error(self.solved, self.measured, self.off)
         if abs(np.log(turn)) > limit:
             return f"it turns {turn:.3g} times as far as the front-end: the focal length is not the true one"
         # The lower of two in the middle: of four steps two may lead to one keyframe that is far off.
         typical = float(np.sort(self.off.sigmas)[(len(self.first) - 1) // 2])
-        if self.selection.much_moves and steps.bias(self.solved, self.measured) > _MAX_BIAS:
-            aside = float(np.linalg.norm(np.mean(self.solved.move - self.measured.move, axis=0)))
+        if self.selection.much_moves and steps.bias(solved, measured) > _MAX_BIAS:
+            aside = float(np.linalg.norm(np.mean(solved.move - measured.move, axis=0)))
             turned = float(np.degrees(np.median(self.off.turn_rad)))
             return (
                 f"its steps are off the front-end's to one side, by {aside:.2g} m and"
@@ -238,7 +259,7 @@ class _Compared:
             return Verdict(health=health)
         start = self.selection.problem.start
         began = steps.between(start.rotation, start.translation, self.first, self.second)
-        known = steps.compare(self.solved, began, self.config.guard).sigmas <= limit
+        known = steps.compare(self.found.solved, began, self.config.guard).sigmas <= limit
         if confirmed is not None:
             known |= agree(self._odd(odd), confirmed, self.config, self._keys(np.arange(len(odd))))
         spanned = np.zeros(len(odd), bool)
@@ -262,7 +283,8 @@ class _Compared:
         return [(int(rows[self.first[k]]), int(rows[self.second[k]])) for k in which]
 
     def _odd(self, odd: BoolArray) -> Odd:
-        return Odd(tuple(self._keys(np.flatnonzero(odd))), steps.Steps(self.solved.turn[odd], self.solved.move[odd]))
+        solved = self.found.solved
+        return Odd(tuple(self._keys(np.flatnonzero(odd))), steps.Steps(solved.turn[odd], solved.move[odd]))
 
     def _borne_out(self, k: int) -> bool:
         """Return True if at both ends of a step most points that are seen across it agree, and there are enough."""

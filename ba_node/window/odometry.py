@@ -73,7 +73,7 @@ class Steps:
 
     def factors(self, kept: BoolArray, loss_scale: float) -> tuple[RelativePoses, ...]:
         """Return the factors of some steps."""
-        pairs = np.stack([self.first, self.first + 1], axis=1)[kept]
+        pairs = self.first[kept, None] + np.arange(2)
         root = np.zeros((2, len(pairs), 6, 6))
         index = np.arange(3)
         root[0][:, index, index] = 1.0 / self.sigma_rad[kept, None]
@@ -95,13 +95,14 @@ def factors(
     keyframes: IntArray,
     turned: Turns | None = None,
     much_moves: bool = False,
+    tied: BoolArray | None = None,
 ) -> tuple[RelativePoses, ...]:
     """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
 
     ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
-    beside the front-end's; ``much_moves`` if a large share of what is seen does.
+    beside the front-end's; ``much_moves`` if a large share of what is seen does; ``tied`` is :func:`ties` if known.
     """
-    tied = np.flatnonzero(ties(scene, config, keyframes))
+    tied = (ties(scene, config, keyframes) if tied is None else tied).nonzero()[0]
     free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
     if not free.any():
         return ()
@@ -129,7 +130,7 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
     """Return the front-end's steps as the parameters have them."""
     table, place = scene.keyframes, scene.places()[keyframes]
     poses = table.input_rotation, table.input_position
-    rotation, translation = _relative(*poses, keyframes[first], keyframes[first + 1])
+    rotation, translation = geometry.steps_between(*poses, keyframes[first], keyframes[first + 1])
     gap = place[first + 1] - place[first]
     steps = (rotation, translation) if (gap == 1).all() else None
     length, turn = _travelled(scene, place[first], gap, steps)
@@ -162,14 +163,14 @@ def _as_learned(
         steps = changed(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
     table = scene.keyframes
     told = ((among & table.refined[keyframes], factor) for among, factor in sources)
-    steps_of = ((np.flatnonzero(sure[steps.first] & sure[steps.first + 1]), factor) for sure, factor in told)
+    steps_of = (((sure[steps.first] & sure[steps.first + 1]).nonzero()[0], factor) for sure, factor in told)
     rows, factor = next((one for one in steps_of if len(one[0]) >= _LEAST_STEPS), (steps.first[:0], 0.0))
     if not len(rows):
         return None
-    first = steps.first[rows]
-    rotation, translation = _relative(table.rotation, table.position, keyframes[first], keyframes[first + 1])
+    first, last = keyframes[steps.first[rows]], keyframes[steps.first[rows] + 1]
+    refined = geometry.steps_between(table.rotation, table.position, first, last)
     stated = steps.rotation[rows], steps.translation[rows]
-    worse = factor * _medians_off((rotation, translation), stated, (steps.sigma_rad[rows], steps.sigma_m[rows]))
+    worse = factor * _medians_off(refined, stated, (steps.sigma_rad[rows], steps.sigma_m[rows]))
     worse /= _MEDIAN_NORM
     # Keyframes of before they were known to be precise are worse than they.
     times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
@@ -190,18 +191,6 @@ def _medians_off(
     return np.asarray(np.median(np.sqrt(np.sum(off * off, axis=2)), axis=1))
 
 
-def _relative(
-    rotation: FloatArray, position: FloatArray, first: IntArray, second: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return relative poses, (n, 3, 3) and (n, 3): body at the first row from body at the second."""
-    if native.kernels is not None:
-        found: tuple[FloatArray, FloatArray] = native.kernels.steps_between(rotation, position, first, second)
-        return found
-    back = np.swapaxes(rotation[first], 1, 2)
-    moved = (position[second] - position[first])[:, :, None]
-    return back @ rotation[second], (back @ moved)[..., 0]
-
-
 def _travelled(
     scene: Scene, place: IntArray, gap: IntArray, steps: tuple[FloatArray, FloatArray] | None
 ) -> tuple[FloatArray, FloatArray]:
@@ -214,7 +203,7 @@ def _travelled(
         factor = np.repeat(np.arange(len(place)), gap)
         at = np.arange(len(factor)) + (place - (np.cumsum(gap) - gap))[factor]
         table, order = scene.keyframes, scene.order
-        steps = _relative(table.input_rotation, table.input_position, order[at], order[at + 1])
+        steps = geometry.steps_between(table.input_rotation, table.input_position, order[at], order[at + 1])
     rotation, translation = steps
     cosine = 0.5 * (rotation[:, 0, 0] + rotation[:, 1, 1] + rotation[:, 2, 2] - 1.0)
     turn = np.arccos(np.clip(cosine, -1.0, 1.0))

@@ -69,9 +69,7 @@ class Comparison:
 def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
     """Return how far steps are off measured ones."""
     if native.kernels is not None:
-        of_turn = config.turn_sigma_rad, config.turn_sigma_share, config.turn_sigma_rad_per_m
-        worth = config.step_sigma_m, config.step_sigma_share, *of_turn
-        return Comparison(*native.kernels.compare_steps(_both(steps), _both(measured), worth))
+        return Comparison(*native.kernels.compare_steps(_both(steps), _both(measured), _worth(config)))
     length, turned = measured.length, angle_of(measured.turn)
     sigma_m = config.step_sigma_m + config.step_sigma_share * length
     sigma_rad = config.turn_sigma_rad + config.turn_sigma_share * turned + config.turn_sigma_rad_per_m * length
@@ -80,20 +78,36 @@ def compare(steps: Steps, measured: Steps, config: GuardConfig) -> Comparison:
     return Comparison(np.maximum(move / sigma_m, turn / sigma_rad), move, turn, turned, sigma_m, sigma_rad)
 
 
-def scale_error(steps: Steps, measured: Steps, found: Comparison) -> float:
-    """Return by what factor all steps are longer than the front-end's; 1 where that cannot be told from its errors."""
-    if native.kernels is not None:
-        factor: float = native.kernels.scale_error(_both(steps), _both(measured), found.sigma_m, _LIMITS)
-        return factor
-    return _common(steps.move, measured.move, found.sigma_m)
+@dataclass(frozen=True)
+class Against:
+    """The steps of a solution beside the front-end's."""
+
+    solved: Steps
+    measured: Steps  # the front-end's
+    off: Comparison
+    scale: float  # by what factor all are longer than the front-end's; 1 where that cannot be told from its errors
+    turn: float  # by what factor all turns are larger, likewise
 
 
-def turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
-    """Return by what factor all turns are larger than the front-end's; 1 where that cannot be told from its errors."""
+def against(
+    solved: tuple[FloatArray, FloatArray],
+    measured: tuple[FloatArray, FloatArray],
+    first: IntArray,
+    second: IntArray,
+    config: GuardConfig,
+) -> Against:
+    """Return the steps of two sets of poses (body from world, as of :func:`between`) beside each other."""
     if native.kernels is not None:
-        worth = found.turned_rad, found.sigma_rad
-        factor: float = native.kernels.turn_error(_both(steps), _both(measured), *worth, _LIMITS)
-        return factor
+        poses, pairs = (*solved, *measured), (first, second)
+        ours, theirs, off, *factors = native.kernels.steps_against(poses, pairs, _worth(config), _LIMITS)
+        return Against(Steps(*ours), Steps(*theirs), Comparison(*off), *factors)
+    steps, others = between(*solved, first, second), between(*measured, first, second)
+    found = compare(steps, others, config)
+    scale = _common(steps.move, others.move, found.sigma_m)
+    return Against(steps, others, found, scale, _turn_error(steps, others, found))
+
+
+def _turn_error(steps: Steps, measured: Steps, found: Comparison) -> float:
     telling = found.turned_rad > found.sigma_rad
     if np.count_nonzero(telling) < _FEW:
         return 1.0
@@ -115,6 +129,11 @@ def bias(steps: Steps, measured: Steps) -> float:
     squared = np.mean(off, axis=0) ** 2 / np.maximum(np.var(off, axis=0, ddof=1) / n, 1e-24)
     # The square of a variable of Student's distribution with n - 1 degrees of freedom is (n - 1) / (n - 3) on average.
     return float(np.sum(squared)) * (n - 3) / (n - 1)
+
+
+def _worth(config: GuardConfig) -> tuple[float, float, float, float, float]:
+    of_turn = config.turn_sigma_rad, config.turn_sigma_share, config.turn_sigma_rad_per_m
+    return config.step_sigma_m, config.step_sigma_share, *of_turn
 
 
 def _both(steps: Steps) -> tuple[FloatArray, FloatArray]:

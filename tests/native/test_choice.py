@@ -17,7 +17,8 @@ from ba_node.config import Config
 from ba_node.core import geometry, native_kernels, triangulation
 from ba_node.core.cameras import DISTORTION, Model
 from ba_node.core.problem import Problem
-from ba_node.scene import ingest
+from ba_node.measurements import FeatureTracks
+from ba_node.scene import ingest, still_images
 from ba_node.scene.scene import Scene
 from ba_node.window import moving, odometry, steps, trial
 from ba_node.window.initial_points import agreed_points
@@ -290,10 +291,13 @@ def test_steps_are_compared_as_numpy_does(off: float, both: Both) -> None:
     first, second = np.arange(0, 28, 2), np.arange(1, 29, 2)
 
     def compared() -> list[Any]:
+        beside = steps.against(found, measured, first, second, Config().guard)
         ours, theirs = (steps.between(*poses, first, second) for poses in (found, measured))
-        comparison = steps.compare(ours, theirs, Config().guard)
-        errors = [error(ours, theirs, comparison) for error in (steps.scale_error, steps.turn_error)]
-        return [*vars(ours).values(), *vars(comparison).values(), *errors]
+        apart = steps.compare(ours, theirs, Config().guard)
+        for one, other in ((beside.solved, ours), (beside.measured, theirs), (beside.off, apart)):
+            for name, values in vars(one).items():
+                np.testing.assert_array_equal(values, getattr(other, name), err_msg=name)
+        return [*vars(ours).values(), *vars(apart).values(), beside.scale, beside.turn]
 
     compiled, plain = both(compared)
     assert (compiled[-2:] == [1.0, 1.0]) == (off < 0.3)
@@ -306,10 +310,29 @@ def test_fewer_steps_than_show_a_factor_show_none(both: Both) -> None:
     few = np.arange(4)
 
     def error() -> float:
-        ours, theirs = (steps.between(*poses, few, few + 1) for poses in (found, measured))
-        return steps.scale_error(ours, theirs, steps.compare(ours, theirs, Config().guard))
+        return steps.against(found, measured, few, few + 1, Config().guard).scale
 
     assert both(error) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("rise", [True, False])
+def test_what_two_images_share_is_what_numpy_finds(rise: bool, both: Both) -> None:
+    """Of 200 ids each, some of whose pixels stay as they are, one coordinate of others; the largest id among them."""
+    rng = np.random.default_rng(8)
+    known = np.append(np.unique(rng.integers(0, 2**64 - 2, 300, dtype=np.uint64)), np.uint64(2**64 - 1))
+    where = rng.uniform(0.0, 600.0, (len(known), 2))
+    images = []
+    for moved in (0.0, 1.0):
+        rows = np.append(rng.choice(len(known) - 1, 199, replace=False), len(known) - 1)
+        uv = where + moved * rng.integers(0, 2, where.shape)
+        rows = np.sort(rows) if rise else rows
+        images.append(FeatureTracks(0, 0, 0, known[rows], uv[rows]))
+    compiled, plain = both(lambda: still_images._shared(*images))
+    assert compiled == plain
+    assert 100 < plain[0] < 200 and 10 < plain[1] < plain[0] - 10
+    assert (
+        native.kernels.shared_pixels(*zip(*((one.track_id, one.uv) for one in images), strict=True)) is None
+    ) != rise
 
 
 @pytest.mark.parametrize("n", [7, 8])
@@ -318,7 +341,7 @@ def test_steps_are_off_by_as_much_as_numpy_finds(n: int, both: Both) -> None:
     rows, sigmas = np.arange(n), (np.full(n, 0.01), np.linspace(0.1, 0.2, n))
 
     def medians() -> Any:
-        ours, theirs = (odometry._relative(*poses, rows, rows + 1) for poses in (found, measured))
+        ours, theirs = (geometry.steps_between(*poses, rows, rows + 1) for poses in (found, measured))
         return odometry._medians_off(ours, theirs, sigmas)
 
     compiled, plain = both(medians)

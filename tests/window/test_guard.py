@@ -13,6 +13,7 @@ from ba_node.window import steps, trial
 from ba_node.window.trust import Odd, Trust
 
 CONFIG = Config()
+FIRST = np.arange(11)  # of the steps between 12 keyframes
 
 
 def poses(rng: np.random.Generator, n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -25,6 +26,15 @@ def poses(rng: np.random.Generator, n: int, scale: float = 1.0) -> tuple[np.ndar
 def steps_of(found: tuple[np.ndarray, np.ndarray]) -> steps.Steps:
     first = np.arange(len(found[0]) - 1)
     return steps.between(*found, first, first + 1)
+
+
+def led_by(made: steps.Steps) -> tuple[np.ndarray, np.ndarray]:
+    """Return body from world where steps lead from the origin."""
+    rotation, translation = [np.eye(3)], [np.zeros(3)]
+    for turn, move in zip(made.turn, made.move, strict=True):
+        rotation.append(turn.T @ rotation[-1])
+        translation.append(turn.T @ (translation[-1] - move))
+    return np.array(rotation), np.array(translation)
 
 
 def test_steps_that_are_off_to_one_side_stand_out_of_noise() -> None:
@@ -62,21 +72,20 @@ def test_angle(angle: float) -> None:
 
 @pytest.mark.parametrize("scale", [0.8, 1.2, 1000.0])
 def test_a_common_scale_is_found(scale: float) -> None:
-    found = steps_of(poses(np.random.default_rng(1), 12, scale))
-    measured = steps_of(poses(np.random.default_rng(2), 12))
-    off = steps.compare(found, measured, GuardConfig())
-    assert steps.scale_error(found, measured, off) == pytest.approx(scale, rel=0.05)
-    assert steps.turn_error(found, measured, off) == 1.0
+    found, measured = poses(np.random.default_rng(1), 12, scale), poses(np.random.default_rng(2), 12)
+    beside = steps.against(found, measured, FIRST, FIRST + 1, GuardConfig())
+    assert beside.scale == pytest.approx(scale, rel=0.05)
+    assert beside.turn == 1.0
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_noise_is_no_scale(seed: int) -> None:
     """Steps that are off by 15 % each way in random directions."""
     rng = np.random.default_rng(seed)
-    found, measured = (steps_of(poses(rng, 12)) for _ in range(2))
-    measured = steps.Steps(measured.turn, measured.move + 0.15 * rng.normal(size=measured.move.shape))
-    off = steps.compare(found, measured, GuardConfig())
-    assert abs(np.log(steps.scale_error(found, measured, off))) < np.log1p(GuardConfig().max_scale_error)
+    found, measured = poses(rng, 12), steps_of(poses(rng, 12))
+    noisy = led_by(steps.Steps(measured.turn, measured.move + 0.15 * rng.normal(size=measured.move.shape)))
+    beside = steps.against(found, noisy, FIRST, FIRST + 1, GuardConfig())
+    assert abs(np.log(beside.scale)) < np.log1p(GuardConfig().max_scale_error)
 
 
 def test_a_fixed_choice_of_tracks() -> None:

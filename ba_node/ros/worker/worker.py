@@ -91,6 +91,7 @@ class Worker:
         self._logged: Counter[str] = Counter()
         self._logged_map = 0
         self._warned: set[str] = set()
+        self._logged_of: object = None  # what was turned away when it was looked for last
         # What the last report said of things turned away, when that was, and whether there is more to say.
         self._reported: object = None
         self._reported_s = -_REPORT_PERIOD_S
@@ -266,7 +267,8 @@ class Worker:
 
     def _turned_away(self) -> object:
         """Return what a report says of things turned away."""
-        return self._backend.map.index, Counter(self._backend.map.rejected), tuple(self._backend.map.warnings)
+        known = self._backend.map
+        return known.index, dict(known.rejected), known.warnings
 
     def _report_rejections(self) -> None:
         """Report what was turned away since the last report, if no solve did."""
@@ -279,6 +281,9 @@ class Worker:
             self._put(Outcome(self._backend.report, self._queue(), self._backend.map.stamp_ns))
 
     def _log_rejections(self) -> None:
+        before, self._logged_of = self._logged_of, self._turned_away()
+        if before == self._logged_of:
+            return
         rejected, notices = Counter(self._backend.map.rejected), []
         if self._backend.map.index != self._logged_map:
             self._logged_map, self._logged, self._warned = self._backend.map.index, Counter(), set()

@@ -4,7 +4,10 @@
 
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <array>
+#include <cstdint>
+#include <functional>
 #include <tuple>
 #include <utility>
 
@@ -56,18 +59,57 @@ CommonLimits limits_of(const Limits& limits) {
   return {telling, spread, median, few};
 }
 
-double scale_error_of(const Steps& steps, const Steps& measured, const Doubles& sigma_m, const Limits& limits) {
-  return scale_error(view_of(steps), view_of(measured), sigma_m.data(), limits_of(limits));
+// poses: of a solution and of the front-end, body from world, each rotation and translation. pairs: first and second.
+py::tuple steps_against(const std::array<Doubles, 4>& poses, const std::pair<Ints, Ints>& pairs,
+                        const std::array<double, 5>& worth, const Limits& limits) {
+  const Steps steps = inverse_steps_between(poses[0], poses[1], pairs.first, pairs.second);
+  const Steps measured = inverse_steps_between(poses[2], poses[3], pairs.first, pairs.second);
+  const py::tuple comparison = compared(steps, measured, worth);
+  const auto column = [&comparison](int i) { return comparison[i].cast<Doubles>(); };
+  const Doubles turned = column(3), sigma_m = column(4), sigma_rad = column(5);
+  const CommonLimits at = limits_of(limits);
+  const double scale = scale_error(view_of(steps), view_of(measured), sigma_m.data(), at);
+  const double turn = turn_error(view_of(steps), view_of(measured), turned.data(), sigma_rad.data(), at);
+  return py::make_tuple(steps, measured, comparison, scale, turn);
 }
 
-double turn_error_of(const Steps& steps, const Steps& measured, const Doubles& turned, const Doubles& sigma_rad,
-                     const Limits& limits) {
-  return turn_error(view_of(steps), view_of(measured), turned.data(), sigma_rad.data(), limits_of(limits));
+// Of each camera, how many of its observations have a residual up to a gate, and how many there are.
+py::tuple agreeing_by_camera(const Ints& camera, const Doubles& norms, double gate, py::ssize_t n_cameras) {
+  Ints agreeing({n_cameras}), every({n_cameras});
+  std::fill_n(agreeing.mutable_data(), n_cameras, 0);
+  std::fill_n(every.mutable_data(), n_cameras, 0);
+  for (py::ssize_t o = 0; o < norms.size(); ++o) {
+    ++every.mutable_data()[camera.data()[o]];
+    agreeing.mutable_data()[camera.data()[o]] += norms.data()[o] <= gate;
+  }
+  return py::make_tuple(agreeing, every);
 }
 
 std::pair<double, double> medians_off_of(const Steps& steps, const Steps& others, const Doubles& sigma_rad,
                                          const Doubles& sigma_m) {
   return medians_off(view_of(steps), view_of(others), sigma_rad.data(), sigma_m.data());
+}
+
+// Of two images, how many ids they share, and how many of these have the same pixel; None unless the ids of both rise.
+py::object shared_pixels(const std::pair<Array<std::uint64_t>, Array<std::uint64_t>>& ids,
+                         const std::pair<Doubles, Doubles>& uv) {
+  const auto rise = [](const Array<std::uint64_t>& of) {
+    return std::adjacent_find(of.data(), of.data() + of.size(), std::greater_equal<>()) == of.data() + of.size();
+  };
+  if (!rise(ids.first) || !rise(ids.second)) return py::none();
+  const std::uint64_t *a = ids.first.data(), *b = ids.second.data();
+  const double *p = uv.first.data(), *q = uv.second.data();
+  std::int64_t shared = 0, same = 0;
+  for (py::ssize_t i = 0, j = 0; i < ids.first.size() && j < ids.second.size();) {
+    if (a[i] == b[j]) {
+      ++shared;
+      same += p[2 * i] == q[2 * j] && p[2 * i + 1] == q[2 * j + 1];
+    }
+    const bool first = a[i] <= b[j], second = b[j] <= a[i];
+    i += first;
+    j += second;
+  }
+  return py::make_tuple(shared, same);
 }
 
 }  // namespace
@@ -76,8 +118,9 @@ void bind_steps(py::module_& m) {
   m.def("steps_between", &steps_between);
   m.def("inverse_steps_between", &inverse_steps_between);
   m.def("compare_steps", &compared);
-  m.def("scale_error", &scale_error_of);
-  m.def("turn_error", &turn_error_of);
+  m.def("steps_against", &steps_against);
+  m.def("agreeing_by_camera", &agreeing_by_camera);
+  m.def("shared_pixels", &shared_pixels);
   m.def("medians_off", &medians_off_of);
 }
 
