@@ -62,6 +62,7 @@ WARNINGS: dict[str, str] = {
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
     "stray": "Keyframes whose front-end's pose contradicts their tracks; they are placed by these, or left out.",
     "moving": "Tracks that move against the rest, as on objects that move; they are left out.",
+    "depths": "Keyframes most of whose depths contradict images and steps, as in another unit; they are left out.",
     "far_from_origin": "Keyframes so far from the origin that the float32 of ~/points loses millimetres.",
     "still_image": "Images that come again while the front-end moves, as of a camera that is stuck; they are left out.",
     "ids_reused": "Track ids that were used again for other points.",
