@@ -22,6 +22,7 @@ from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 from ba_node.core import geometry
 
+_ONE_ID = "track_id in the feature_tracks of camera {camera}: one id for one point, whichever camera sees it"
 # Keyframes from which on it is measured by how much a camera is off.
 _KEYFRAMES_TO_MEASURE = 10
 # Cameras beyond the first that are tested.
@@ -43,6 +44,8 @@ _ZOOMS = tuple(float(factor) for factor in np.geomspace(0.5, 2.0, 41))
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
+# Two cameras that see so much of the same have tracks in common.
+_SEE_THE_SAME = 0.5
 # Outliers keep it from being measured unless the given relation explains less than this share of what the best does.
 _CLEAR = 0.5
 
@@ -55,6 +58,8 @@ def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diag
         if relation is None:
             if shared := shared_views(tracks, camera):
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
+            elif len(tracks) >= _KEYFRAMES_TO_MEASURE and (overlap := _overlap(tracks, camera)) > _SEE_THE_SAME:
+                outcome.add(Diagnosis([_none_shared(camera, overlap)]))
             continue
         found = _check_camera(tracks, camera, relation, related)
         if (best := max(row.share for row in found.rows)) < _CONTRADICT and _agree_alone(tracks, camera):
@@ -126,8 +131,26 @@ def _agree_alone(tracks: Tracks, camera: int) -> bool:
 def _ids_differ(camera: int, share: float) -> Finding:
     cause = f"track ids of cameras 0 and {camera} do not name the same points"
     evidence = f"{share:.0%} of those that both see agree, although the tracks of each camera alone do"
-    change = f"track_id in the feature_tracks of camera {camera}: one id for one point, whichever camera sees it"
-    return Finding((cause,), evidence, (change,), usual=True)
+    return Finding((cause,), evidence, (_ONE_ID.format(camera=camera),), usual=True)
+
+
+def _overlap(tracks: Tracks, camera: int) -> float:
+    """Return which share of what camera 0 sees another one that has tracks of the same keyframes sees too, far away."""
+    both = [k for k in spread(len(tracks), _PAIRS_NEEDED) if {(k, 0), (k, camera)} <= tracks.images.keys()]
+    if len(both) < _PAIRS_NEEDED:
+        return 0.0
+    own, other = (tracks.ray[np.concatenate([tracks.images[k, one] for k in both])] for one in (0, camera))
+    there = np.append(own, np.ones((len(own), 1)), axis=1) @ tracks.between_cameras(0, camera).rotation.T
+    low, high = np.percentile(other, (2.0, 98.0), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = there[:, :2] / there[:, 2:]
+    return float(np.mean((there[:, 2] > 0.0) & (seen > low).all(axis=1) & (seen < high).all(axis=1)))
+
+
+def _none_shared(camera: int, overlap: float) -> Finding:
+    cause = f"cameras 0 and {camera} share no track, though they look at the same: each counts as one camera alone"
+    evidence = f"camera {camera} sees {overlap:.0%} of what camera 0 sees"
+    return Finding((cause,), evidence, (_ONE_ID.format(camera=camera),), harmful=False, usual=True)
 
 
 def _same_place(camera: int, relation: Relation, rows: list[Row]) -> Diagnosis:

@@ -14,6 +14,7 @@ from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.relations import Relation, agreed, in_motion, rays
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
+from ba_node.core.units import unit_of
 
 # Parallax, in gates, from which on a triangulated depth is worth something; points and pairs that are needed.
 _PARALLAX = 4.0
@@ -31,15 +32,6 @@ _STANDARD_ERRORS = 4.0
 _GROSS = 5.0
 # A factor is named if depths agree on it to this share (median deviation of its logarithm).
 _AGREE = 0.35
-_UNITS = (
-    (1000.0, "in millimetres"),
-    (100.0, "in centimetres"),
-    (10.0, "in decimetres"),
-    (5000.0, "in units of 0.2 mm"),
-    (256.0, "in units of 1/256 m"),
-    (0.001, "in kilometres"),
-    (3.2808, "in feet"),
-)
 # A shift of all disparities is named unless a factor of all depths leaves so many times less spread, and goes first.
 _CLEARLY = 3.0
 # A factor is named unless a shift leaves so much less.
@@ -155,7 +147,7 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             finding, causes=(*finding.causes, steps[0]), changes=("the factor from depth images to depth_m", steps[1])
         )
         return Diagnosis([both], rows=rows)
-    unit = _unit(factor)
+    unit = unit_of(factor)
     finding = _depth_finding(f"depth_m {unit or 'in another unit'}: it is {_times(factor)} what {by} tell", evidence)
     if not unit:
         # What steps tell of distances depends on the intrinsics.
@@ -178,11 +170,6 @@ def _alike(ratio: list[float], most: float) -> bool:
 
 def _times(factor: float) -> str:
     return f"{factor:.0f} times" if factor >= 10.0 else f"{factor:.3g} times"
-
-
-def _unit(factor: float) -> str:
-    """Return the unit that a factor stands for; empty if none is near."""
-    return next((name for value, name in _UNITS if 0.75 < factor / value < 1.33), "")
 
 
 def _depth_finding(cause: str, evidence: str) -> Finding:
@@ -293,7 +280,7 @@ def _of_shift(tracks: Tracks, camera: int, turn: float) -> dict[str, str]:
 def _of_factor(camera: int, baseline: float, factor: float) -> dict[str, str]:
     """Return what stretches all depths by a factor, and what to change."""
     fitting = f"({baseline:.3g} m; tracks fit {baseline / factor:.3g} m)"
-    size = _unit(factor) or f"is {_times(factor)} what the front-end's steps tell"
+    size = unit_of(factor) or f"is {_times(factor)} what the front-end's steps tell"
     return {
         f"baseline of camera {camera} {size}": (f"body_from_camera of camera {camera} in camera_rig {fitting}"),
         _scale_of_steps(factor): _STEPS,
@@ -304,7 +291,7 @@ def _scale_of_steps(factor: float) -> str:
     """Return what is wrong with poses where lengths are ``factor`` times what these tell."""
     if 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
         return f"scale of the front-end's steps: they are {_times(1.0 / factor)} what the cameras tell"
-    return f"poses {_unit(1.0 / factor) or 'in another unit'}"
+    return f"poses {unit_of(1.0 / factor) or 'in another unit'}"
 
 
 def _depth_pairs(

@@ -14,6 +14,7 @@ from ba_node.backend import Backend, CurrentMap, Diagnosis, can_examine
 from ba_node.config import Config
 from ba_node.io.bag_reader import BagReader
 from ba_node.offline.attention import turned_away
+from ba_node.offline.clock import with_clock_watched
 
 
 class CheckError(ValueError):
@@ -65,7 +66,7 @@ def check_recording(bag: Path, config: Config) -> CheckedRecording:
     backend = Backend(config)
     maps = [backend.map]
     with BagReader(bag) as reader:
-        for _, _, measurement in reader.measurements():
+        for _, _, measurement in with_clock_watched(reader.measurements(), reader):
             backend.add(measurement)
             if backend.map is not maps[-1]:
                 maps.append(backend.map)

@@ -38,6 +38,7 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, WHOLE_MAP
 from ba_node.offline.attention import attention
+from ba_node.offline.clock import with_clock_watched
 from ba_node.offline.keyframe_images import images_of
 from ba_node.offline.recording import placed, read_truth
 from ba_node.offline.run_folder import recording_facts, shown_keyframe, versions, write_details
@@ -97,7 +98,8 @@ def replay(
     """
     with contextlib.ExitStack() as stack:
         reader = stack.enter_context(BagReader(bag, options.topics))
-        measurements = placed(reader.measurements(options.load is not None), reader, config.frames)
+        messages = with_clock_watched(reader.measurements(options.load is not None), reader)
+        measurements = placed(messages, reader, config.frames)
         stack.enter_context(locked_folder(out))
         (out / "report.json").unlink(missing_ok=True)
         with BagWriter(out / "refined.mcap") as writer:

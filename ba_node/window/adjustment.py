@@ -35,6 +35,8 @@ _SEAM_RAD, _SEAM_M = 0.1, 1.0
 _UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
 _RECENT, _TELLING = 50, 4.0
+# One that lies far beside the map may be wrong, and nothing else may tell: it takes so many that agree to move it.
+_CONFIRMED = 2
 # Map and world are tried to be aligned again once the map has grown by this share.
 _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
@@ -292,8 +294,19 @@ def _left_the_world(scene: Scene, config: Config, final: bool) -> loops.Due | No
         return None
     rotation, translation = known.map_from_world
     off = pairs.position @ rotation.T + translation - pairs.points(scene)
-    sigma = np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
-    middle = float(np.linalg.norm(np.median(off, axis=0)))
-    if middle > max(config.factors.adjust_m, _TELLING * float(np.median(sigma)) / np.sqrt(len(pairs))) or final:
-        return loops.Due(f"the map has come to lie {middle:.2f} m beside where priors have it")
-    return None
+    sigma = float(np.median(np.sqrt(np.trace(pairs.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)))
+    middle = np.median(off, axis=0)
+    middle_m, noise_m = float(np.linalg.norm(middle)), _TELLING * sigma
+    scene.log.warnings.pop("unconfirmed", None)
+    if middle_m <= max(config.factors.adjust_m, noise_m / np.sqrt(len(pairs))) and not final:
+        return None
+    near_m = max(config.factors.adjust_m, np.sqrt(3.0) * noise_m)
+    agreeing = np.count_nonzero(np.linalg.norm(off - middle, axis=1) <= near_m)
+    if middle_m > near_m and agreeing < _CONFIRMED:
+        priors = f"in frame {known.world_frame!r}"
+        which = f"of {len(pairs)} recent priors {priors} no two agree, and half of them lie"
+        which = f"the only recent prior {priors} lies" if len(pairs) == 1 else which
+        text = f"{which} {middle_m:.2f} m beside the map: it stays as it is until another one confirms that"
+        scene.log.warn("unconfirmed", text)
+        return None
+    return loops.Due(f"the map has come to lie {middle_m:.2f} m beside where priors have it")

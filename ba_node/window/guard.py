@@ -29,7 +29,7 @@ from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core.problem import Problem, State
-from ba_node.window import steps
+from ba_node.window import depths, steps
 from ba_node.window.merging import Merged
 from ba_node.window.selection import Selection
 from ba_node.window.trial import MIN_PARALLAX, Explained, median
@@ -154,15 +154,12 @@ def _misfit(selection: Selection, state: State, agreeing: _Agreeing, config: Con
 
 def _depth_errors(problem: Problem, state: State) -> FloatArray:
     """Return how far some of the measured depths are off a solution, sigmas."""
-    obs, cams = problem.observations, problem.cameras
+    obs = problem.observations
     if not len(obs.depth_m):
         return np.empty(0)
     rows = np.flatnonzero(np.isfinite(obs.depth_m))
     rows = rows[:: 1 + len(rows) // _LOOKED_AT]
-    camera, keyframe = obs.camera[rows], obs.keyframe[rows]
-    body = (state.rotation[keyframe] @ state.points[obs.point[rows]][:, :, None])[..., 0] + state.translation[keyframe]
-    depth = np.sum(cams.rotation[camera, 2] * body, axis=1) + cams.translation[camera, 2]
-    return np.asarray(np.abs(depth - obs.depth_m[rows]) / obs.depth_sigma_m[rows])
+    return np.asarray(np.abs(depths.expected(problem, state, rows) - obs.depth_m[rows]) / obs.depth_sigma_m[rows])
 
 
 def _without_parallax(problem: Problem, found: Explained, sigma_px: float, config: Config) -> str:

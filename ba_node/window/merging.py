@@ -15,7 +15,7 @@ from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import Observations, Problem, State
 from ba_node.core.result import Result
 from ba_node.scene.scene import Scene
-from ba_node.window import gauge
+from ba_node.window import depths, gauge
 from ba_node.window.initial_points import agreed_points, widened
 from ba_node.window.problems import part_of
 from ba_node.window.reuse import note_reuse, part_reused
@@ -172,6 +172,7 @@ def apply(
     classify(scene, selection, state, norms, tracks, kernels)
     _displace(scene, selection.lost)
     _note_moving(scene, selection)
+    depths.note_wrong(scene, selection, state)
     return norms
 
 

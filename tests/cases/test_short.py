@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 
+from ba_node.measurements import FeatureTracks
 from experiments.robustness.faults import SOUND, spoiled
 from experiments.robustness.faults.catalogue import spoiled_by
 from tests.cases.conftest import Replay, harmless
@@ -48,3 +50,23 @@ def test_a_principal_point_off_on_a_straight_way(tmp_path: Path, run: Replay) ->
     assert outcome.code == 3, outcome.words
     harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
     outcome.tells("principal point")
+
+
+@pytest.mark.parametrize(
+    ("factor", "last", "seed", "unit"), [(1000.0, 5, 925, "in millimetres"), (3.28, 13, 926, "in feet")]
+)
+def test_depths_that_change_their_unit_near_the_end_are_named(
+    factor: float, last: int, seed: int, unit: str, tmp_path: Path, run: Replay
+) -> None:
+    recording = spoiled(SOUND, "rgbd", seed=seed)
+    late = len(recording.keyframes) - last
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        times = factor if recording.number(image.keyframe_id) >= late else 1.0
+        return dataclasses.replace(image, depth_m=times * image.depth_m)
+
+    outcome = run(write(tmp_path, recording.changed(FeatureTracks, change)))
+    assert outcome.code == 3, outcome.words
+    (found,) = outcome.errors(recording.truth)
+    assert found.published_m < 0.5 * found.input_m, "the images go on without them"
+    outcome.tells(rf"depth_m of \d+ keyframes \({late} to \d+\).*{unit}")

@@ -245,6 +245,9 @@ WRONG: dict[str, Wrong] = {
     "ids of each camera": images(
         lambda one: dataclasses.replace(one, track_id=one.track_id + np.uint64(37 * one.camera_index))
     ),
+    "other ids of each camera": images(
+        lambda one: dataclasses.replace(one, track_id=one.track_id + np.uint64(10**6 * one.camera_index))
+    ),
     "mirrored": images(
         lambda one: dataclasses.replace(one, uv=np.array([639.0, 0.0]) + np.array([-1.0, 1.0]) * one.uv)
     ),

@@ -164,7 +164,34 @@ def test_priors_of_which_no_two_agree_leave_the_map_where_it_is(street: Syntheti
     backend, last, jump = played(data, more)
     assert jump < 0.5
     assert aligned_rms(last.trajectory.position, street.truth.position[:50]) < 0.15
-    assert any("49 of 50 priors would lie beside it" in line for line in backend.report.warnings)
+    assert any("of 50 recent priors in frame 'map' no two agree" in line for line in backend.report.warnings)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "moves_m", "said"),
+    [
+        pytest.param((), (0,), 0.0, "the only recent prior in frame 'map' lies (49|50)", id="one_alone"),
+        pytest.param((8, 16, 27), (0,), 0.0, "", id="the_first_of_four"),
+        pytest.param((3,), (16,), 0.0, "of 2 recent priors in frame 'map' no two agree", id="one_of_two"),
+        pytest.param((), (0, 5), 50.0, "", id="two_that_agree"),
+    ],
+)
+def test_a_prior_moves_the_map_only_if_a_second_one_agrees(
+    street: SyntheticData, right: tuple[int, ...], wrong: tuple[int, ...], moves_m: float, said: str
+) -> None:
+    data, turned = first(street, 30), np.diag([1e-4] * 3 + [1e-4] * 3).ravel()
+
+    def more(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        yield from wheels_of(k, keyframe)
+        if k in (*right, *wrong):
+            place = street.truth.position[k] + np.array([30.0, -40.0, 0.0]) * (k in wrong)
+            yield PosePrior(keyframe.stamp_ns, "map", place, street.truth.orientation[k], turned)
+
+    wheels_of = wheels(street)
+    backend, last, _ = played(data, more)
+    away = last.trajectory.position - street.truth.position[:30]
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), moves_m, atol=1.0)
+    assert any(re.match(said, line) for line in backend.report.warnings) == bool(said), backend.report.warnings
 
 
 def test_a_measurement_that_says_nothing_takes_no_place(street: SyntheticData) -> None:

@@ -297,6 +297,9 @@ FAULTS: dict[str, Fault] = {
         codes=_LOOK,
         changes={"path": "loop", "length_m": 30.0, "keyframes": 60},
     ),
+    "clock_stepped": Fault(
+        "clock set forward, s", stamps.clock_stepped, amounts=(3600.0, -0.3), named=("clock",), codes=_LOOK
+    ),
 }
 
 

@@ -20,6 +20,11 @@ def clock_set_back(recording: Recording, amount: float, _rng: np.random.Generato
     return _with_stamps(recording, lambda k, n, stamp_ns: stamp_ns - round(amount * 1e9) * (k >= n // 2))
 
 
+def clock_stepped(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Set the clock forward by some seconds in the middle, or back by less than keyframes are apart."""
+    return _with_stamps(recording, lambda k, n, stamp_ns: stamp_ns + round(amount * 1e9) * (k >= n // 2))
+
+
 def one_stamp_zero(recording: Recording, _amount: float, rng: np.random.Generator) -> Recording:
     """Leave the stamp of one keyframe empty."""
     at = _one(recording, rng)
