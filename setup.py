@@ -27,6 +27,7 @@ SOURCES = Path(NAME) / "native" / "src"
 # What is compiled once, and what once for each target.
 COMMON = (
     "bindings/module",
+    "bindings/patches",
     "bindings/steps",
     "bindings/window",
     "targets/target",

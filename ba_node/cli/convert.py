@@ -50,6 +50,7 @@ _FAULTS = (
     "bad_pose",
     "bad_extrinsic",
     "not_pixels",
+    "misread",
 )
 # A few wait for a partner where a recording begins and ends, as a share of the images.
 _MOST_APART = 0.1

@@ -118,6 +118,7 @@ def tell(report: Mapping[str, Any]) -> None:
         ("images", f"{report['images']}, {report['mode']}, {1e3 * report['time_per_image_s']:.1f} ms each"),
         ("keyframes", f"{report['keyframes']} in {report['sessions']} session{'s' * (report['sessions'] != 1)}"),
         ("tracks", f"{report['tracks']} with {report['observations']} observations"),
+        ("scale of", report["scale_from"]),
     ]
     if turn is not None and any(turn[:2]):
         yaw, roll = f"{turn[0]:.2f} +- {turn[2]:.2f} px of yaw", f"{turn[1]:.2f} +- {turn[3]:.2f} of roll"

@@ -178,9 +178,8 @@ class ImageWatch:
     def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
         """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""
         assert frame.right is not None
-        as_given = (frame.grey, frame.right, frame.soft, frame.right_soft)
-        exchanged = (frame.right, frame.grey, frame.right_soft, frame.soft)
-        ours, theirs = (_share(*images, rig) for images in (as_given, exchanged))
+        exchanged = Frame(frame.right, frame.grey, None, frame.right_clear, frame.allowed)
+        ours, theirs = (_share(one, rig) for one in (frame, exchanged))
         if theirs > 2.0 * ours and theirs > _FEW_PARTNERS:
             self.say(
                 "swapped",
@@ -202,10 +201,13 @@ def _same(image: Grey | Floats, before: Grey | Floats | None) -> bool:
     return before is not None and np.array_equal(image, before)
 
 
-def _share(first: Grey, second: Grey, soft: Floats, other_soft: Floats, rig: IdealRig) -> float:
+def _share(frame: Frame, rig: IdealRig) -> float:
     """Return which share of an image's corners has a partner in the other, and is found from there again."""
-    uv = features.corners(first, np.ones(first.shape, bool), np.empty((0, 2)), _TRIED, _RIM)
-    size = stereo.smaller(first.shape[1])
-    begin = stereo.look_up(stereo.dense(first, second, first.shape[1] // 5, rig.baseline < 0.0), uv, size)
-    found = stereo.measure(soft, other_soft, uv, begin, _SIDE, np.zeros(len(uv)))
+    assert frame.right is not None
+    uv = features.corners(frame.grey, frame.allowed, np.empty((0, 2)), _TRIED, _RIM)
+    width = frame.grey.shape[1]
+    begin = stereo.look_up(
+        stereo.dense(frame.grey, frame.right, width // 5, rig.baseline < 0.0), uv, stereo.smaller(width)
+    )
+    found = stereo.measure(frame.soft, frame.right_soft, uv, begin, _SIDE, np.zeros(len(uv)))
     return float(found.found.mean()) if len(uv) else 0.0

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.front_end import patches, stereo
 from ba_node.front_end.alignment import StereoAlignment
-from ba_node.front_end.frame import Frame
+from ba_node.front_end.frame import Frame, inside
 from ba_node.front_end.rectify import IdealRig
 
 # Standard deviation of a depth camera, as a share of the depth.
@@ -63,6 +64,9 @@ def _stereo(
     start = np.where(np.isfinite(first), first * fb - added, start)
     off = alignment.rows_off(uv)
     found = stereo.measure(frame.soft, frame.right_soft, uv, (start, slant), side, off)
+    if frame.right_rim is not None:
+        there = np.column_stack([uv[:, 0] - found.value, uv[:, 1] + off])
+        found = dataclasses.replace(found, value=np.where(inside(frame.right_rim, there), found.value, np.nan))
     if alignment.wants_rows:
         _learn_rows(frame, uv, found, side, alignment)
     value = found.value + added

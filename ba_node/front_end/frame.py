@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ba_node.arrays import BoolArray
+from ba_node.arrays import BoolArray, FloatArray
 from ba_node.front_end.opencv import cv2
 from ba_node.front_end.patches import Floats
 from ba_node.front_end.records import Grey
@@ -27,6 +27,12 @@ class Frame:
     right: Grey | None
     depth: NDArray[np.float32] | None
     allowed: BoolArray  # (h, w) where features may be
+    right_rim: BoolArray | None = None  # (h, w) where patches are clear of the second image's rim; None for everywhere
+
+    @property
+    def right_clear(self) -> BoolArray:
+        """Return where patches are clear of the second image's rim: (h, w)."""
+        return np.ones(self.grey.shape, bool) if self.right_rim is None else self.right_rim
 
     @cached_property
     def soft(self) -> Floats:
@@ -38,6 +44,15 @@ class Frame:
         """Return the second image smoothed."""
         assert self.right is not None
         return soften(self.right)
+
+
+def inside(allowed: BoolArray, uv: FloatArray) -> BoolArray:
+    """Return which of uv (n, 2), px, round to a pixel that is allowed; none outside the image is."""
+    height, width = allowed.shape
+    at = np.round(np.nan_to_num(uv, nan=-1.0)).astype(np.intp)
+    good: BoolArray = np.asarray(((at >= 0) & (at < [width, height])).all(axis=1))
+    good[good] = allowed[at[good, 1], at[good, 0]]
+    return good
 
 
 def soften(image: Grey) -> Floats:

@@ -17,6 +17,7 @@ from ba_node.front_end.frame import Frame
 from ba_node.front_end.odometry import OdometryWatch
 from ba_node.front_end.records import FrontEndError, Images, State, Tracked
 from ba_node.front_end.rectify import IdealRig, ideal_rig
+from ba_node.front_end.rim import Rim
 from ba_node.front_end.session import Session
 from ba_node.measurements import CameraRig
 
@@ -88,6 +89,7 @@ class FrontEnd:
         self._odometry = OdometryWatch(lambda cause, words: self._watch.say(cause, words, self._notes))
         self._ideal: IdealRig | None = None
         self._allowed: BoolArray = np.ones((0, 0), bool)
+        self._rims = tuple(Rim(self.options.patch_px | 1) for _ in range(len(rig)))
         if rig.image_size.all():
             self._know_size((int(rig.image_size[0, 0]), int(rig.image_size[0, 1])))
         self._stamp_ns: int | None = None
@@ -259,7 +261,11 @@ class FrontEnd:
             depth = np.where((depth >= self.options.min_depth_m) & (depth <= farthest), depth, np.float32(0.0))
         if images.mask is not None and images.mask.shape == images.grey[0].shape:
             allowed = allowed & (ideal.image(0, images.mask.astype(np.uint8), linear=False) > 0)
-        return Frame(grey[0], grey[1] if len(grey) > 1 else None, depth, allowed)
+        clear = [rim.clear_of(image) for rim, image in zip(self._rims, grey, strict=False)]
+        allowed = allowed if clear[0] is None else allowed & clear[0]
+        if len(grey) == 1:
+            return Frame(grey[0], None, depth, allowed)
+        return Frame(grey[0], grey[1], depth, allowed, clear[1])
 
     def _first(self, images: Images, frame: Frame, odometry: Transform | None) -> Tracked:
         """Begin a session with an image."""

@@ -26,12 +26,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ba_node import native
 from ba_node.arrays import FloatArray
 from ba_node.front_end.opencv import cv2
 
 Floats = NDArray[np.float32]
-# Steps shorter than this end an alignment, px.
-_STEP_PX = 0.01
+# Steps shorter than this end an alignment, and none is longer, px.
+_STEP_PX, _FARTHEST_PX = 0.01, 3.0
 _LEAST_STD = 0.5
 _LEAST_HESSIAN = 1e-6
 _STRIDE = 2
@@ -71,12 +72,20 @@ def cut(image: Floats, uv: FloatArray, side: int, rows: bool = False) -> Floats:
 
     ``rows`` leaves out those rows that are not compared, for what moves along rows alone: (n, rows, side + 2).
     """
+    x, y = _offsets(side, rows)
+    if native.kernels is not None:
+        values: Floats = native.kernels.cut_patches(image, uv, np.stack([x.ravel(), y.ravel()], axis=1))
+    else:
+        at = uv.astype(np.float32)
+        values = sample(image, at[:, :1] + x.ravel(), at[:, 1:] + y.ravel())
+    return values.reshape(-1, *x.shape)
+
+
+def _offsets(side: int, rows: bool) -> tuple[Floats, Floats]:
     half = side // 2 + 1
     along = np.arange(-half, half + 1, dtype=np.float32)
     x, y = np.meshgrid(along, along[1:-1:_STRIDE] if rows else along)
-    at = uv.astype(np.float32)
-    values = sample(image, at[:, :1] + x.ravel(), at[:, 1:] + y.ravel())
-    return values.reshape(-1, *x.shape)
+    return x, y
 
 
 @dataclass(frozen=True)
@@ -154,11 +163,34 @@ def align(
         bend: (n, 2) g, 1/px; None for 0.
         iterations: most steps.
     """
+    k, p, w = templates.hessian.shape[1], grid(templates.side), window(templates.side)
+    # A patch without texture has no Hessian to speak of; what it is given moves it by nothing.
+    inverse = inverses(templates.hessian + _LEAST_HESSIAN * np.eye(k))
+    if native.kernels is not None:
+        of = templates.weighted, templates.std, templates.jacobian, inverse, p, w
+        bends = np.empty(0) if bend is None else bend
+        limits = iterations, _STEP_PX, _FARTHEST_PX
+        place, a, correlation, left = native.kernels.align_patches(image, of, uv, affine, bends, limits)
+    else:
+        place, a, correlation, left = _align(templates, inverse, image, (uv, affine, bend), iterations)
+    # As many independent values as pixels under the window.
+    independent = 1.0 / float((w * w).sum())
+    covariance = inverse * (left / independent)[:, None, None]
+    return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance)
+
+
+def _align(
+    templates: Templates,
+    inverse: FloatArray,
+    image: Floats,
+    start: tuple[FloatArray, FloatArray, FloatArray | None],
+    iterations: int,
+) -> tuple[FloatArray, ...]:
+    """Return places (n, 2), A, correlations and variances that are left: what the kernels do, from uv, A and g."""
+    uv, affine, bend = start
     n, k = len(templates), templates.hessian.shape[1]
     p, w = grid(templates.side), window(templates.side)
     place, a = uv.astype(np.float64).copy(), affine.astype(np.float64).copy()
-    # A patch without texture has no Hessian to speak of; what it is given moves it by nothing.
-    inverse = inverses(templates.hessian + _LEAST_HESSIAN * np.eye(k))
     correlation, left = np.zeros(n), np.full(n, np.inf)
     depth = None if bend is None else 1.0 / (1.0 + bend.astype(np.float32) @ p.T)
     rows = np.arange(n)
@@ -183,10 +215,7 @@ def align(
         if going.mean() < _MANY:
             rows, compared, std, back = (one[going] for one in (rows, compared, std, back))
             depth = None if depth is None else depth[going]
-    # As many independent values as pixels under the window.
-    independent = 1.0 / float((w * w).sum())
-    covariance = inverse * (left / independent)[:, None, None]
-    return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance)
+    return place, a, correlation, left
 
 
 def inverses(matrices: FloatArray) -> FloatArray:
@@ -207,11 +236,11 @@ def _at(image: Floats, place: FloatArray, a: FloatArray, p: Floats, depth: Float
 def _move(place: FloatArray, a: FloatArray, rows: NDArray[np.intp], e: FloatArray) -> None:
     """Compose warps with p - B e."""
     if e.shape[1] == 2:
-        e = e * np.minimum(1.0, 3.0 / np.maximum(np.linalg.norm(e, axis=1), 1e-9))[:, None]
+        e = e * np.minimum(1.0, _FARTHEST_PX / np.maximum(np.linalg.norm(e, axis=1), 1e-9))[:, None]
         place[rows] -= np.matmul(a[rows], e[:, :, None])[:, :, 0]
         return
     along = a[rows, 0, 0]
-    e = e * np.minimum(1.0, 3.0 / np.maximum(np.abs(e[:, 0]), 1e-9))[:, None]
+    e = e * np.minimum(1.0, _FARTHEST_PX / np.maximum(np.abs(e[:, 0]), 1e-9))[:, None]
     place[rows, 0] -= along * e[:, 0]
     a[rows, 0, 0] -= along * e[:, 1]
     a[rows, 0, 1] -= along * e[:, 2]

@@ -22,7 +22,7 @@ from ba_node.front_end import features, patches, pose
 from ba_node.front_end.alignment import Pair, StereoAlignment
 from ba_node.front_end.covariance import Lengths
 from ba_node.front_end.depths import Depths, measure_depths
-from ba_node.front_end.frame import Frame
+from ba_node.front_end.frame import Frame, inside
 from ba_node.front_end.local_map import LocalMap, Warp
 from ba_node.front_end.odometry import Step, step_of
 from ba_node.front_end.rectify import IdealRig
@@ -100,11 +100,9 @@ class Tracker:
             before = self.map.warp(self.rows, self.pose, self.scene_inverse_depth).uv
             first = self.uv + np.nan_to_num(first - before)
         uv, found = features.follow(self.frame.grey, frame.grey, self.uv, first)
-        inside = np.zeros(len(uv), bool)
-        at = np.round(uv[found]).astype(int)
-        inside[found] = frame.allowed[at[:, 1], at[:, 0]]
-        self.rows, self.uv, self.frame = self.rows[inside], uv[inside], frame
-        return inside
+        found &= inside(frame.allowed, uv)
+        self.rows, self.uv, self.frame = self.rows[found], uv[found], frame
+        return found
 
     def locate(self) -> Found | None:
         """Find the pose by the features that are followed now, and let go those that do not agree with it."""
@@ -304,8 +302,9 @@ class Tracker:
         sigma = np.hypot(sigma, self._floor_px(frame))
         height, width = frame.grey.shape
         half = self.side // 3
-        inside = (found.uv >= half).all(axis=1) & (found.uv <= [width - 1 - half, height - 1 - half]).all(axis=1)
-        good = inside & (found.correlation > least) & (np.linalg.norm(found.uv - uv, axis=1) < near_px)
+        good = (found.uv >= half).all(axis=1) & (found.uv <= [width - 1 - half, height - 1 - half]).all(axis=1)
+        good &= (found.correlation > least) & (np.linalg.norm(found.uv - uv, axis=1) < near_px)
+        good &= inside(frame.allowed, found.uv)
         return found.uv, sigma, good
 
     def _floor_px(self, frame: Frame) -> float:
@@ -366,8 +365,7 @@ class Tracker:
         )
         rows_of = np.flatnonzero(good)
         rows_of = rows_of[np.argsort(-self.map.last_seen[rows[rows_of]], kind="stable")[:_LOOKED_FOR]]
-        at = np.round(warp.uv[rows_of]).astype(int)
-        rows_of = rows_of[frame.allowed[at[:, 1], at[:, 0]]]
+        rows_of = rows_of[inside(frame.allowed, warp.uv[rows_of])]
         rows, warp = rows[rows_of], take_rows(warp, rows_of)
         uv, sigma, good = self._aligned(frame, rows, warp.uv, warp, _SAME_AGAIN, _AGAIN_PX)
         if not good.any():

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 class State(Protocol):
@@ -325,3 +326,20 @@ def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, fl
 
 def numbers(text: bytes) -> Doubles | None:
     """Return the numbers between white space, None where something is no finite number as C++ reads them."""
+
+def cut_patches(image: Floats, uv: Doubles, offsets: Floats) -> Floats:
+    """Return what front_end.patches.sample does at uv (n, 2) by offsets (m, 2): (n, m)."""
+
+def align_patches(
+    image: Floats,
+    templates: tuple[Floats, Floats, Floats, Doubles, Floats, Floats],
+    uv: Doubles,
+    affine: Doubles,
+    bend: Doubles,
+    limits: tuple[int, float, float],
+) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+    """Return what front_end.patches._align does: place, A, correlation, and the variance that is left unexplained.
+
+    templates: weighted, std, jacobian, inverse Hessian, grid and window; bend may be empty; limits: iterations, the
+    step that ends them and the longest one, px.
+    """

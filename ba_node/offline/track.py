@@ -97,6 +97,7 @@ class _Run:
         self.measurements: list[tuple[int, Measurement]] = []
         self.states: Counter[str] = Counter()
         self.busy_s = 0.0
+        self.scale_from = ""  # what lengths are those of
         self._clock = clock
         self._front_end: FrontEnd | None = None
         self._backend = Backend(request.config)
@@ -120,6 +121,8 @@ class _Run:
         front_end = self._front_end or self._begin(images)
         tracked = front_end.process(images, odometry)
         self.busy_s += self._clock() - began
+        if tracked.keyframe is not None and not self.scale_from:
+            self.scale_from = _scale_of(images, odometry)
         self.stamps.append(images.stamp_ns)
         self.states[tracked.state.value] += 1
         self.notes += [note for note in tracked.notes if note not in self.notes]
@@ -169,6 +172,7 @@ class _Run:
         learned = None if turn is None or len(self.rig) < 2 else [*turn[0].tolist(), *turn[1].tolist()]
         return {
             "mode": self.source.mode,
+            "scale_from": self.scale_from,
             "images": len(self.stamps),
             "keyframes": len(self.keyframes),
             "sessions": len({one.session_id for one in self.keyframes}),
@@ -181,6 +185,15 @@ class _Run:
             "causes": front_end.counts,
             "notes": self.notes,
         }
+
+
+def _scale_of(images: Images, odometry: Transform | None) -> str:
+    """Return in words what the lengths of a map of such images are those of."""
+    if len(images.grey) > 1:
+        return "the baseline of the cameras"
+    if images.depth_m is not None:
+        return "measured depths"
+    return "the first step, 1 long" if odometry is None else "the odometry: one camera cannot tell whether it is right"
 
 
 def _left_out(source: ImageSource) -> str:

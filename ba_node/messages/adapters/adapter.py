@@ -26,6 +26,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.core import cameras, geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.messages.adapters.misread import misread
 from ba_node.messages.adapters.sources import Extrinsic, Features, LayoutError, Pose, Source, mismatch
 
 # Images that wait for their pose or for the rig, and poses that wait for their image.
@@ -227,6 +228,9 @@ class Adapter:
             if len(self._frames) > MAX_WAITING:
                 del self._frames[0]
                 self.leave("no_rig", _NO_RIG)
+            return
+        if wrong := misread(pose, features, self.rig):
+            self.leave("misread", wrong)
             return
         if self._is_anew(pose, features):
             self.notes["begun_anew"] = f"track ids are those of other points from {pose.stamp_ns} ns on: a new session"

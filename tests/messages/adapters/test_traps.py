@@ -198,3 +198,35 @@ def test_a_source_that_begins_anew_while_its_clock_goes_on(source: str) -> None:
     assert made.notes["begun_anew"].endswith("a new session")
     assert made.summary().endswith("in 2 sessions")
     assert "begun_anew" not in feed(source, getattr(layouts, source)(data, **options))[0].notes
+
+
+def _w_first(message: Any, _: int) -> None:
+    turn = message.pose.pose.orientation
+    turn.x, turn.y, turn.z, turn.w = turn.w, turn.x, turn.y, turn.z
+
+
+def _inverted(message: Any, _: int) -> None:
+    turn, at = message.pose.pose.orientation, message.pose.pose.position
+    back = geometry.matrix_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w])).T
+    turn.x, turn.y, turn.z = -turn.x, -turn.y, -turn.z
+    at.x, at.y, at.z = (float(v) for v in -back @ np.array([at.x, at.y, at.z]))
+
+
+@pytest.mark.parametrize("source", ["openvins", "vins_fusion"])
+@pytest.mark.parametrize(
+    ("spoil", "end", "words"),
+    [
+        (_w_first, "_pose", "the poses (fixed frame from body) have quaternions with w first"),
+        # The quaternion of an optical frame is the same with w first.
+        (_w_first, "", "the poses (fixed frame from body) have quaternions with w first: put x, y, z, w into them"),
+        (_inverted, "extrinsic", "the extrinsics (body from camera) "),
+    ],
+)
+def test_poses_that_are_written_otherwise_are_named(
+    source: str, spoil: Callable[[Any, int], None], end: str, words: str
+) -> None:
+    """By the points, which a source tells with the pixels that show them; nothing is taken for what it is not."""
+    made, out = feed(source, changed(source, ODOMETRY, spoil, end))
+    assert not of(Keyframe, out)
+    assert made.counted["misread"] >= 2
+    assert words in made.notes["misread"], made.notes["misread"]

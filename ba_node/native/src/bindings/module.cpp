@@ -357,6 +357,7 @@ PYBIND11_MODULE(_kernels, m) {
   ba::bind_sparse_factor(m);
   ba::bind_relative_poses(m);
   ba::bind_window(m);
+  ba::bind_patches(m);
   m.def("targets", &ba::target_names);
   m.def("target", [] { return ba::target->name; });
   m.def("use_target", &ba::use_target);

@@ -1,0 +1,60 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+#include "front_end/patches.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <tuple>
+
+#include "bindings/arrays.hpp"
+#include "bindings/window.hpp"
+
+namespace ba {
+
+namespace {
+
+using Floats = Array<float>;
+
+ImageView view_of(const Floats& image) { return {image.data(), image.shape(0), image.shape(1)}; }
+
+Floats cut(const Floats& image, const Doubles& uv, const Floats& offsets) {
+  const py::ssize_t n = uv.shape(0), m = offsets.shape(0);
+  Floats values({n, m});
+  float* out = values.mutable_data();
+  without_gil([&] { cut_patches(view_of(image), uv.data(), n, offsets.data(), m, out); });
+  return values;
+}
+
+// templates: weighted, std, jacobian, inverse, grid and window; bend may be empty; limits as AlignLimits.
+py::tuple align(const Floats& image, const std::tuple<Floats, Floats, Floats, Doubles, Floats, Floats>& templates,
+                const Doubles& uv, const Doubles& affine, const Doubles& bend,
+                const std::tuple<int, double, double>& limits) {
+  const auto& [weighted, std, jacobian, inverse, grid, window] = templates;
+  const auto& [iterations, step_px, farthest_px] = limits;
+  const py::ssize_t n = uv.shape(0);
+  Doubles place({n, py::ssize_t{2}}), shape({n, py::ssize_t{2}, py::ssize_t{2}}), correlation({n}), left({n});
+  std::copy_n(uv.data(), 2 * n, place.mutable_data());
+  std::copy_n(affine.data(), 4 * n, shape.mutable_data());
+  std::fill_n(correlation.mutable_data(), n, 0.0);
+  std::fill_n(left.mutable_data(), n, std::numeric_limits<double>::infinity());
+  const TemplatesView view{
+      n,           jacobian.shape(1), window.size(), weighted.data(), std.data(), jacobian.data(), inverse.data(),
+      grid.data(), window.data()};
+  const PlacesSpan to{place.mutable_data(), shape.mutable_data(), correlation.mutable_data(), left.mutable_data()};
+  const double* bends = bend.size() ? bend.data() : nullptr;
+  without_gil([&] {
+    Aligner aligner(view_of(image), view, {iterations, step_px, farthest_px});
+    for (std::int64_t i = 0; i < n; ++i) aligner.align(i, bends, to);
+  });
+  return py::make_tuple(place, shape, correlation, left);
+}
+
+}  // namespace
+
+void bind_patches(py::module_& m) {
+  m.def("cut_patches", &cut);
+  m.def("align_patches", &align);
+}
+
+}  // namespace ba

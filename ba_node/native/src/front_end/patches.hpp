@@ -1,0 +1,178 @@
+// Copyright 2026 The ba_node Authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Patches of images: cut, and aligned with another image. front_end/patches.py has the equations, and is this file's
+// oracle.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+namespace ba {
+
+// Grey values (height, width).
+struct ImageView {
+  const float* at;
+  std::int64_t height, width;
+};
+
+// As patches.Templates, with the inverse of its Hessian; pixels are those that are compared, values in each of n.
+struct TemplatesView {
+  std::int64_t n, movements, pixels;
+  const float *weighted, *std, *jacobian;
+  const double* inverse;
+  const float *grid, *window;
+};
+
+// Where templates are: (n, 2) px, (n, 2, 2), and how they look there.
+struct PlacesSpan {
+  double *place, *affine, *correlation, *left;
+};
+
+struct AlignLimits {
+  int iterations;
+  double step_px, farthest_px;
+};
+
+// Values between pixels, at places that are set first; beyond the border as at the border. Images have two rows and
+// columns at least.
+class Sampler {
+ public:
+  Sampler(const ImageView& image, std::int64_t n) : image_(image), n_(n), x_(n), y_(n), column_(n), row_(n) {}
+
+  float* x() { return x_.data(); }
+  float* y() { return y_.data(); }
+
+  void sample(float* out) {
+    split(x_.data(), image_.width, column_.data());
+    split(y_.data(), image_.height, row_.data());
+    const float *right = x_.data(), *down = y_.data();
+    for (std::int64_t j = 0; j < n_; ++j) {
+      const float* above = image_.at + row_[j] * image_.width + column_[j];
+      const float* below = above + image_.width;
+      const float upper = above[0] + right[j] * (above[1] - above[0]);
+      const float lower = below[0] + right[j] * (below[1] - below[0]);
+      out[j] = upper + down[j] * (lower - upper);
+    }
+  }
+
+ private:
+  // Takes coordinates apart into a pixel that has a neighbour and the way from it, which stays in their place.
+  void split(float* at, std::int64_t size, std::int32_t* pixel) const {
+    const auto last = static_cast<float>(size - 1), last_but_one = static_cast<float>(size - 2);
+    for (std::int64_t j = 0; j < n_; ++j) {
+      const float inside = at[j] > 0.0F ? std::min(at[j], last) : 0.0F;
+      const float whole = std::min(static_cast<float>(static_cast<std::int32_t>(inside)), last_but_one);
+      pixel[j] = static_cast<std::int32_t>(whole);
+      at[j] = inside - whole;
+    }
+  }
+
+  ImageView image_;
+  std::int64_t n_;
+  std::vector<float> x_, y_;
+  std::vector<std::int32_t> column_, row_;
+};
+
+// Values at uv (n, 2) by offsets (m, 2).
+inline void cut_patches(const ImageView& image, const double* uv, std::int64_t n, const float* offsets, std::int64_t m,
+                        float* out) {
+  Sampler sampler(image, m);
+  for (std::int64_t i = 0; i < n; ++i, out += m) {
+    const auto u = static_cast<float>(uv[2 * i]), v = static_cast<float>(uv[2 * i + 1]);
+    float *x = sampler.x(), *y = sampler.y();
+    for (std::int64_t j = 0; j < m; ++j) {
+      x[j] = u + offsets[2 * j];
+      y[j] = v + offsets[2 * j + 1];
+    }
+    sampler.sample(out);
+  }
+}
+
+// Aligns one template after another; bend (n, 2) may be null.
+class Aligner {
+ public:
+  Aligner(const ImageView& image, const TemplatesView& templates, const AlignLimits& limits)
+      : sampler_(image, templates.pixels),
+        templates_(templates),
+        limits_(limits),
+        seen_(static_cast<std::size_t>(templates.pixels)) {}
+
+  void align(std::int64_t i, const double* bend, const PlacesSpan& to) {
+    const std::int64_t k = templates_.movements;
+    double *place = to.place + 2 * i, *affine = to.affine + 4 * i;
+    const double std = templates_.std[i];
+    for (int step = 0; step < limits_.iterations; ++step) {
+      const float spread = look(place, affine, bend == nullptr ? nullptr : bend + 2 * i);
+      const double agree =
+          product(templates_.weighted + i * templates_.pixels) / spread / std::max(templates_.std[i], 1e-6F);
+      std::array<double, 3> right{}, move{};
+      for (std::int64_t r = 0; r < k; ++r)
+        right[r] = product(templates_.jacobian + (i * k + r) * templates_.pixels) * (std / spread);
+      for (std::int64_t r = 0; r < k; ++r)
+        for (std::int64_t c = 0; c < k; ++c) move[r] += templates_.inverse[(i * k + r) * k + c] * right[c];
+      to.correlation[i] = agree;
+      to.left[i] = 2.0 * std * std * std::max(1.0 - agree, 0.0);
+      const double length = k == 2 ? std::hypot(move[0], move[1]) : std::abs(move[0]);
+      const double share = std::min(1.0, limits_.farthest_px / std::max(length, 1e-9));
+      for (double& each : move) each *= share;
+      if (k == 2) {
+        place[0] -= affine[0] * move[0] + affine[1] * move[1];
+        place[1] -= affine[2] * move[0] + affine[3] * move[1];
+      } else {
+        const double along = affine[0];
+        place[0] -= along * move[0];
+        affine[0] -= along * move[1];
+        affine[1] -= along * move[2];
+      }
+      if (!(length > limits_.step_px) || !std::isfinite(length)) break;
+    }
+  }
+
+ private:
+  // Looks at the image where a template is, as differences from the mean; returns how far they spread.
+  float look(const double* place, const double* affine, const double* bend) {
+    const std::int64_t n = templates_.pixels;
+    const auto u = static_cast<float>(place[0]), v = static_cast<float>(place[1]);
+    const auto xx = static_cast<float>(affine[0]), xy = static_cast<float>(affine[1]);
+    const auto yx = static_cast<float>(affine[2]), yy = static_cast<float>(affine[3]);
+    const float gx = bend == nullptr ? 0.0F : static_cast<float>(bend[0]);
+    const float gy = bend == nullptr ? 0.0F : static_cast<float>(bend[1]);
+    const float *p = templates_.grid, *w = templates_.window;
+    float *s = seen_.data(), *to_x = sampler_.x(), *to_y = sampler_.y();
+    for (std::int64_t j = 0; j < n; ++j) {
+      const float x = p[2 * j], y = p[2 * j + 1], depth = 1.0F / (1.0F + gx * x + gy * y);
+      to_x[j] = u + (xx * x + xy * y) * depth;
+      to_y[j] = v + (yx * x + yy * y) * depth;
+    }
+    sampler_.sample(s);
+    const float mean = product(w);
+    for (std::int64_t j = 0; j < n; ++j) s[j] -= mean;
+    std::array<float, 4> sums{};
+    for (std::int64_t j = 0; j < n; ++j) sums[j % 4] += s[j] * s[j] * w[j];
+    const float square = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+    return std::sqrt(std::max(square, 1e-6F));
+  }
+
+  // In four sums, so that none waits for another.
+  float product(const float* a) const {
+    const float* s = seen_.data();
+    std::array<float, 4> sums{};
+    std::int64_t j = 0;
+    for (; j + 4 <= templates_.pixels; j += 4)
+      for (std::int64_t lane = 0; lane < 4; ++lane) sums[lane] += a[j + lane] * s[j + lane];
+    for (; j < templates_.pixels; ++j) sums[0] += a[j] * s[j];
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+  }
+
+  Sampler sampler_;
+  TemplatesView templates_;
+  AlignLimits limits_;
+  std::vector<float> seen_;
+};
+
+}  // namespace ba

@@ -1,0 +1,110 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Patches are cut and aligned alike in C++ and numpy, and both find how a picture was moved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from ba_node import native
+from ba_node.front_end import patches
+from ba_node.front_end.frame import soften
+
+SIDE, COUNT = 21, 60
+# The finest step of OpenCV's interpolation, px.
+_OF_OPENCV_PX = 1.0 / 32.0
+
+
+@pytest.fixture
+def picture() -> Any:
+    noise = np.random.default_rng(4).normal(size=(200, 300)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.clip(128.0 + 60.0 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def places() -> Any:
+    return np.random.default_rng(5).uniform([30.0, 30.0], [270.0, 170.0], (COUNT, 2))
+
+
+def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "kernels", None)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+@pytest.mark.parametrize("rows", [False, True])
+def test_both_cut_the_same(picture: Any, rows: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the border too, where values are those of the border."""
+    soft = soften(picture)
+    at = np.concatenate([places(), [[0.0, 0.0], [299.0, 199.0], [-5.0, 100.0], [2.5, 198.5]]])
+    ours = patches.cut(soft, at, SIDE, rows)
+    without_kernels(monkeypatch)
+    theirs = patches.cut(soft, at, SIDE, rows)
+    assert ours.shape == theirs.shape == (COUNT + 4, 11 if rows else SIDE + 2, SIDE + 2)
+    steepest = sum(np.abs(np.diff(soft, axis=axis)).max() for axis in (0, 1))
+    assert np.abs(ours - theirs).max() < _OF_OPENCV_PX * steepest
+    assert np.abs((ours - theirs).mean()) < 0.01
+
+
+@pytest.mark.parametrize("basis", ["place", "row"])
+@pytest.mark.parametrize("bent", [False, True])
+@pytest.mark.parametrize("kernels", ["native", "numpy"])
+def test_a_moved_picture_is_found(
+    picture: Any, basis: str, bent: bool, kernels: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Moved by parts of a pixel, brighter and of less contrast: the same by both, to what OpenCV rounds."""
+    if kernels == "native" and native.kernels is None:
+        pytest.skip("needs the C++ kernels")
+    moved = np.array([0.37, 0.0 if basis == "row" else -0.61])
+    shift = np.array([[1.0, 0.0, moved[0]], [0.0, 1.0, moved[1]]])
+    there = cv2.warpAffine(picture.astype(np.float32), shift, (300, 200), flags=cv2.INTER_LANCZOS4)
+    image = soften(np.clip(0.8 * there + 20.0, 0, 255).astype(np.uint8))
+    at = places()
+    if kernels == "numpy":
+        without_kernels(monkeypatch)
+    templates = patches.Templates.of(patches.cut(soften(picture), at, SIDE, rows=basis == "row"), basis)
+    start = np.tile(np.eye(2), (COUNT, 1, 1))
+    bend = np.full((COUNT, 2), 1e-4) if bent else None
+    found = patches.align(templates, image, at + np.array([0.9, 0.0]), start, bend)
+    good = found.correlation > 0.9
+    assert good.mean() > 0.9
+    off = (found.uv - at - moved)[good]
+    assert np.abs(np.median(off, axis=0)).max() < 0.02, np.median(off, axis=0)
+    assert np.median(np.abs(off)) < 0.03
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+def test_both_find_the_same(picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = cv2.warpAffine(picture, np.array([[1.01, 0.0, 0.3], [0.0, 0.99, -0.4]]), (300, 200))
+    cut = patches.cut(soften(picture), places(), SIDE)
+    templates, start = patches.Templates.of(cut, "place"), np.tile(np.eye(2), (COUNT, 1, 1))
+    first = places() * [1.01, 0.99] + [0.8, 0.1]
+    ours = patches.align(templates, soften(there), first, start)
+    without_kernels(monkeypatch)
+    theirs = patches.align(templates, soften(there), first, start)
+    good = theirs.correlation > 0.9
+    assert good.mean() > 0.9
+    assert np.abs(ours.uv - theirs.uv)[good].max() < 0.03
+    assert np.median(np.abs(ours.uv - theirs.uv)[good]) < 0.5 * _OF_OPENCV_PX
+    assert np.abs(ours.correlation - theirs.correlation)[good].max() < 0.01
+    assert np.allclose(ours.covariance[good], theirs.covariance[good], rtol=0.3)
+
+
+@pytest.mark.parametrize("kernels", ["native", "numpy"])
+def test_what_has_no_texture_or_lies_nowhere_is_not_found(
+    picture: Any, kernels: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kernels == "native" and native.kernels is None:
+        pytest.skip("needs the C++ kernels")
+    if kernels == "numpy":
+        without_kernels(monkeypatch)
+    at = np.array([[50.0, 50.0], [np.nan, 20.0], [1e9, -1e9]])
+    plain = patches.Templates.of(np.full((3, SIDE + 2, SIDE + 2), 7.0, np.float32), "place")
+    found = patches.align(plain, soften(picture), at, np.tile(np.eye(2), (3, 1, 1)))
+    assert not (found.correlation > 0.5).any()
+    none = patches.align(patches.Templates.of(np.empty((0, SIDE + 2, SIDE + 2), np.float32), "place"),
+                         soften(picture), np.empty((0, 2)), np.empty((0, 2, 2)))  # fmt: skip
+    assert none.uv.shape == (0, 2)
