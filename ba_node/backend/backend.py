@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterable, Iterator
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.summary import MapEnded
+from ba_node.backend.worse import wrong_at_the_end
 from ba_node.check.departure import departed
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
@@ -250,15 +251,14 @@ class Backend:
         while self.ready:
             if (estimate := self.solve()) is not None:
                 yield estimate
-        undone = self.take_check(departed(self.scene, final=True))
-        last = undone if self.setup.reason(self.scene) else self.adjust(final=True)
-        if last is not None:
+        undone = self.take_check(wrong_at_the_end(self.scene, self.config))
+        if (last := undone if self.setup.reason(self.scene) else self.adjust(final=True)) is not None:
             yield last
 
     def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
         if self.completes(admitted) and (estimate := self.solve()) is not None:
             yield estimate
-        if admitted.begins is not None and (undone := self.take_check(departed(self.scene, final=True))):
+        if admitted.begins is not None and (undone := self.take_check(wrong_at_the_end(self.scene, self.config))):
             yield undone
         before = self.map
         self.take(admitted)
@@ -332,7 +332,7 @@ class Backend:
         statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
-        undone = self.take_check(departed(self.scene, final=True))
+        undone = self.take_check(wrong_at_the_end(self.scene, self.config))
         return undone or self.map.with_covariances(self.estimate(), taken), followed
 
     def reset(self) -> None:

@@ -1,0 +1,45 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ask of a young map at its end whether it explains what was observed worse than what came in: then that stands.
+
+Each solve is tried against the front-end's poses on some tracks of its window (``window/guard.py``). What is lost from
+one window to the next, or in keyframes that were left out, shows in all observations alone.
+"""
+
+from __future__ import annotations
+
+from ba_node.check.departure import departed
+from ba_node.check.diagnosis import Diagnosis, Finding
+from ba_node.check.watch import Check
+from ba_node.config import Config
+from ba_node.scene.scene import Scene
+from ba_node.window import quality
+
+# Keyframes up to which a map is young. It is worse if its rms, in which no residual counts for more than 20 px, is
+# higher by this share and by so much, px.
+_YOUNG = 120
+_SHARE, _SLACK_PX = 0.05, 0.05
+
+
+def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
+    """Return what is wrong with a young map as a whole when no more will come, None if nothing is."""
+    return departed(scene, final=True) or explains_worse(scene, config)
+
+
+def explains_worse(scene: Scene, config: Config) -> Check | None:
+    """Return what is wrong if a young map explains its observations worse than what came in; None if it does not.
+
+    Nothing is asked where something absolute places the map: images may have to give way to that.
+    """
+    known = scene.constraints
+    if len(scene.keyframes) > _YOUNG or known.absolute or known.landmarks or not scene.keyframes.refined.any():
+        return None
+    before, after = (quality.summary(scene, config, state)["bounded_px"] for state in ("input", "refined"))
+    if before is None or after is None or after <= (1.0 + _SHARE) * before + _SLACK_PX:
+        return None
+    held = scene.log.warnings.get("held", "")
+    evidence = f"rms with none above 20 px {before:.3g} -> {after:.3g} px{held and '; '}{held}"
+    cause = "the result explains the observations worse than what came in"
+    change = "what ba check names, track ids that are not of one point, or solver.* and tracks.* that were set"
+    found = Diagnosis([Finding((cause,), evidence, (change,))])
+    return Check(scene, lambda: found, found)

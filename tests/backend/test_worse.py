@@ -1,0 +1,36 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a map as a whole explains what was observed worse than what came in, what came in stands at the end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ba_node.backend import Backend
+from ba_node.backend.worse import explains_worse
+from ba_node.config import Config
+from ba_node.estimate import Estimate
+from experiments.robustness.faults import SOUND, spoiled
+
+
+def test_few_keyframes_at_their_optimum_that_windows_make_worse_are_kept() -> None:
+    recording = spoiled("optimal_map", "mono", seed=331, path="loop", noise_px=1.0, keyframes=8)
+    backend = Backend(Config())
+    events = [one for one in backend.replay(iter(recording.measurements)) if isinstance(one, Estimate)]
+    np.testing.assert_allclose(events[-1].trajectory.position, recording.odometry.position, atol=1e-9)
+    (line,) = (line for line in backend.report.warnings if "worse than what came in" in line)
+    assert "rms with none above 20 px 0.995 -> 1.7 px" in line
+
+
+@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
+def test_a_good_map_that_is_moved_aside_is_worse(rig: str) -> None:
+    recording = spoiled(SOUND, rig, seed=12, keyframes=12, length_m=10.0)
+    backend = Backend(Config())
+    for _ in backend.replay(iter(recording.measurements)):
+        pass
+    scene = backend.scene
+    assert explains_worse(scene, backend.config) is None and scene.keyframes.refined.all()
+    scene.keyframes.position[scene.order[::2], 2] += 0.3
+    check = explains_worse(scene, backend.config)
+    assert check is not None and check.found is not None and check.found.harmful
