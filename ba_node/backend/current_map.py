@@ -71,7 +71,7 @@ class Completion:
         newest = self.row(scene)
         if newest is not None and not self._complete(scene, newest):
             due[newest] = False
-        return np.flatnonzero(due)
+        return due.nonzero()[0]
 
     def _complete(self, scene: Scene, row: int) -> bool:
         if self.closed:

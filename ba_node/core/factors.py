@@ -179,15 +179,17 @@ class FactorSum:
     def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray, parameterisation: str = "local") -> None:
         """Find which free keyframes they couple; ``fixed`` is (n_kf,)."""
         self._factors, self._parameterisation = tuple(factors), parameterisation
-        self._free = np.flatnonzero(~fixed)
+        self._free = (~fixed).nonzero()[0]
         self._column = np.full(len(fixed), -1, np.intp)
         self._column[self._free] = np.arange(len(self._free))
         n = len(self._free)
         # Rotation and translation of the same steps are two kinds.
         ends = [kind.keyframes for kind in self._factors]
         keys = {id(one): self._keys(self._column[one], n) for one in {id(one): one for one in ends}.values()}
-        distinct = np.unique(np.concatenate([key.ravel() for key in keys.values()])) if keys else np.empty(0, np.intp)
+        distinct = np.concatenate([key.ravel() for key in keys.values()]) if keys else np.empty(0, np.intp)
         distinct = distinct[distinct >= 0]
+        if not (distinct[1:] > distinct[:-1]).all():  # those of consecutive keyframes rise
+            distinct = np.unique(distinct)
         self.rows, self.columns = np.divmod(distinct, max(n, 1))
         # By kind: (n, n_places) the pair that each two places of a factor belong to, -1 if one of them is fixed.
         pairs = {one: np.where(key >= 0, np.searchsorted(distinct, key), -1) for one, key in keys.items()}

@@ -14,7 +14,6 @@ A Snavely (BAL) camera is a body that looks down -z with one camera at ``Rc = di
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -41,7 +40,7 @@ class State:
 
     def is_finite(self) -> bool:
         """Return True if no number is NaN or infinite."""
-        return all(np.isfinite(getattr(self, f.name)).all() for f in dataclasses.fields(self))
+        return all(np.isfinite(array).all() for array in vars(self).values())
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,14 @@ Bad rows are dropped one by one, good rows stay. Everything that is dropped is c
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ba_node import native
-from ba_node.arrays import BoolArray, FloatArray, IdArray
+from ba_node.arrays import BoolArray, FloatArray, IdArray, changed
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Cameras
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
@@ -28,6 +29,7 @@ MAX_POSITION_M = 1e9
 MAX_GUESS_M = 1e12
 COARSE_M = 1e-3
 _MIN_QUATERNION_NORM = 1e-6
+_MAX_QUATERNION = 1e6
 # A distortion that folds over within this share of the way from the principal point to the border is no calibration.
 _FOLD_REFUSED = 0.5
 _STAMP = np.iinfo(np.int64)
@@ -97,7 +99,8 @@ def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -
 
 def _check_distance(name: str, frame_id: str, position: FloatArray, log: RejectionLog) -> None:
     """Warn where the cloud, as viewers take it, cannot tell points apart any more that the map can."""
-    step_m = float(np.spacing(np.abs(position).max().astype(np.float32)))
+    # That of float32 where double precision has its own.
+    step_m = math.ulp(max(map(abs, position.tolist()))) * 2.0**29
     if step_m > COARSE_M:
         text = (
             f"{name} is {np.linalg.norm(position):.0f} m from the origin of {frame_id!r}: points on ~/points are"
@@ -130,7 +133,7 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
     depth = np.array(tracks.depth_m, float) if len(tracks.depth_m) else np.full(n, np.nan)
     ids = np.asarray(tracks.track_id).astype(np.uint64)
     if _nothing_to_check(ids, uv, sigma, depth):
-        return dataclasses.replace(tracks, track_id=ids, uv=uv, sigma_px=sigma, depth_m=depth)
+        return changed(tracks, track_id=ids, uv=uv, sigma_px=sigma, depth_m=depth)
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & ~np.isinf(depth)
     with np.errstate(invalid="ignore"):
         near = (np.abs(uv) <= MAX_PIXEL).all(axis=1)
@@ -281,12 +284,10 @@ def _is_id_array(ids: NDArray[np.generic]) -> bool:
 
 
 def _within(values: FloatArray, limit: float) -> bool:
-    with np.errstate(invalid="ignore"):
-        return bool((np.abs(values) <= limit).all())
+    # Of a few numbers; no comparison holds for NaN.
+    return all(abs(value) <= limit for value in values.ravel().tolist())
 
 
 def is_rotation(quaternion: FloatArray) -> bool:
     """Return True for a quaternion that is finite and not zero."""
-    if not np.isfinite(quaternion).all() or np.abs(quaternion).max() > 1e6:
-        return False
-    return bool(np.linalg.norm(quaternion) > _MIN_QUATERNION_NORM)
+    return _within(quaternion, _MAX_QUATERNION) and math.hypot(*quaternion.tolist()) > _MIN_QUATERNION_NORM

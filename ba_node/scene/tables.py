@@ -84,6 +84,8 @@ class Table:
     def append(self, count: int, **values: object) -> IntArray:
         """Add rows at the end and return their numbers; room grows by doubling, so adding is O(1) a row."""
         begin, end = self._size, self._size + count
+        if not count:
+            return np.arange(begin, end)
         for name, column in self.COLUMNS.items():
             buffer = self._buffers[name]
             if end > len(buffer):
@@ -93,9 +95,9 @@ class Table:
             self._buffers[name][begin:end] = values.get(name, column.fill)
         self._size = end
         self._expose()
-        added = np.arange(begin, end)
-        self.changed(added)
-        return added
+        if self.COPIED:
+            self._mark(slice(begin // _PIECE, -(-end // _PIECE)))
+        return np.arange(begin, end)
 
     def keep(self, rows: BoolArray) -> IntArray:
         """Forget all rows but those marked, and return the new number of every old row, -1 for the forgotten."""
@@ -114,10 +116,7 @@ class Table:
         if isinstance(rows, slice):
             self._pieces, self._stale = [], np.ones(self._n_pieces, bool)
         elif len(rows):
-            missing = self._n_pieces - len(self._stale)
-            if missing > 0:
-                self._stale = np.append(self._stale, np.ones(missing, bool))
-            self._stale[np.asarray(rows) // _PIECE] = True
+            self._mark(np.asarray(rows) // _PIECE)
 
     def clone(self: _Table) -> _Table:
         """Return a table of its own with the same rows."""
@@ -137,6 +136,13 @@ class Table:
             self._pieces[k : k + 1] = [piece]
         self._stale[:] = False
         return Rows(tuple(self._pieces))
+
+    def _mark(self, pieces: IntArray | slice) -> None:
+        """Note that pieces are to be copied anew."""
+        missing = self._n_pieces - len(self._stale)
+        if missing > 0:
+            self._stale = np.append(self._stale, np.ones(missing, bool))
+        self._stale[pieces] = True
 
     @property
     def _n_pieces(self) -> int:

@@ -77,7 +77,8 @@ class Views:
 
     def seen_by(self, keyframes: IntArray) -> IntArray:
         """Return the landmarks that some keyframes see, by track id."""
-        blocks = np.array([b[1:] for row in keyframes.tolist() for b in self.blocks[row]], np.intp).reshape(-1, 2)
+        bounds = [bound for row in keyframes.tolist() for block in self.blocks[row] for bound in block[1:]]
+        blocks = np.array(bounds, np.intp).reshape(-1, 2)
         if native.kernels is None:
             landmarks = self.distinct(self.observations.landmark[ranges(*blocks.T)])
         else:

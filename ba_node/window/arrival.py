@@ -51,7 +51,7 @@ def strays(
     start, sigmas.
     """
     obs, new = problem.observations, ~scene.keyframes.refined[keyframes]
-    rows = np.flatnonzero(new.take(obs.keyframe))
+    rows = new.take(obs.keyframe).nonzero()[0]
     if config.tracks.outlier_px <= 0 or new.all() or not len(rows):
         return keyframes[:0]
     rows = rows[scene.landmarks.has_position[landmarks].take(obs.point[rows])]

@@ -25,8 +25,10 @@ _LEAST_POINTS = 10
 def cull(scene: Scene, config: Config) -> None:
     """Take redundant keyframes out that have left the window and were not looked at yet."""
     share, end = config.scene.redundant_share, len(scene.keyframes) - window_size(scene, config)
+    if share <= 0.0:
+        return
     first = max(1, int(np.searchsorted(scene.keyframes.stamp_ns[scene.order], scene.culled_ns, side="right")))
-    if share <= 0.0 or end - first < _TOGETHER:
+    if end - first < _TOGETHER:
         return
     candidates = scene.order[first:end]
     scene.culled_ns = int(scene.keyframes.stamp_ns[candidates[-1]])

@@ -51,7 +51,9 @@ def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
     has_tie = np.zeros(n_kf, bool)
     has_tie[:-1] |= tied
     has_tie[1:] |= tied
-    strong = has_tie | (np.bincount(obs.keyframe, minlength=n_kf) >= _ANCHOR_OBSERVATIONS)
+    strong = has_tie
+    if not strong.all():
+        strong = has_tie | (np.bincount(obs.keyframe, minlength=n_kf) >= _ANCHOR_OBSERVATIONS)
     parts = [part_of == part for part in (np.unique(part_of) if part_of.any() else (0,))]
     # To look for what shows the scale takes as long as all the rest; poses that are held and steps show it too.
     known = all((members & old).any() and (members & has_tie).any() for members in parts)

@@ -214,8 +214,8 @@ class _Compared:
     def of(cls, config: Config, selection: Selection, state: State, norms: FloatArray) -> _Compared:
         fixed = selection.problem.fixed
         # Keyframes of the problem are oldest first; those between which others are left out make one step too.
-        adjacent = np.diff(selection.place) <= 1 + len(selection.window)
-        first = np.flatnonzero(adjacent & ~(fixed[1:] & fixed[:-1]))
+        adjacent = selection.place[1:] - selection.place[:-1] <= 1 + len(selection.window)
+        first = (adjacent & ~(fixed[1:] & fixed[:-1])).nonzero()[0]
         second = first + 1
         poses = (state.rotation, state.translation), selection.measured
         return cls(selection, norms, config, first, second, steps.against(*poses, first, second, config.guard))

@@ -78,7 +78,7 @@ def _returned(selection: Selection, state: State, norms: FloatArray, gate: float
     """Return a state whose points that ran away are back where they began; their norms are written over."""
     whole, point = selection.whole, selection.observations.point
     doubted, agreeing, away, began, leapt = _doubted(selection, state, norms, gate, kernels)
-    rows = np.flatnonzero(doubted.take(point))
+    rows = doubted.take(point).nonzero()[0]
     if not len(rows):
         return state
     point = point.take(rows)
@@ -140,8 +140,7 @@ def _noticed_m(selection: Selection, position: FloatArray) -> float:
     ``position`` (n_kf, 3) is that of the keyframes, m.
     """
     cams, obs = selection.problem.cameras, selection.observations
-    spread = np.ptp(position, axis=0).max()
-    spread = max(float(spread), float(np.ptp(cams.translation, axis=0).max()))
+    spread = max(float((where.max(axis=0) - where.min(axis=0)).max()) for where in (position, cams.translation))
     return _NOTICED * spread * float(cams.params[0, 0]) / float(obs.sigma_px[0])
 
 
@@ -253,7 +252,7 @@ def _place_anew(
     point, n_points = whole.observations.point, whole.n_points
     good = np.bincount(point, ~outlier, n_points)
     doubted = 2 * good < np.bincount(point, minlength=n_points)
-    rows = np.flatnonzero(doubted.take(point))
+    rows = doubted.take(point).nonzero()[0]
     if not len(rows):
         return
     views = part_of(whole, rows, doubted)

@@ -66,7 +66,7 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
     if young or len(point) < _MANY * problem.n_keyframes:
         return np.zeros(problem.n_points, bool)
     off, found = _seem_to_move(problem, norms, unrefined, kernels)
-    rows = np.flatnonzero(found.take(point))
+    rows = found.take(point).nonzero()[0]
     if not len(rows):
         return found
     doubted = part_of(problem, rows, found)

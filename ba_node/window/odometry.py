@@ -73,7 +73,7 @@ class Steps:
 
     def factors(self, kept: BoolArray, loss_scale: float) -> tuple[RelativePoses, ...]:
         """Return the factors of some steps."""
-        pairs = np.stack([self.first, self.first + 1], axis=1)[kept]
+        pairs = self.first[kept, None] + np.arange(2)
         root = np.zeros((2, len(pairs), 6, 6))
         index = np.arange(3)
         root[0][:, index, index] = 1.0 / self.sigma_rad[kept, None]
@@ -95,18 +95,19 @@ def factors(
     keyframes: IntArray,
     turned: Turns | None = None,
     much_moves: bool = False,
+    tied: BoolArray | None = None,
 ) -> tuple[RelativePoses, ...]:
     """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
 
     ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
-    beside the front-end's; ``much_moves`` if a large share of what is seen does.
+    beside the front-end's; ``much_moves`` if a large share of what is seen does; ``tied`` is :func:`ties` if known.
     """
-    tied = np.flatnonzero(ties(scene, config, keyframes))
-    free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
+    first = (ties(scene, config, keyframes) if tied is None else tied).nonzero()[0]
+    free = ~(problem.fixed[first] & problem.fixed[first + 1])
     if not free.any():
         return ()
     many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= MANY_OBSERVATIONS
-    stated = _front_end(scene, config, keyframes, tied)
+    stated = _front_end(scene, config, keyframes, first)
     depths, windowed = len(problem.observations.depth_m) > 0, len(keyframes) <= _WINDOW
     much_moves = much_moves and not depths
     learned_from = [(many, 1.0)]
@@ -115,7 +116,7 @@ def factors(
     inflated = None if much_moves else _as_learned(scene, config, keyframes, learned_from, stated)
     steps = stated if inflated is None else inflated
     if turned is not None:
-        rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
+        rotation, sigma_rad = turned.between(keyframes, first, first + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
     few = not problem.has_scale and windowed and 2 * np.count_nonzero(many) < len(many)
@@ -162,7 +163,7 @@ def _as_learned(
         steps = changed(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
     table = scene.keyframes
     told = ((among & table.refined[keyframes], factor) for among, factor in sources)
-    steps_of = ((np.flatnonzero(sure[steps.first] & sure[steps.first + 1]), factor) for sure, factor in told)
+    steps_of = (((sure[steps.first] & sure[steps.first + 1]).nonzero()[0], factor) for sure, factor in told)
     rows, factor = next((one for one in steps_of if len(one[0]) >= _LEAST_STEPS), (steps.first[:0], 0.0))
     if not len(rows):
         return None

@@ -71,7 +71,7 @@ class Selection:
     @cached_property
     def used(self) -> IntArray:
         """Return which of all observations are in the problem, in its order."""
-        return np.flatnonzero(self.inlier)
+        return self.inlier.nonzero()[0]
 
     @cached_property
     def whole(self) -> Problem:
@@ -145,13 +145,14 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     held_out = np.zeros(len(part.landmarks), bool)
     held_out[aside] = True
     inlier = usable & ~held_out.take(obs.point)
-    active = some_observations(part.problem, np.flatnonzero(inlier))
-    held = gauge.choose(active, is_old, odometry.ties(scene, config.odometry, part.keyframes))
+    active = some_observations(part.problem, inlier.nonzero()[0])
+    tied = odometry.ties(scene, config.odometry, part.keyframes)
+    held = gauge.choose(active, is_old, tied)
     prior = None if known is None else known.factor(table.keyframe_id[part.keyframes], part.origin)
     if prior is not None:
         held = gauge.Gauge(is_old, np.full(len(is_old), -1))
     active = changed(active, fixed=held.fixed)
-    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves)
+    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves, tied)
     beside = constraints.factors(scene, config, active, part.keyframes, part.origin)
     factors = constraints.in_place(steps, beside)
     factors += () if prior is None else (prior,)
@@ -212,11 +213,11 @@ def _begun(scene: Scene, window: IntArray, config: Config, without: IntArray) ->
     norms = native_kernels.residual_norms(problem, start, kernels)
     of_new = new.take(problem.observations.point)
     points[new] = np.nan
-    rows = np.flatnonzero(of_new & part.heard)
+    rows = (of_new & part.heard).nonzero()[0]
     if len(rows):
         points[new] = _first_positions(scene, part, rows, (new, norms[part.heard & ~of_new]), config)
         at = changed(start, points=np.where(np.isnan(points), 0.0, points))
-        rows = np.flatnonzero(of_new)
+        rows = of_new.nonzero()[0]
         norms[rows] = native_kernels.residual_norms(problem, at, kernels, rows)
     return changed(part, problem=changed(problem, start=start)), norms
 
@@ -278,7 +279,7 @@ def _views_needed(scene: Scene, window: IntArray, n_fixed: int) -> int | None:
     """
     if not len(window) or window[-1] != scene.order[-1]:
         return None  # newer keyframes wait behind the window
-    images = max(len(scene.blocks[row]) for row in window)
+    images = max(len(scene.blocks[row]) for row in window.tolist())
     return _SPARE * images * (len(window) + n_fixed)
 
 
@@ -372,7 +373,7 @@ def _contradicted(scene: Scene, part: _Part, usable: BoolArray) -> IntArray:
     obs, n = part.problem.observations, len(part.landmarks)
     doubted = np.zeros(n, bool)
     doubted[obs.point[part.heard & ~usable]] = True
-    rows = np.flatnonzero(doubted.take(obs.point))
+    rows = doubted.take(obs.point).nonzero()[0]
     if not len(rows):
         return part.landmarks[:0]
     point = obs.point[rows]
