@@ -76,11 +76,14 @@ py::tuple steps_against(const std::array<Doubles, 4>& poses, const std::pair<Int
 // Of each camera, how many of its observations have a residual up to a gate, and how many there are.
 py::tuple agreeing_by_camera(const Ints& camera, const Doubles& norms, double gate, py::ssize_t n_cameras) {
   Ints agreeing({n_cameras}), every({n_cameras});
-  std::fill_n(agreeing.mutable_data(), n_cameras, 0);
-  std::fill_n(every.mutable_data(), n_cameras, 0);
+  std::int64_t *to_agreeing = agreeing.mutable_data(), *to_every = every.mutable_data();
+  const std::int64_t* of = camera.data();
+  const double* norm = norms.data();
+  std::fill_n(to_agreeing, n_cameras, 0);
+  std::fill_n(to_every, n_cameras, 0);
   for (py::ssize_t o = 0; o < norms.size(); ++o) {
-    ++every.mutable_data()[camera.data()[o]];
-    agreeing.mutable_data()[camera.data()[o]] += norms.data()[o] <= gate;
+    ++to_every[of[o]];
+    to_agreeing[of[o]] += norm[o] <= gate;
   }
   return py::make_tuple(agreeing, every);
 }
