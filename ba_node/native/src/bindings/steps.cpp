@@ -10,6 +10,7 @@
 #include <functional>
 #include <tuple>
 #include <utility>
+#include <vector>
 
 #include "bindings/arrays.hpp"
 #include "bindings/window.hpp"
@@ -93,6 +94,21 @@ std::pair<double, double> medians_off_of(const Steps& steps, const Steps& others
   return medians_off(view_of(steps), view_of(others), sigma_rad.data(), sigma_m.data());
 }
 
+// The places of some points in a column that ascends, one point after the other, and which of them each is of.
+py::tuple rows_of_points(const Ints& point, const Ints& wanted) {
+  std::vector<std::int64_t> rows, which;
+  for (py::ssize_t k = 0; k < wanted.size(); ++k) {
+    const std::int64_t *begin = point.data(), *end = begin + point.size();
+    const auto [first, last] = std::equal_range(begin, end, wanted.data()[k]);
+    for (const std::int64_t* at = first; at != last; ++at) rows.push_back(at - begin);
+    which.resize(rows.size(), k);
+  }
+  const auto taken = [](const std::vector<std::int64_t>& from) {
+    return Ints(static_cast<py::ssize_t>(from.size()), from.data());
+  };
+  return py::make_tuple(taken(rows), taken(which));
+}
+
 // Of two images, how many ids they share, and how many of these have the same pixel; None unless the ids of both rise.
 py::object shared_pixels(const std::pair<Array<std::uint64_t>, Array<std::uint64_t>>& ids,
                          const std::pair<Doubles, Doubles>& uv) {
@@ -124,6 +140,7 @@ void bind_steps(py::module_& m) {
   m.def("steps_against", &steps_against);
   m.def("agreeing_by_camera", &agreeing_by_camera);
   m.def("shared_pixels", &shared_pixels);
+  m.def("rows_of_points", &rows_of_points);
   m.def("medians_off", &medians_off_of);
 }
 
