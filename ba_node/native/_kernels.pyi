@@ -308,6 +308,9 @@ def steps_against(
     limits are constants of window.steps.
     """
 
+def rows_of_points(point: Ints, wanted: Ints) -> tuple[Ints, Ints]:
+    """Return where points stand in a column that ascends, one after the other, and which of them each place is of."""
+
 def shared_pixels(
     ids: tuple[NDArray[np.uint64], NDArray[np.uint64]], uv: tuple[Doubles, Doubles]
 ) -> tuple[int, int] | None:

@@ -19,6 +19,7 @@ taken follow the front-end by the correction of the last one that was (``Scene.p
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -78,7 +79,7 @@ def decide(config: Config, selection: Selection, found: Merged, trust: Trust | N
     held_out = found.explained.held_out * sigma
     health = {
         "inlier_share": agreeing.share,
-        "parallax_deg": float(np.degrees(found.explained.parallax_rad)),
+        "parallax_deg": math.degrees(found.explained.parallax_rad),
         "held_out_px_before": float(held_out[0]),
         "held_out_px_after": float(held_out[1]),
     }
@@ -221,15 +222,15 @@ class _Compared:
         """Return what is wrong with the steps as a whole, in words."""
         if len(self.first) < _MIN_STEPS:
             return ""
-        guard, limit = self.config.guard, np.log1p(self.config.guard.max_scale_error)
+        guard, limit = self.config.guard, math.log1p(self.config.guard.max_scale_error)
         solved, measured, scale, turn = self.found.solved, self.found.measured, self.found.scale, self.found.turn
-        if abs(np.log(scale)) > limit:
+        if abs(math.log(scale)) > limit:
             text = f"its steps are {scale:.3g} times as long as the front-end's"
             problem = self.selection.problem
             if len(problem.cameras.model) == 1 and not len(problem.observations.depth_m):
                 return f"{text}: one camera does not see the scale, and here it has drifted away"
             return f"{text}: the scale of depths, baseline or focal length is not that of the front-end"
-        if abs(np.log(turn)) > limit:
+        if abs(math.log(turn)) > limit:
             return f"it turns {turn:.3g} times as far as the front-end: the focal length is not the true one"
         # The lower of two in the middle: of four steps two may lead to one keyframe that is far off.
         typical = float(np.sort(self.off.sigmas)[(len(self.first) - 1) // 2])

@@ -102,12 +102,12 @@ def factors(
     ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
     beside the front-end's; ``much_moves`` if a large share of what is seen does; ``tied`` is :func:`ties` if known.
     """
-    tied = (ties(scene, config, keyframes) if tied is None else tied).nonzero()[0]
-    free = ~(problem.fixed[tied] & problem.fixed[tied + 1])
+    first = (ties(scene, config, keyframes) if tied is None else tied).nonzero()[0]
+    free = ~(problem.fixed[first] & problem.fixed[first + 1])
     if not free.any():
         return ()
     many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= MANY_OBSERVATIONS
-    stated = _front_end(scene, config, keyframes, tied)
+    stated = _front_end(scene, config, keyframes, first)
     depths, windowed = len(problem.observations.depth_m) > 0, len(keyframes) <= _WINDOW
     much_moves = much_moves and not depths
     learned_from = [(many, 1.0)]
@@ -116,7 +116,7 @@ def factors(
     inflated = None if much_moves else _as_learned(scene, config, keyframes, learned_from, stated)
     steps = stated if inflated is None else inflated
     if turned is not None:
-        rotation, sigma_rad = turned.between(keyframes, tied, tied + 1)
+        rotation, sigma_rad = turned.between(keyframes, first, first + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
     few = not problem.has_scale and windowed and 2 * np.count_nonzero(many) < len(many)

@@ -89,9 +89,7 @@ def explained(
     ``tracks`` are these points, and how many of them, the first ones, took no part in the solve.
     """
     tried, n_out = tracks
-    # Observations are sorted by point.
-    begin, end = (np.searchsorted(problem.observations.point, tried, side) for side in ("left", "right"))
-    rows, track = ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin)
+    rows, track = _views_of(tried, problem.observations.point)
     if kernels == "numpy" or native.kernels is None:
         return _Trial(problem, rows, track, (len(tried), n_out)).explained(before, after)
     limits = MIN_PARALLAX, _BOUND, _BEHIND, _MIN_VIEWS, _MIN_RESIDUALS
@@ -101,6 +99,15 @@ def explained(
         problem, (rows, track, triangulation.rays_in_cameras(problem, rows)), *others
     )
     return Explained(*found)
+
+
+def _views_of(tried: IntArray, point: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the observations of some points, point by point, and which of these each is of; ``point`` ascends."""
+    if native.kernels is not None:
+        rows, track = native.kernels.rows_of_points(point, tried)
+        return rows, track
+    begin, end = (np.searchsorted(point, tried, side) for side in ("left", "right"))
+    return ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin)
 
 
 class _Trial:

@@ -315,6 +315,23 @@ def test_fewer_steps_than_show_a_factor_show_none(both: Both) -> None:
     assert both(error) == (1.0, 1.0)
 
 
+@pytest.mark.parametrize(
+    ("tried", "rows", "track"),
+    [
+        ([6, 0, 9, 3], [10, 11, 12, 13, 14, 0, 1, 2, 4, 5, 6, 7], [0, 0, 0, 0, 0, 1, 1, 1, 3, 3, 3, 3]),
+        ([10, 4, 5], [17, 18, 19, 8, 9], [0, 0, 0, 2, 2]),
+        ([], [], []),
+    ],
+)
+def test_views_of_tracks_are_those_that_numpy_finds(
+    tried: list[int], rows: list[int], track: list[int], both: Both
+) -> None:
+    """Of points with and without views, in any order."""
+    point = np.repeat(np.arange(12), [3, 0, 1, 4, 0, 2, 5, 1, 1, 0, 3, 0])
+    for found in both(lambda: trial._views_of(np.array(tried, np.intp), point)):
+        assert [one.tolist() for one in found] == [rows, track]
+
+
 @pytest.mark.parametrize("rise", [True, False])
 def test_what_two_images_share_is_what_numpy_finds(rise: bool, both: Both) -> None:
     """Of 200 ids each, some of whose pixels stay as they are, one coordinate of others; the largest id among them."""

@@ -10,6 +10,7 @@
 #include <functional>
 #include <tuple>
 #include <utility>
+#include <vector>
 
 #include "bindings/arrays.hpp"
 #include "bindings/window.hpp"
@@ -76,11 +77,14 @@ py::tuple steps_against(const std::array<Doubles, 4>& poses, const std::pair<Int
 // Of each camera, how many of its observations have a residual up to a gate, and how many there are.
 py::tuple agreeing_by_camera(const Ints& camera, const Doubles& norms, double gate, py::ssize_t n_cameras) {
   Ints agreeing({n_cameras}), every({n_cameras});
-  std::fill_n(agreeing.mutable_data(), n_cameras, 0);
-  std::fill_n(every.mutable_data(), n_cameras, 0);
+  std::int64_t *to_agreeing = agreeing.mutable_data(), *to_every = every.mutable_data();
+  const std::int64_t* of = camera.data();
+  const double* norm = norms.data();
+  std::fill_n(to_agreeing, n_cameras, 0);
+  std::fill_n(to_every, n_cameras, 0);
   for (py::ssize_t o = 0; o < norms.size(); ++o) {
-    ++every.mutable_data()[camera.data()[o]];
-    agreeing.mutable_data()[camera.data()[o]] += norms.data()[o] <= gate;
+    ++to_every[of[o]];
+    to_agreeing[of[o]] += norm[o] <= gate;
   }
   return py::make_tuple(agreeing, every);
 }
@@ -88,6 +92,21 @@ py::tuple agreeing_by_camera(const Ints& camera, const Doubles& norms, double ga
 std::pair<double, double> medians_off_of(const Steps& steps, const Steps& others, const Doubles& sigma_rad,
                                          const Doubles& sigma_m) {
   return medians_off(view_of(steps), view_of(others), sigma_rad.data(), sigma_m.data());
+}
+
+// The places of some points in a column that ascends, one point after the other, and which of them each is of.
+py::tuple rows_of_points(const Ints& point, const Ints& wanted) {
+  std::vector<std::int64_t> rows, which;
+  for (py::ssize_t k = 0; k < wanted.size(); ++k) {
+    const std::int64_t *begin = point.data(), *end = begin + point.size();
+    const auto [first, last] = std::equal_range(begin, end, wanted.data()[k]);
+    for (const std::int64_t* at = first; at != last; ++at) rows.push_back(at - begin);
+    which.resize(rows.size(), k);
+  }
+  const auto taken = [](const std::vector<std::int64_t>& from) {
+    return Ints(static_cast<py::ssize_t>(from.size()), from.data());
+  };
+  return py::make_tuple(taken(rows), taken(which));
 }
 
 // Of two images, how many ids they share, and how many of these have the same pixel; None unless the ids of both rise.
@@ -121,6 +140,7 @@ void bind_steps(py::module_& m) {
   m.def("steps_against", &steps_against);
   m.def("agreeing_by_camera", &agreeing_by_camera);
   m.def("shared_pixels", &shared_pixels);
+  m.def("rows_of_points", &rows_of_points);
   m.def("medians_off", &medians_off_of);
 }
 
