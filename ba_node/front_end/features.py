@@ -39,8 +39,8 @@ def corners(image: Grey, allowed: BoolArray, taken: FloatArray, count: int, bord
         return np.empty((0, 2))
     strength = cv2().cornerMinEigenVal(image, _BLOCK, ksize=3)
     strength[~allowed] = 0.0
-    # Cells so that twice as many as wanted would fit: not each has a corner.
-    cell = max(8, int(np.sqrt(height * width / (1.6 * count))))
+    # Cells so that twice as many as wanted would fit where they may be: not each has a corner.
+    cell = max(8, int(np.sqrt(np.count_nonzero(allowed) / (1.6 * count))))
     rows, columns = (height - 2 * border) // cell, (width - 2 * border) // cell
     inner = strength[border : border + rows * cell, border : border + columns * cell]
     cells = inner.reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows, columns, cell * cell)

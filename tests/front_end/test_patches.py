@@ -78,7 +78,7 @@ def test_a_moved_picture_is_found(
 
 @pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
 def test_both_find_the_same(picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    there = cv2.warpAffine(picture, np.array([[1.01, 0.0, 0.3], [0.0, 0.99, -0.4]]), (300, 200))
+    there: Any = cv2.warpAffine(picture, np.array([[1.01, 0.0, 0.3], [0.0, 0.99, -0.4]]), (300, 200))
     cut = patches.cut(soften(picture), places(), SIDE)
     templates, start = patches.Templates.of(cut, "place"), np.tile(np.eye(2), (COUNT, 1, 1))
     first = places() * [1.01, 0.99] + [0.8, 0.1]

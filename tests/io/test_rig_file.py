@@ -141,3 +141,13 @@ def test_what_is_no_rig_is_said(text: str, words: str, tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(RigError, match="cannot be opened: No such file"):
         read_rig(tmp_path / "none.yaml")
+
+
+def test_the_rig_that_the_documentation_shows_is_one(tmp_path: Path) -> None:
+    """What a user copies beside the pictures."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "from_images.md"
+    shown = page.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0]
+    (tmp_path / "rig.yaml").write_text(shown)
+    rig = read_rig(tmp_path / "rig.yaml")
+    assert (rig.names, rig.models, rig.malformed) == (("left", "right"), ("plumb_bob",) * 2, "")
+    assert rig.image_size.tolist() == [[1226, 370]] * 2 and rig.position[1].tolist() == [0.537, 0.0, 0.0]

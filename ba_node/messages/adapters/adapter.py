@@ -262,7 +262,9 @@ class Adapter:
 
     def _invent_lens(self, features: Features) -> None:
         """Make a camera without distortion for the source's normalised points, where its lens is not known."""
-        if self._extrinsic is None or self._options.rig is not None or not np.isfinite(features.normalised).all():
+        if self._extrinsic is None or self._options.rig is not None or self._from_rays:
+            return
+        if not np.isfinite(features.normalised).all():
             return
         why = "no camera_info"
         if self.rig is not None:

@@ -164,6 +164,13 @@ def test_what_cannot_be_read_names_the_trap(
     assert words in told and told.count("\n") == 1, told
 
 
+def test_a_lens_that_was_made_up_is_no_camera_info() -> None:
+    """An extrinsic that comes after the first image has its camera made of the rays of that one, once."""
+    adapter, out = feed("vins_mono", list(field_table.vins_mono(drive("vins_mono"))))
+    assert adapter.sent >= 6 and len(out) > 6
+    assert adapter.notes["camera"].startswith("no camera_info: the source's undistorted points are taken")
+
+
 def _emptied(messages: list[Sent], kind: int) -> list[Sent]:
     """Return messages without words, as odometry of a kind (0 F2M, 1 F2F) leaves them."""
     for sent in messages:
