@@ -39,7 +39,8 @@ def check_ids(tracks: Tracks) -> Diagnosis:
     near, far = _along(tracks)
     quarter = max(1, len(tracks) // 4)
     early = np.unique(tracks.track[tracks.keyframe < quarter])
-    persist = float(np.isin(tracks.track[tracks.keyframe >= len(tracks) - quarter], early).mean())
+    late = tracks.track[tracks.keyframe >= len(tracks) - quarter]
+    persist = float(np.isin(late, early).mean()) if len(late) else 0.0
     again = _distant(tracks)
     rows = [Row("ids", "images next to each other", near), Row("ids", f"images {_FAR} keyframes apart", far)]
     rows += [Row("ids", "images far apart that share ids", again)]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from ba_node.check.examine import examine
+from ba_node.check.ids import check_ids
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
@@ -145,6 +146,14 @@ def test_silent_when_sound(options: dict[str, object], keyframes: int) -> None:
     found = examine(seen(recording(**options), keyframes))  # type: ignore[arg-type]
     assert not found.findings, found.summary()
     assert found.sound, found.untold
+
+
+def test_ids_are_told_where_images_end_before_the_keyframes_do() -> None:
+    tracks = seen(recording())
+    rows = np.flatnonzero(tracks.keyframe < len(tracks) // 2)
+    parts = {name: getattr(tracks, name)[rows] for name in ("keyframe", "camera", "track", "uv", "sigma_px", "depth_m")}
+    found = check_ids(dataclasses.replace(tracks, **parts))
+    assert found.sound == ["tracks keep their ids"], found.summary()
 
 
 @pytest.mark.slow
