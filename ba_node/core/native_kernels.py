@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import reprojection_errors
+from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Problem, State
 from ba_node.core.two_level import TwoLevel
 
@@ -318,7 +320,7 @@ class NativeFactorSum(FactorSum):
     """The sum of all factors of a problem, stepped locally."""
 
     def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray) -> None:
-        """Hand those on relative poses over; they are copied."""
+        """Hand those on relative poses, and of poses in the world, over; they are copied."""
         super().__init__(factors, fixed)
         self._kernels = [self._kernel(kind, number) for number, kind in enumerate(self._factors)]
         n, pairs = len(self._free), len(self.rows)
@@ -352,7 +354,16 @@ class NativeFactorSum(FactorSum):
         return kernel.linearise(state, terms.gradient, terms.diagonal, terms.pairs.blocks)
 
     def _kernel(self, kind: KeyframeFactors, number: int) -> CompiledPoses | None:
-        if not isinstance(kind, RelativePoses) or kind.loss not in native.LOSSES:
+        if not isinstance(kind, RelativePoses | PosePriors) or kind.loss not in native.LOSSES:
             return None
-        kernel: CompiledPoses = native.kernels.RelativePoses(kind, self._column, self._pair[number][:, 0])
+        own = isinstance(kind, PosePriors)
+        pair = np.full(len(kind), -1) if own else self._pair[number][:, 0]
+        given = _in_world(kind) if isinstance(kind, PosePriors) else kind
+        kernel: CompiledPoses = native.kernels.RelativePoses(given, self._column, pair)
         return kernel
+
+
+def _in_world(priors: PosePriors) -> SimpleNamespace:
+    """Return measured poses as those of the body in a keyframe that is the world."""
+    ends = np.insert(priors.keyframes, 0, -1, axis=1)
+    return SimpleNamespace(**vars(priors) | {"keyframes": ends, "translation": priors.position})

@@ -135,7 +135,11 @@ class SparseFactor:
         """Turn the right-hand side x (n d,) into the solution; False if the matrix is not positive definite."""
 
 class RelativePoses:
-    """Factors on relative poses, as core.factors.RelativePoses; the arrays are copied."""
+    """Factors on relative poses, as core.factors.RelativePoses; the arrays are copied.
+
+    The first keyframe is -1 where it is the world; ``lever_arm`` (n, 3), if there is one, is the point of the second
+    body whose place is meant.
+    """
 
     def __init__(self, factors: object, column: Ints, pair: Ints) -> None: ...
     def value(self, state: State) -> float: ...

@@ -79,6 +79,7 @@ WARNINGS: dict[str, str] = {
     "contradicted": "Many priors or fixes lie beside the map: they contradict each other, the images or the odometry.",
     "scattered": "Priors or fixes that scatter by much more than their covariance states; they count by so much less.",
     "unconfirmed": "Priors or fixes far beside the map of which no two agree; it stays where it is.",
+    "drifted": "Priors or fixes and steps, as of wheels, drift apart by more than their covariances leave.",
     "unaligned": "Priors or fixes that were not used, as the path is too short to tell where the map lies in them.",
     "not_adjusted": "A loop or priors that the map would have to be bent too far for, or that images contradict.",
     "not_joined": "Sessions that tracks connect and that can be no one map: ids in both, stamps, cameras.",

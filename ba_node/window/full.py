@@ -38,7 +38,7 @@ from ba_node.core.problem import State
 from ba_node.core.result import Iteration, Result
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import quality
+from ba_node.window import odometry, quality
 from ba_node.window.covariance import Covariances, covariances
 from ba_node.window.merging import Merged, classify, merge, scaled, settled
 from ba_node.window.problems import joined_observations, problem_of, some_observations
@@ -94,6 +94,7 @@ class Optimization:
     placed: BoolArray  # (n_pt,) True where the point had a position
     position: FloatArray  # (n_kf, 3) positions at that moment, m: where scale floats, they go on giving it
     held: BoolArray  # (n_kf,) keyframes that are fixed but for the one that holds a floating scale
+    floating: IntArray  # (n_kf,) as Selection.unscaled, of parts whose scale no step of the front-end holds
     stamp_ns: NDArray[np.int64]  # (n_kf,) ns
     refine: CalibrationConfig  # what of the cameras is refined too
     wanted: Extras = NOTHING  # what is to be worked out beside the solution
@@ -124,9 +125,8 @@ class Optimization:
         result = result.settled()
         self.solved = result, native_kernels.residual_norms(self.selection.whole, result.state, chosen.kernels)
         if self.wanted.covariance and result.status.usable and result.state.is_finite():
-            # After it the front-end's steps set the scale, be they factors or not.
             problem = dataclasses.replace(self.selection.problem, fixed=self.held)
-            state = scaled(self.selection, self.position, result.state)
+            state = self._scaled(result.state)
             selection = dataclasses.replace(self.selection, problem=problem)
             self.covariances = covariances(selection, state, self.position, chosen, points=self.wanted.points)
 
@@ -155,6 +155,10 @@ class Optimization:
         self.selection = dataclasses.replace(self.selection, problem=problem, observations=whole.observations)
         self.calibration = found
 
+    def _scaled(self, state: State) -> State:
+        """Return a state in the scale of the map where nothing in the solve has told one."""
+        return scaled(dataclasses.replace(self.selection, unscaled=self.floating), self.position, state)
+
     @property
     def result(self) -> Result:
         """Return what the solver gave back."""
@@ -174,8 +178,7 @@ class Optimization:
 
     def outcome(self, state: State, config: Config) -> Merged:
         """Return a solution in the scale of the map, with its points where they may be published."""
-        state = scaled(self.selection, self.position, state)
-        return settled(self.selection, state, config.tracks, config.solver.kernels)
+        return settled(self.selection, self._scaled(state), config.tracks, config.solver.kernels)
 
 
 @dataclass(frozen=True)
@@ -205,9 +208,11 @@ def take_snapshot(
     if isinstance(selection, str):
         return selection
     problem = selection.problem
-    # Precise steps hold the scale; a second keyframe that is held would keep the map turned as it was.
-    floats = selection.unscaled if scene.step_shares == (1.0, 1.0) else np.full(len(selection.unscaled), -1)
-    fixed = _fixed(problem.fixed, floats, scene.keyframes.position[selection.keyframes])
+    # The front-end's steps hold the scale where there are any; a second keyframe that is held would keep the map as
+    # long, and turned, as it was.
+    tied = np.append(odometry.ties(scene, config.odometry, selection.keyframes), False)
+    floating = np.where(np.isin(selection.unscaled, selection.unscaled[tied]), -1, selection.unscaled)
+    fixed = _fixed(problem.fixed, floating, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
     return Optimization(
         origin or scene,
@@ -217,6 +222,7 @@ def take_snapshot(
         scene.landmarks.has_position[selection.landmarks],
         scene.keyframes.position[selection.keyframes],
         problem.fixed,
+        floating,
         scene.keyframes.stamp_ns[selection.keyframes],
         config.calibration,
         wanted,

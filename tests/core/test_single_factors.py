@@ -7,8 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ba_node import native
 from ba_node.config import SolverOptions
 from ba_node.core import geometry, solver
+from ba_node.core.factors import FactorSum
+from ba_node.core.native_kernels import NativeFactorSum
+from ba_node.core.priors import PosePriors
 from ba_node.core.problem import Observations, PointPriors, ProblemError
 from ba_node.core.result import Status
 from tests.core.factors import (
@@ -61,6 +65,25 @@ def test_factors_alone_are_solved(backend: str, make_problem: Make) -> None:
     near(chain.translation, translation, 1e-9)
     empty = dataclasses.replace(problem, factors=())
     assert solver.solve(empty, SolverOptions()).status == Status.SKIPPED
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+def test_native_has_priors_of_poses(make_problem: Make) -> None:
+    """With lever arms and full matrices, on free keyframes and on fixed ones, and where no orientation was measured."""
+    problem, truth = make_problem()
+    (priors, *_) = single_keyframe_factors(truth, problem.n_keyframes)
+    assert isinstance(priors, PosePriors) and priors.lever_arm.all()
+    root = priors.root_information.copy()
+    root[1, :, :3] = 0.0
+    for loss in ("squared", "huber", "cauchy"):
+        given = [dataclasses.replace(priors, root_information=root, loss=loss)]
+        compiled = NativeFactorSum(given, problem.fixed)
+        assert compiled._kernels[0] is not None
+        oracle, found = (one.linearise(problem.start) for one in (FactorSum(given, problem.fixed), compiled))
+        assert compiled.value(problem.start) == pytest.approx(oracle.value, rel=1e-13)
+        assert found.value == pytest.approx(oracle.value, rel=1e-13)
+        near(found.gradient, oracle.gradient)
+        near(found.diagonal, oracle.diagonal)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -19,7 +19,7 @@ from ba_node.estimate import Estimate
 from ba_node.measurements import GlobalFix, Keyframe, LandmarkPriors, Measurement, PosePrior, RelativePose
 from ba_node.window import contradicted
 from experiments.synthetic import SyntheticData
-from tests.window.street import ANTENNA, ORIGIN, aligned_rms, first, fixes, pymap3d, stream, street_data, wheels
+from tests.window.street import ANTENNA, ORIGIN, TURN, aligned_rms, first, fixes, pymap3d, stream, street_data, wheels
 
 KILOMETRE = np.array([600.0, -800.0, 0.0])
 
@@ -133,6 +133,37 @@ def test_fixes_count_by_how_they_scatter_where_their_covariance_is_far_too_small
     ]
     (found,) = (one for one in told if one)
     assert 0.5 < float(found[1]) < 1.5 and 500 < int(found[2]) < 1500, lines
+
+
+@pytest.mark.parametrize(
+    ("steps_told", "drift_m"),
+    [("relative", 10.0), pytest.param("covariance", 10.0, marks=pytest.mark.slow), ("relative", 0.0)],
+)
+def test_fixes_that_drift_along_with_the_map_are_said(street: SyntheticData, steps_told: str, drift_m: float) -> None:
+    """4 % too long a way: the map lies between fixes and wheels, and nothing lies far beside it."""
+    right, steps = fixes(street, 0.0), wheels(street)
+    along = TURN @ (street.truth.position[-1] - street.truth.position[0])
+    along *= drift_m / 100.0 / np.linalg.norm(along)
+    data = street
+    if steps_told == "covariance":
+        told = np.diag([0.025**2] * 3 + [0.002**2] * 3).ravel()
+        data = dataclasses.replace(
+            street, keyframes=tuple(dataclasses.replace(one, covariance=told) for one in street.keyframes)
+        )
+
+    def more(k: int, keyframe: Keyframe) -> Iterator[Measurement]:
+        yield from (moved(one, k * along) for one in right(k, keyframe))
+        if steps_told == "relative":
+            yield from steps(k, keyframe)
+
+    backend, _, jump = played(data, more, **ANTENNA)
+    assert jump < 1.0
+    told_of = [re.match(r"priors in frame 'enu' and measured steps drift apart by (\S+) m over (\d+) m", line)
+               for line in backend.report.warnings]  # fmt: skip
+    found = [one for one in told_of if one]
+    assert len(found) == (drift_m > 0.0), backend.report.warnings
+    for one in found:
+        assert abs(float(one[1]) / float(one[2]) - 0.04) < 0.01, one[0]
 
 
 def test_measurements_in_a_row_on_one_side_of_the_map_tell_together() -> None:

@@ -24,8 +24,11 @@ class RelativePoses final : public RelativePoseFactors {
         rotation_(p.rotation, p.rotation + 9 * p.n),
         translation_(p.translation, p.translation + 3 * p.n),
         root_(p.root_information, p.root_information + 36 * p.n),
+        lever_arm_(3 * p.n),
         loss_(p.loss),
-        scale_(p.loss_scale) {}
+        scale_(p.loss_scale) {
+    if (p.lever_arm) std::copy_n(p.lever_arm, 3 * p.n, lever_arm_.begin());
+  }
 
   double value(const StateView& s) const override {
     double total = 0;
@@ -52,9 +55,25 @@ class RelativePoses final : public RelativePoseFactors {
   }
 
  private:
+  // Poses of both ends; the point l of body j has the place of the origin of a body at t_j - l.
+  struct Ends {
+    const double *ri, *ti, *rj;
+    double tj[3];
+  };
+
+  Ends ends(const StateView& s, std::size_t f) const {
+    static constexpr double kUnit[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, kZero[3] = {0, 0, 0};
+    const std::int64_t i = keyframes_[2 * f], j = keyframes_[2 * f + 1];
+    const double *t = s.translation + 3 * j, *l = &lever_arm_[3 * f];
+    return {i < 0 ? kUnit : s.rotation + 9 * i,
+            i < 0 ? kZero : s.translation + 3 * i,
+            s.rotation + 9 * j,
+            {t[0] - l[0], t[1] - l[1], t[2] - l[2]}};
+  }
+
   void error(const StateView& s, std::size_t f, double* e) const {
-    const double *ri = s.rotation + 9 * keyframes_[2 * f], *rj = s.rotation + 9 * keyframes_[2 * f + 1];
-    const double *ti = s.translation + 3 * keyframes_[2 * f], *tj = s.translation + 3 * keyframes_[2 * f + 1];
+    const Ends at = ends(s, f);
+    const double *ri = at.ri, *rj = at.rj, *ti = at.ti, *tj = at.tj;
     const double *rm = &rotation_[9 * f], *tm = &translation_[3 * f];
     double ij[9], turned[9];
     for (int r = 0; r < 3; ++r)
@@ -69,8 +88,8 @@ class RelativePoses final : public RelativePoseFactors {
 
   // W A, row by row: the derivative by the step of i; that by the step of j is its negative.
   void jacobian(const StateView& s, std::size_t f, const double* e, double* out) const {
-    const double *ri = s.rotation + 9 * keyframes_[2 * f], *rj = s.rotation + 9 * keyframes_[2 * f + 1];
-    const double* tj = s.translation + 3 * keyframes_[2 * f + 1];
+    const Ends at = ends(s, f);
+    const double *ri = at.ri, *rj = at.rj, *tj = at.tj;
     double inverse[9], turned[9], q[3], moved[9];
     inverse_right_jacobian(e, inverse);
     for (int r = 0; r < 3; ++r) q[r] = rj[r] * tj[0] + rj[3 + r] * tj[1] + rj[6 + r] * tj[2];
@@ -132,7 +151,7 @@ class RelativePoses final : public RelativePoseFactors {
       }
     }
     for (int end = 0; end < 2; ++end) {
-      const std::int64_t k = column_[keyframes_[2 * f + end]];
+      const std::int64_t of = keyframes_[2 * f + end], k = of < 0 ? -1 : column_[of];
       if (k < 0) continue;
       for (int i = 0; i < 6; ++i) out.gradient[6 * k + i] += end ? -g[i] : g[i];
       for (int i = 0; i < 36; ++i) out.diagonal[36 * k + i] += h[i];
@@ -182,7 +201,7 @@ class RelativePoses final : public RelativePoseFactors {
   static constexpr double kSmall = 1e-4;  // as in core/geometry.py
 
   std::vector<std::int64_t> keyframes_, column_, pair_;
-  std::vector<double> rotation_, translation_, root_;
+  std::vector<double> rotation_, translation_, root_, lever_arm_;
   Loss loss_;
   double scale_;
 };

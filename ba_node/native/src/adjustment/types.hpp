@@ -77,10 +77,11 @@ struct RaysView {
 
 // Factors on relative poses. Arrays of the caller: n x 2 keyframes, n x 9 rotation and n x 3 translation of j in i,
 // n x 36 W; column: of each keyframe among the free ones, -1 if fixed; pair: n, of each factor, -1 if one end is fixed.
+// i is -1 where it is the world; lever_arm: n x 3 of the point of body j whose place is meant, null for its origin.
 struct RelativePosesView {
   std::int64_t n = 0, n_keyframes = 0;
   const std::int64_t *keyframes = nullptr, *column = nullptr, *pair = nullptr;
-  const double *rotation = nullptr, *translation = nullptr, *root_information = nullptr;
+  const double *rotation = nullptr, *translation = nullptr, *root_information = nullptr, *lever_arm = nullptr;
   Loss loss = Loss::kSquared;
   double loss_scale = 1.0;
 };

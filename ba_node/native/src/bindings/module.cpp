@@ -305,7 +305,12 @@ RelativePoseFactors* make_relative_poses(const py::object& factors, const Ints& 
   const Doubles rotation = array_of<double>(factors, "rotation"),
                 translation = array_of<double>(factors, "translation"),
                 root_information = array_of<double>(factors, "root_information");
+  Doubles lever_arm;
   RelativePosesView view;
+  if (py::hasattr(factors, "lever_arm")) {
+    lever_arm = array_of<double>(factors, "lever_arm");
+    view.lever_arm = lever_arm.data();
+  }
   view.n = pair.size();
   view.n_keyframes = column.size();
   view.keyframes = keyframes.data();
