@@ -231,6 +231,7 @@ class CurrentMap:
             text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
             if text:
                 self.scene.log.warn("stray", text)
+        quality.note_unbounded(self.scene, self.config, norms)
         if tried.held:
             self.hold(tried.held)
         elif state is not None:

@@ -65,6 +65,7 @@ WARNINGS: dict[str, str] = {
     "depths": "Keyframes most of whose depths contradict images and steps, as in another unit; they are left out.",
     "far_from_origin": "Keyframes so far from the origin that the float32 of ~/points loses millimetres.",
     "still_image": "Images that come again while the front-end moves, as of a camera that is stuck; they are left out.",
+    "unbounded": "Mismatches draw the map as far as they are off, as solver.loss and tracks.outlier_px were set.",
     "ids_reused": "Track ids that were used again for other points.",
     "distortion_folds": "A camera whose distortion folds over inside its image.",
     "clock_jump": "The stamps went far back, or a recording plays again: a new session began.",

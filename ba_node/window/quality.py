@@ -26,6 +26,8 @@ BOUND_PX = 1000.0
 _OUTVOTED, _FADING = 5.0, ("cauchy", "geman_mcclure")
 # And this, where two states are compared: outliers are as far off in the one as in the other.
 _COMPARED_PX = 20.0
+# No noise is so many sigmas off.
+_WILD = 10.0
 
 
 def rms_of_norms_px(selection: Selection, norms: FloatArray) -> float:
@@ -66,6 +68,19 @@ def statistics(selection: Selection, result: Result, norms: FloatArray) -> dict[
         "outvoted_factors": sum(_outvoted(kind, result.state) for kind in selection.beside),
         "outliers": int(np.count_nonzero(~selection.inlier & ~selection.held_out[selection.observations.point])),
     }
+
+
+def note_unbounded(scene: Scene, config: Config, norms: FloatArray) -> None:
+    """Say so where mismatches draw a solution and nothing bounds by how much, as somebody asked for that."""
+    if config.solver.loss != "squared" or config.tracks.outlier_px > 0.0:
+        return
+    wild = int(np.count_nonzero(norms > _WILD))
+    if wild:
+        scene.log.warn(
+            "unbounded",
+            f"{wild} of {len(norms)} observations are over {_WILD:g} sigmas off, and nothing bounds how far each draws"
+            " the map: set solver.loss to auto, or tracks.outlier_px to 6",
+        )
 
 
 def _outvoted(kind: KeyframeFactors, state: State) -> int:

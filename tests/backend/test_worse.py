@@ -1,6 +1,6 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map as a whole explains what was observed worse than what came in, what came in stands at the end."""
+"""Where a map as a whole explains what was observed worse than what came in, that stands at the end; what draws it."""
 
 from __future__ import annotations
 
@@ -34,3 +34,22 @@ def test_a_good_map_that_is_moved_aside_is_worse(rig: str) -> None:
     scene.keyframes.position[scene.order[::2], 2] += 0.3
     check = explains_worse(scene, backend.config)
     assert check is not None and check.found is not None and check.found.harmful
+
+
+@pytest.mark.parametrize(
+    ("share", "settings", "said"),
+    [
+        (0.1, {"solver.loss": "squared", "tracks.outlier_px": 0.0}, True),
+        (0.01, {"solver.loss": "squared", "tracks.outlier_px": 0.0}, True),
+        (0.01, {"solver.loss": "squared"}, False),
+        (0.01, {"tracks.outlier_px": 0.0}, False),
+        (0.0, {"solver.loss": "squared", "tracks.outlier_px": 0.0}, False),
+    ],
+)
+def test_mismatches_that_nothing_bounds_are_said(share: float, settings: dict[str, object], said: bool) -> None:
+    recording = spoiled(SOUND, "mono", seed=7, keyframes=15, outlier_share=share)
+    backend = Backend(Config().with_values(settings))
+    for _ in backend.replay(iter(recording.measurements)):
+        pass
+    assert backend.solve_count
+    assert any("nothing bounds how far each draws the map" in line for line in backend.report.warnings) == said
