@@ -85,7 +85,7 @@ class Adjustment:
 
     def _solved(self, scene: Scene, config: Config) -> full.Optimization | str:
         """Return a solve of everything in a copy, or why there is none, in words."""
-        begun = full.take_snapshot(scene, config, self.wanted, self.scene)
+        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=True)
         if isinstance(begun, str):
             return f"no solve of everything can begin: {begun}"
         begun.solve(self.config.solver)

@@ -196,11 +196,12 @@ class Similarity:
 
 
 def take_snapshot(
-    scene: Scene, config: Config, wanted: Extras = NOTHING, origin: Scene | None = None
+    scene: Scene, config: Config, wanted: Extras = NOTHING, origin: Scene | None = None, *, bent: bool = False
 ) -> Optimization | str:
     """Return the problem of all keyframes and points, or why there is none; later changes do not reach it.
 
-    ``origin`` is the scene that the result is for where this one is a clone of it.
+    ``origin`` is the scene that the result is for where this one is a clone of it. A map that was ``bent`` to meet a
+    loop is not where the front-end's steps lead: it keeps its scale, unless they were found to be precise.
     """
     sizes = {"max_keyframes": max(2, len(scene.keyframes)), "max_landmarks": max(10, len(scene.landmarks))}
     window = dataclasses.replace(config.window, old_keyframes="fix", **sizes)
@@ -210,8 +211,10 @@ def take_snapshot(
     problem = selection.problem
     # The front-end's steps hold the scale where there are any; a second keyframe that is held would keep the map as
     # long, and turned, as it was.
-    tied = np.append(odometry.ties(scene, config.odometry, selection.keyframes), False)
-    floating = np.where(np.isin(selection.unscaled, selection.unscaled[tied]), -1, selection.unscaled)
+    floating = selection.unscaled
+    if not bent or scene.step_shares != (1.0, 1.0):
+        tied = np.append(odometry.ties(scene, config.odometry, selection.keyframes), False)
+        floating = np.where(np.isin(floating, floating[tied]), -1, floating)
     fixed = _fixed(problem.fixed, floating, scene.keyframes.position[selection.keyframes])
     selection = dataclasses.replace(selection, problem=dataclasses.replace(problem, fixed=fixed))
     return Optimization(

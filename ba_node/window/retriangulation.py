@@ -53,7 +53,7 @@ def close_gaps(scene: Scene, config: Config) -> Config:
     least, since = np.inf, 0
     for _ in range(_ROUNDS):
         _place_roughly(scene, config)
-        taken = full.take_snapshot(scene, eager)
+        taken = full.take_snapshot(scene, eager, bent=True)
         if isinstance(taken, str):
             break
         objective = _solve(taken, config)
