@@ -5,6 +5,7 @@
 from ba_node.backend.backend import Backend, Work
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
+from ba_node.backend.worse import is_worse
 from ba_node.check.diagnosis import Diagnosis, Row
 from ba_node.check.watch import Check
 from ba_node.core.calibration import Calibration
@@ -27,4 +28,5 @@ __all__ = [
     "Row",
     "Work",
     "can_examine",
+    "is_worse",
 ]

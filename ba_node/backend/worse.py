@@ -15,10 +15,15 @@ from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
 
-# Keyframes up to which a map is young. It is worse if its rms, in which no residual counts for more than 20 px, is
-# higher by this share and by so much, px.
+# Keyframes up to which a map is young.
 _YOUNG = 120
+# A measure is worse if it is higher by a share of it, usually this one, and by so much, px.
 _SHARE, _SLACK_PX = 0.05, 0.05
+
+
+def is_worse(before: float, after: float, share: float = _SHARE) -> bool:
+    """Return True if a measure of what came in, px, has risen by more than a share, and more than chance."""
+    return after > (1.0 + share) * before + _SLACK_PX
 
 
 def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
@@ -35,7 +40,7 @@ def explains_worse(scene: Scene, config: Config) -> Check | None:
     if len(scene.keyframes) > _YOUNG or known.absolute or known.landmarks or not scene.keyframes.refined.any():
         return None
     before, after = (quality.summary(scene, config, state)["bounded_px"] for state in ("input", "refined"))
-    if before is None or after is None or after <= (1.0 + _SHARE) * before + _SLACK_PX:
+    if before is None or after is None or not is_worse(before, after):
         return None
     held = scene.log.warnings.get("held", "")
     evidence = f"rms with none above 20 px {before:.3g} -> {after:.3g} px{held and '; '}{held}"

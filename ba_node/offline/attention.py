@@ -8,16 +8,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ba_node.backend import is_worse
+
 # What arrives twice changes nothing.
 HARMLESS = ("duplicate_keyframe", "duplicate_observation")
-# What must not rise by more than a share, and px. Outliers decide the rms of all, and good points do not follow them;
+# What must not rise by more than a share. Outliers decide the rms of all, and good points do not follow them;
 # one alone may be three times as far off, so that the rms with none above 20 px must not fall.
 _MEASURES = (
     ("rms_px", "rms of all", 0.5),
     ("bounded_px", "rms with none above 20 px", 0.05),
     ("median_px", "median residual", 0.05),
 )
-_SLACK_PX = 0.05
 # Half of all observations are nearer than this by their sigma_px, or the result explains little. By noise alone half
 # are within 1.2.
 _MAX_MEDIAN_SIGMAS = 3.0
@@ -52,7 +53,7 @@ def _worse(session: Mapping[str, Any]) -> list[str]:
     found = {}
     for key, name, share in _MEASURES:
         before, after = _both(session, key)
-        if after > (1.0 + share) * before + _SLACK_PX:
+        if is_worse(before, after, share):
             found[key] = f"{name} {before:.3g} -> {after:.3g} px"
     before, after = _both(session, "bounded_px")
     sigmas = _both(session, "median_sigmas")[1]
