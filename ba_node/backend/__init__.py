@@ -3,6 +3,7 @@
 """The back-end: keyframes in, refined estimates out. What stands above it uses this face and nothing below."""
 
 from ba_node.backend.backend import Backend, Work
+from ba_node.backend.clock import ClockWatch
 from ba_node.backend.current_map import CurrentMap, can_examine
 from ba_node.backend.summary import MapEnded, MapSummary
 from ba_node.backend.worse import is_worse
@@ -18,6 +19,7 @@ __all__ = [
     "Backend",
     "Calibration",
     "Check",
+    "ClockWatch",
     "CurrentMap",
     "Diagnosis",
     "MapContent",

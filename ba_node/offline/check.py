@@ -14,7 +14,7 @@ from ba_node.backend import Backend, CurrentMap, Diagnosis, can_examine
 from ba_node.config import Config
 from ba_node.io.bag_reader import BagReader
 from ba_node.offline.attention import turned_away
-from ba_node.offline.clock import with_clock_watched
+from ba_node.offline.recording import arriving
 
 
 class CheckError(ValueError):
@@ -66,7 +66,7 @@ def check_recording(bag: Path, config: Config) -> CheckedRecording:
     backend = Backend(config)
     maps = [backend.map]
     with BagReader(bag) as reader:
-        for _, _, measurement in with_clock_watched(reader.measurements(), reader):
+        for _, _, measurement in arriving(reader.measurements(), backend):
             backend.add(measurement)
             if backend.map is not maps[-1]:
                 maps.append(backend.map)

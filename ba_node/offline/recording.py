@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from ba_node.backend import Backend, ClockWatch
 from ba_node.config import FramesConfig
 from ba_node.estimate import Poses
 from ba_node.io.bag_reader import BagReader
@@ -56,6 +57,16 @@ def record(
             writer.write(topic, INPUT_TYPES[topic], message, stamp_ns, latched=isinstance(measurement, CameraRig))
             count += 1
     return count
+
+
+def arriving(
+    measurements: Iterable[tuple[str, int, Measurement]], backend: Backend
+) -> Iterator[tuple[str, int, Measurement]]:
+    """Yield all measurements; a back-end gets to know when each was recorded, to tell where the clock was set."""
+    watch = ClockWatch()
+    for topic, time_ns, one in measurements:
+        watch.came(backend, one, 1e-9 * time_ns)
+        yield topic, time_ns, one
 
 
 def placed(

@@ -38,9 +38,8 @@ from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement
 from ba_node.messages.outputs import output_messages
 from ba_node.messages.topics import LATCHED_OUTPUTS, OUTPUT_TYPES, WHOLE_MAP
 from ba_node.offline.attention import attention
-from ba_node.offline.clock import with_clock_watched
 from ba_node.offline.keyframe_images import images_of
-from ba_node.offline.recording import placed, read_truth
+from ba_node.offline.recording import arriving, placed, read_truth
 from ba_node.offline.run_folder import recording_facts, shown_keyframe, versions, write_details
 from ba_node.offline.session_record import SessionRecord
 
@@ -98,15 +97,14 @@ def replay(
     """
     with contextlib.ExitStack() as stack:
         reader = stack.enter_context(BagReader(bag, options.topics))
-        messages = with_clock_watched(reader.measurements(options.load is not None), reader)
-        measurements = placed(messages, reader, config.frames)
         stack.enter_context(locked_folder(out))
         (out / "report.json").unlink(missing_ok=True)
         with BagWriter(out / "refined.mcap") as writer:
             run = _Run(config, writer, watch)
             if options.load is not None:
                 run.load(options.load)
-            run.read(measurements, reader.message_count)
+            messages = arriving(reader.measurements(options.load is not None), run.backend)
+            run.read(placed(messages, reader, config.frames), reader.message_count)
             run.backend.extras = Extras(covariance=options.covariance, points=options.covariance)
             run.end(options.optimize, options.by)
             if not run.sessions:

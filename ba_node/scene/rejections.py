@@ -69,6 +69,7 @@ WARNINGS: dict[str, str] = {
     "ids_reused": "Track ids that were used again for other points.",
     "distortion_folds": "A camera whose distortion folds over inside its image.",
     "clock_jump": "The stamps went far back, or a recording plays again: a new session began.",
+    "clock_step": "The stamps jump while keyframes go on coming: the clock was set.",
     "lower_session": "Keyframes came of a lower session only: it began anew.",
     "frame_changed": "The frame of the keyframes changed: a new session began.",
     "bad_stamp": "A keyframe was turned away for its stamp.",

@@ -11,8 +11,10 @@ standard deviations grow with the path between them, of length l and turn a, ove
 They are those of good odometry. Where that of a recording is worse, keyframes that see much tell: with d the distances
 between their refined steps and the front-end's, in standard deviations of three axes, all are multiplied by
 ``median(d) / 1.54`` (1.54 is that of a normal distribution), for translation and rotation apart. Where it is better
-than images are, precision.py learns by what share. Where two cameras see little, refined steps lie between what images
-and front-end say, in the middle if both are as good; so half of what they are off is not seen, and d counts twice.
+than images are, precision.py learns by what share; but the turns of keyframes that see little take that median below 1
+too, as a dozen points hardly tell a turn from a shift. Where two cameras see little, refined steps lie between what
+images and front-end say, in the middle if both are as good; so half of what they are off is not seen, and d counts
+twice.
 
 So images decide where they see enough. Where these see little (no tracks, no parallax, a camera that stands still or
 turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
@@ -49,6 +51,8 @@ _MAX_GAP = 100
 # Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
 _LEAST_STEPS = 8
 MANY_OBSERVATIONS = 50
+# Turns are not taken for more precise than this share of what is stated.
+_LEAST_SHARE = 0.2
 # What refined steps are off by counts so many times where keyframes see little.
 _HALF_SEEN = 2.0
 # How many times as wide as stated the loss is once they have told, or where most see little to one camera; and before,
@@ -158,7 +162,7 @@ def _as_learned(
     ``sources`` are such keyframes, (n_kf,), and their factors; the first of which there are enough tell. Smaller ones
     where precision.py has learned that. None where too few are known.
     """
-    shares = scene.step_shares
+    shares, many = scene.step_shares, sources[0][0]
     if shares != (1.0, 1.0):
         steps = changed(steps, sigma_rad=shares[0] * steps.sigma_rad, sigma_m=shares[1] * steps.sigma_m)
     table = scene.keyframes
@@ -174,7 +178,10 @@ def _as_learned(
     worse /= _MEDIAN_NORM
     # Keyframes of before they were known to be precise are worse than they.
     times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
-    return changed(steps, sigma_rad=times[0] * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
+    # Where many see how well the front-end turns, few are not to know better.
+    weak = ~(many[steps.first] & many[steps.first + 1]) & (shares[0] == 1.0)
+    turns = np.where(weak, np.clip(worse[0], _LEAST_SHARE, config.max_inflation), times[0])
+    return changed(steps, sigma_rad=turns * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
 
 
 def _medians_off(

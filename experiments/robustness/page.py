@@ -30,7 +30,8 @@ A drive of 20 m with good odometry (noise 0.5 px, 1 % outliers). **before** and 
 front-end's poses and of what is published (se3 alignment), m{median}.
 **verdict**{worst}: *better* than what came in; *kept*, within 10 % and 5 mm of it (of the rotation: 10 % and 0.1
 degrees); *refused*, nothing is published; *harm*. **named**: in how many of the runs the words for the user name the
-cause; a dash where there is nothing to say. Of sound recordings, how many gave no warning.
+cause; a dash where there is nothing to say. Of sound recordings, how many gave no warning. A row is of the code
+with which it was last run: rows are renewed one by one.
 
 """
 _ABOUT_OUTLIERS = """## Outliers

@@ -16,11 +16,12 @@ from ba_node.core import geometry
 from ba_node.core.factors import RelativePoses
 from ba_node.estimate import Poses
 from ba_node.evaluation.metrics import absolute_error
-from ba_node.measurements import Keyframe, Measurement
+from ba_node.measurements import FeatureTracks, Keyframe, Measurement
 from ba_node.scene.scene import Scene
 from ba_node.window import odometry, select
 from ba_node.window.selection import Selection
 from experiments.robustness.faults import spoiled
+from experiments.robustness.faults.recording import rows_of
 from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 GOOD = {"drift_rotation_deg": 0.2, "drift_translation": 0.01}
@@ -198,3 +199,36 @@ def test_twenty_tracks_on_a_long_path_do_better(seed: int) -> None:
     recording = spoiled("few_observations", "stereo", seed=seed)
     before, after = errors([one for _, _, one in recording.timeline], recording.truth)
     assert after <= 0.25 * before, f"{before:.4f} -> {after:.4f} m"
+
+
+def test_keyframes_that_see_little_keep_to_turns_that_others_show_to_be_precise() -> None:
+    data = made(tracks=150, keyframes=14, drift_rotation_deg=0.02)
+    weak_id = int(data.truth.keyframe_id[12])
+
+    def thinned(one: Measurement) -> Measurement:
+        if not isinstance(one, FeatureTracks) or one.keyframe_id != weak_id:
+            return one
+        return rows_of(one, np.arange(min(20, len(one.uv))))
+
+    backend = played([thinned(one) for _, _, one in data.timeline()])
+    selection = select(backend.scene, ON)
+    assert isinstance(selection, Selection)
+    seen = np.bincount(selection.problem.observations.keyframe, minlength=selection.problem.n_keyframes)
+    turn, move = kinds(selection)
+    stated = odometry.stated(backend.scene, ON.odometry, selection.keyframes)
+    weak = np.asarray((seen[turn.keyframes] < odometry.MANY_OBSERVATIONS).any(axis=1))
+    assert np.count_nonzero(weak) == 2 and len(weak) == len(stated.first)
+    share = 1.0 / turn.root_information[:, 1, 1] / stated.sigma_rad
+    assert (share[weak] < 0.5).all() and (share[weak] >= 0.2).all() and (share[~weak] >= 1.0).all()
+    assert (1.0 / move.root_information[:, 4, 4] >= stated.sigma_m).all(), "lengths of one camera follow the steps"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [101, 104, 109])
+def test_a_turn_on_the_spot_past_a_bare_wall_is_no_worse_than_it_came(seed: int) -> None:
+    recording = spoiled("pure_rotation", "mono", 8.0, seed, path="loop", length_m=30.0, keyframes=60)
+    refined = played(list(recording.measurements)).estimate().trajectory
+    before, after = (
+        absolute_error(poses, recording.truth, "none").rotation.rmse for poses in (recording.odometry, refined)
+    )
+    assert after < 0.8 * before, (before, after)

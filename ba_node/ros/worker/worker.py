@@ -19,7 +19,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ba_node.backend import Backend, Check, Work
+from ba_node.backend import Backend, Check, ClockWatch, Work
 from ba_node.estimate import Estimate, Iteration, Refinement, SolveReport, Status
 from ba_node.measurements import Keyframe
 from ba_node.messages.report import QueueReport
@@ -89,6 +89,7 @@ class Worker:
         self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
         self._budget = Budget(clock)
         self._keyframes = KeyframeAccounts()
+        self._arrivals = ClockWatch()
         self._lag = Lag(_PATIENCE_S)
         self._logged: Counter[str] = Counter()
         self._logged_map = 0
@@ -207,6 +208,7 @@ class Worker:
             return
         content, backend = arrival.content, self._backend
         backend.refused.clear()
+        self._arrivals.came(backend, content, arrival.time_s)
         backend.add(content)
         refused = list(backend.refused)
         if isinstance(content, Keyframe) and all(one is not content for one in refused):

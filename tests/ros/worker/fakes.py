@@ -18,6 +18,7 @@ from ba_node.measurements import Keyframe, Measurement
 from ba_node.messages.report import Report
 from ba_node.ros.worker.inbox import Inbox
 from ba_node.ros.worker.worker import Outcome, Output, Worker
+from ba_node.scene.scene import Scene
 
 
 class FakeMap:
@@ -66,6 +67,7 @@ class FakeBackend:
         self.status = Status.CONVERGED
         self.config = Config()
         self.map = FakeMap(self)
+        self.scene = Scene(self.config.scene, 0)
         self.early = False
         self.after_poses: Callable[[], None] = lambda: None
         self.while_solving: Callable[[Callable[[Any], bool]], None] = lambda _: None

@@ -8,12 +8,16 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Status
+from ba_node.measurements import Keyframe
 from ba_node.ros.worker import worker
-from ba_node.ros.worker.worker import Notice
+from ba_node.ros.worker.inbox import Arrival, Inbox
+from ba_node.ros.worker.worker import Notice, Worker
 from tests.ros.worker.fakes import Rig, reports
 
 
@@ -225,3 +229,15 @@ def test_a_latency_budget_ends_a_solve_in_time(budget_ms: float, expected: int) 
     assert report.reason == (
         f"the latency budget of {budget_ms:g} ms was spent after 0 iterations" if budget_ms else ""
     )
+
+
+def test_a_clock_that_is_set_is_said_while_keyframes_come() -> None:
+    backend, inbox = Backend(Config()), Inbox(100)
+    one = Worker(backend, inbox, 1.0, lambda: None, lambda _poses, _arrived_s: None)
+    for k in range(30):
+        stamp_s = 100.0 + 0.5 * k + 60.0 * (k >= 20)
+        keyframe = Keyframe(0, k, round(1e9 * stamp_s), "odom", np.array([0.3 * k, 0.0, 0.0]), np.eye(4)[3])
+        one.step([Arrival(7.0 + 0.5 * k, keyframe)])
+    found = [text for text in backend.report.warnings if "the clock was set" in text]
+    assert len(found) == 1 and "jump forward by 60 s at keyframe 20 (" in found[0]
+    assert [out.text for out in one.outputs() if isinstance(out, Notice) and "the clock was set" in out.text] == found
