@@ -35,6 +35,8 @@ _SEAM_RAD, _SEAM_M = 0.1, 1.0
 _UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
 _RECENT, _TELLING = 50, 4.0
+# That is asked once in so many keyframes.
+_ASKED = 5
 # One that lies far beside the map may be wrong, and nothing else may tell: it takes so many that agree to move it.
 _CONFIRMED = 2
 # Map and world are tried to be aligned again once the map has grown by this share.
@@ -287,8 +289,9 @@ def _left_the_world(scene: Scene, config: Config, final: bool) -> loops.Due | No
     known, n = scene.constraints, len(scene.keyframes)
     if known.map_from_world is None or config.factors.adjust_m <= 0.0:
         return None
-    if n - known.adjusted_at < (1 if final else max(_FEW, _GROWN * n)):
+    if n - known.adjusted_at < (1 if final else max(_FEW, _GROWN * n)) or (n - known.asked_at < _ASKED and not final):
         return None
+    known.asked_at = n
     pairs = constraints.every_pair(scene, config.factors, max(n - _RECENT, 0))
     if not len(pairs):
         return None
