@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 
 from ba_node.arrays import FloatArray
-from ba_node.check.relations import GIVE_WAY, Relation, spread
+from ba_node.check.relations import Relation, spread
 from ba_node.check.tracks import Tracks
 from ba_node.config import SolverOptions
 from ba_node.core import bordered, cameras, geometry, methods, native_kernels, solver, triangulation
@@ -195,7 +195,6 @@ class Freed:
 
 def _placed(problem: Problem) -> Problem:
     """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
-    GIVE_WAY.get()()
     rays, n = triangulation.rays_of(problem), problem.n_points
     if not len(rays.point):
         return problem

@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from contextvars import ContextVar
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +26,6 @@ _AS_GOOD = 0.95
 # Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
 # is estimated, and nothing but the usual mistakes of placement is told.
 AGREED = 0.7
-# Called between steps of a few milliseconds: a check that runs beside solves waits here until there is time.
-GIVE_WAY: ContextVar[Callable[[], object]] = ContextVar("GIVE_WAY", default=lambda: None)
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,6 @@ class Relation:
 
 def relate(tracks: Tracks, a: Image, b: Image, rows: tuple[IntArray, IntArray]) -> Relation | None:
     """Return the relation of two images (of two cameras: of all keyframes that the rows are of)."""
-    GIVE_WAY.get()()
     pair = rays(tracks, rows)
     pose = two_view.estimate(pair)
     if pose is None:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
-from ba_node.check.relations import GIVE_WAY
 from ba_node.check.tracks import tracks_of
 from ba_node.scene.scene import Scene
 
@@ -43,11 +42,9 @@ class Check:
     work: Callable[[], Diagnosis]  # what it does; the scene is not touched
     found: Diagnosis | None = None  # what it found, None before :meth:`run`
 
-    def run(self, give_way: Callable[[], object] = lambda: None) -> Check:
-        """Do the work; ``give_way`` is called between steps of a few milliseconds."""
-        before = GIVE_WAY.set(give_way)
+    def run(self) -> Check:
+        """Do the work."""
         self.found = self.work()
-        GIVE_WAY.reset(before)
         return self
 
 

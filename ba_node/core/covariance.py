@@ -178,8 +178,13 @@ class Reduced:
         weighted = scipy.sparse.diags(weight)
         self.inverse = _inverse_blocks((rows.points.T @ weighted @ rows.points).tobsr((3, 3)))
         self.back = (self.inverse @ (rows.points.T @ weighted @ rows.keyframes)).tocsr()
-        self.influence = (rows.keyframes - rows.points @ self.back).tocsr()
-        self.s = (rows.keyframes.T @ weighted @ self.influence).toarray()
+        # By pieces: scipy keeps the interpreter for the whole of a product, and solves beside this one wait for it.
+        pieces = [slice(begin, begin + _CHUNK) for begin in range(0, len(rows), _CHUNK)]
+        parts = [rows.keyframes[piece] - rows.points[piece] @ self.back for piece in pieces]
+        self.influence = scipy.sparse.vstack(parts, format="csr")
+        left = (rows.keyframes.T @ weighted).tocsr()
+        n = left.shape[0]
+        self.s = np.concatenate([(left[k : k + 6] @ self.influence).toarray() for k in range(0, n, 6)])
         self.s = 0.5 * (self.s + self.s.T)
 
     def leverages(self, roots: FloatArray) -> FloatArray:

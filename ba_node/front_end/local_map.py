@@ -127,6 +127,19 @@ class LocalMap:
             bend = by_p[:, 2] / m[:, 2:]
         return Warp(self._rig.focal * flat + self._rig.centre, affine, bend, depth)
 
+    def seen_at(self, rows: IntArray, camera_from_map: Transform, unknown: float = 0.0) -> FloatArray:
+        """Return where points appear from a camera as :meth:`warp` does, alone: (n, 2) px, NaN behind it."""
+        anchor = self.anchor[rows]
+        t = self.position @ camera_from_map.rotation.T + camera_from_map.translation
+        w = self.inverse_depth[rows]
+        w = np.where(np.isfinite(w), np.maximum(w, 0.0), unknown)
+        R = (camera_from_map.rotation @ self.rotation)[anchor].transpose(1, 2, 0)
+        x, y = ((self.uv[rows] - self._rig.centre) / self._rig.focal).T
+        u, v, z = R[:, 0] * x + R[:, 1] * y + R[:, 2] + t[anchor].T * w
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = np.where(z > 1e-3, np.stack([u, v]) / z, np.nan)
+        return np.asarray(self._rig.focal * flat.T + self._rig.centre)
+
     def refine(self, track_id: IdArray, position: FloatArray) -> None:
         """Take positions (n, 3) of points in the map, m."""
         order = np.argsort(track_id, kind="stable")

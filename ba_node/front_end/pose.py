@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Transform
@@ -70,33 +71,33 @@ def refine(rig: IdealRig, seen: Seen, camera_from_map: Transform) -> tuple[Trans
     """Return the weighted pose, its (6, 6) covariance (turn, place; of the camera) and each point's error in sigmas."""
     pose = camera_from_map
     for _ in range(_STEPS):
-        error, jacobian = _linear(rig, seen, pose)
-        weighted, _ = _weights(error)
-        H, b = _normal(error, jacobian, weighted)
+        H, b, _ = _equations(rig, seen, pose)
         step = np.linalg.solve(H + (1e-9 * np.trace(H) + 1e-300) * np.eye(6), b)
         if not np.isfinite(step).all():
             return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
         pose = Transform(geometry.so3_exp(step[:3]), step[3:]).after(pose)
         if np.linalg.norm(step) < _SMALL:
             break
-    error, jacobian = _linear(rig, seen, pose)
-    weighted, size = _weights(error)
-    H, _ = _normal(error, jacobian, weighted)
+    H, _, size = _equations(rig, seen, pose)
     if not (np.isfinite(H).all() and np.isfinite(size).all()):
         return camera_from_map, np.full((6, 6), np.nan), errors(rig, seen, camera_from_map)
     return pose, np.linalg.inv(H + (1e-12 * np.trace(H) + 1e-300) * np.eye(6)), size
 
 
-def _normal(error: FloatArray, jacobian: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return J' w J and J' w e."""
-    J = jacobian.reshape(-1, 6)
-    weighted = J.T * np.repeat(weight, 2)
-    return weighted @ J, weighted @ error.reshape(-1)
-
-
-def _weights(error: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _equations(rig: IdealRig, seen: Seen, pose: Transform) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return J' W J, J' W e, and each point's error in sigmas."""
+    if native.kernels is not None:
+        camera = np.array([rig.focal, *rig.centre])
+        of = seen.points, seen.along, seen.uv, seen.sigma, camera
+        found: tuple[FloatArray, FloatArray, FloatArray] = native.kernels.pose_equations(
+            of, pose.rotation, pose.translation, _CAUCHY
+        )
+        return found
+    error, jacobian = _linear(rig, seen, pose)
     size = np.linalg.norm(error, axis=1)
-    return 1.0 / (1.0 + (size / _CAUCHY) ** 2), size
+    J = jacobian.reshape(-1, 6)
+    weighted = J.T * np.repeat(1.0 / (1.0 + (size / _CAUCHY) ** 2), 2)
+    return weighted @ J, weighted @ error.reshape(-1), size
 
 
 def _linear(rig: IdealRig, seen: Seen, pose: Transform) -> tuple[FloatArray, FloatArray]:

@@ -96,8 +96,8 @@ class Tracker:
         assert self.frame is not None
         first = None
         if expected is not None:
-            first = self.map.warp(self.rows, expected, self.scene_inverse_depth).uv
-            before = self.map.warp(self.rows, self.pose, self.scene_inverse_depth).uv
+            first = self.map.seen_at(self.rows, expected, self.scene_inverse_depth)
+            before = self.map.seen_at(self.rows, self.pose, self.scene_inverse_depth)
             first = self.uv + np.nan_to_num(first - before)
         uv, found = features.follow(self.frame.grey, frame.grey, self.uv, first)
         found &= inside(frame.allowed, uv)
@@ -133,8 +133,8 @@ class Tracker:
         last = self.keyframe_pose
         turned = Transform(self.pose.rotation, self.pose.rotation @ -self.map.position[-1])
         w = self.scene_inverse_depth
-        before = self.map.warp(self.rows, last, w).uv
-        moved = np.linalg.norm(self.uv - self.map.warp(self.rows, turned, w).uv, axis=1)
+        before = self.map.seen_at(self.rows, last, w)
+        moved = np.linalg.norm(self.uv - self.map.seen_at(self.rows, turned, w), axis=1)
         shift = np.linalg.norm(self.uv - before, axis=1)
         ok = np.isfinite(moved) & np.isfinite(shift)
         return (float(np.median(moved[ok])), float(np.median(shift[ok]))) if ok.any() else (0.0, 0.0)

@@ -350,3 +350,8 @@ def align_patches(
     templates: weighted, std, jacobian, inverse Hessian, grid and window; bend may be empty; limits: iterations, the
     step that ends them and the longest one, px.
     """
+
+def pose_equations(
+    seen: tuple[Doubles, Doubles, Doubles, Doubles, Doubles], rotation: Doubles, translation: Doubles, cauchy: float
+) -> tuple[Doubles, Doubles, Doubles]:
+    """Return what front_end.pose._equations does; seen: points, along, uv, sigma, and the camera (focal, u, v)."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ba_node import native
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Transform
@@ -50,6 +51,20 @@ def test_errors_are_whitened_and_the_jacobian_is_their_change() -> None:
         assert error[i] == pytest.approx(whiten @ (of.uv[i] - project(of.points, TRUE)[i]), rel=1e-6, abs=1e-8)
         expected = whiten @ np.column_stack([column[i] for column in columns])
         assert np.abs(jacobian[i] - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+def test_both_have_the_same_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With points behind the camera, without an uncertain depth, and far off too; and none."""
+    of = seen(40, 3.0)
+    of.points[0] = [0.0, 0.0, -3.0]
+    ours, of_none = pose._equations(RIG, of, TRUE), pose._equations(RIG, seen(0, 1.0), TRUE)
+    monkeypatch.setattr(native, "kernels", None)
+    for one, other in zip(ours, pose._equations(RIG, of, TRUE), strict=True):
+        assert one.shape == other.shape
+        assert np.abs(one - other).max() < 1e-9 * np.abs(other).max()
+    assert [one.shape for one in of_none] == [(6, 6), (6,), (0,)]
+    assert not of_none[0].any() and not of_none[1].any()
 
 
 def test_a_point_behind_the_camera_has_finite_errors() -> None:

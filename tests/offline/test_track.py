@@ -202,6 +202,32 @@ def test_real_car(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert abs(scale - 1.0) < 0.006, f"scale {scale:.4f}"
 
 
+@pytest.mark.slow
+def test_left_camera_of_a_real_car_with_the_true_steps(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Refined poses stay at those that were given, to what one camera's directions are off."""
+    data, folder, out = shared_data / "kitti-stereo-images", tmp_path / "left", tmp_path / "out"
+    folder.mkdir()
+    for file in (data / "image_l").iterdir():
+        (folder / file.name).symlink_to(file)
+    for name in ("calib.txt", "poses.txt"):
+        (folder / name).symlink_to(data / name)
+    rows = np.loadtxt(data / "poses.txt")[:, :12].reshape(-1, 3, 4)
+    turns = geometry.quaternion_from_matrix(geometry.nearest_rotation(rows[:, :, :3]))
+    lines = [
+        " ".join(map(str, [0.1 * i, *row[:, 3], *turn])) for i, (row, turn) in enumerate(zip(rows, turns, strict=True))
+    ]
+    (tmp_path / "odometry.tum").write_text("\n".join(lines))
+    tracks = tmp_path / "tracks.mcap"
+    assert main(["track", str(folder), str(tracks), "--odometry", str(tmp_path / "odometry.tum")]) == 0
+    assert "51, mono" in capsys.readouterr().out
+    assert main(["replay", str(tracks), "--out", str(out), "--final-optimize", "--no-report"]) == 0
+    error, scale = segments(out / "trajectory.tum", out / "ground_truth.tum")
+    assert 0.0 < error < 0.007, f"{100 * error:.2f} % of segments of 10 to 40 m"
+    assert abs(scale - 1.0) < 0.002, f"scale {scale:.4f}"
+
+
 def recording(path: Path, stamps: list[tuple[int, int]], poses: list[Transform]) -> Path:
     """Write colour images of a stereo rig, with camera_info that tells the baseline in p; stamps (ns), poses."""
     rig, sent = world.rig(), []

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 import threading
 import time
 import traceback
@@ -30,8 +31,9 @@ from ba_node.ros.worker.latency import Budget, Lag
 _MAX_OUTPUTS = 20
 # A report on what was turned away goes out without a solve, but not more often.
 _REPORT_PERIOD_S = 1.0
-# For so long a step of a check waits for a solve to end: where solves follow each other at once it must get on too.
-_GIVES_WAY_S = 0.2
+# What is done beside solves waits for so long at a time, and in all for this share of its time and as long as that:
+# where solves follow each other at once it must get on too.
+_GIVES_WAY_S, _WAITS = 0.2, 0.67
 # Texts that begin alike say the same.
 _HEAD = 40
 # Falling behind for this long is warned about.
@@ -124,24 +126,36 @@ class Worker:
         return not self._thread.is_alive()
 
     def check_elsewhere(self, check: Check) -> None:
-        """Check a set-up on a thread of its own, between solves; what is found comes back as a command."""
-        work = functools.partial(check.run, functools.partial(self._resting.wait, _GIVES_WAY_S))
-        self._elsewhere("setup_check", work, lambda backend: backend.take_check(check))
+        """Check a set-up on another thread; what is found comes back as a command."""
+        self._elsewhere("setup_check", check.run, lambda backend: backend.take_check(check))
 
     def work_elsewhere(self, work: Work) -> None:
-        """Do what takes long likewise, once the solve that it came up in is over."""
-
-        def run() -> None:
-            self._resting.wait(_GIVES_WAY_S)
-            work.run()
-
-        self._elsewhere("work", run, lambda backend: backend.take_work(work))
+        """Do what takes long likewise."""
+        self._elsewhere("work", work.run, lambda backend: backend.take_work(work))
 
     def _elsewhere(self, name: str, work: Callable[[], object], then: Command) -> None:
-        """Do something on a thread of its own, and then something on the solver's."""
+        """Do something on a thread of its own, between solves, and then something on the solver's."""
+        began_s, waited_s = self._clock(), 0.0
+
+        def give_way(*_: object) -> None:
+            nonlocal waited_s
+            if not self._resting.is_set():
+                now_s = self._clock()
+                if waited_s <= _GIVES_WAY_S + _WAITS * (now_s - began_s):
+                    self._resting.wait(_GIVES_WAY_S)
+                    waited_s += self._clock() - now_s
+
+        def between_solves() -> None:
+            # Python calls it before and after each function, numpy's too: nothing else stops work that is under way,
+            # and after each call of the kernels a solve would wait for it.
+            sys.setprofile(give_way)
+            try:
+                work()
+            finally:
+                sys.setprofile(None)
 
         def run() -> None:
-            self._guard(work)
+            self._guard(between_solves)
             self._inbox.post(then)
 
         # Not a daemon: Python must not end while the kernels run.

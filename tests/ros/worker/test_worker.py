@@ -110,8 +110,10 @@ def test_commands_reach_the_backend_between_measurements() -> None:
     assert seen == [1]
 
 
-def test_a_check_gives_way_to_solves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "_GIVES_WAY_S", 60.0)
+@pytest.mark.parametrize("solves_end", [True, False])
+def test_a_check_gives_way_to_solves_wherever_it_is(solves_end: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where none ends it goes on all the same."""
+    monkeypatch.setattr(worker, "_GIVES_WAY_S", 60.0 if solves_end else 0.01)
     rig, done = Rig(), []
     solving, looking, go_on = threading.Event(), threading.Event(), threading.Event()
 
@@ -120,23 +122,27 @@ def test_a_check_gives_way_to_solves(monkeypatch: pytest.MonkeyPatch) -> None:
         assert go_on.wait(10.0)
         done.append("solved")
 
-    def look(give_way: Callable[[], object]) -> None:
-        looking.set()
-        give_way()
+    def look() -> None:
+        looking.set()  # begins before the solve does, and is in the middle of something then
+        while not solving.is_set():
+            time.sleep(0.001)
         done.append("looked")
         rig.new.set()
 
     rig.backend.while_solving = solve
     rig.worker.start()
     try:
-        rig.keyframe(1)
-        assert solving.wait(10.0)
         rig.worker.check_elsewhere(SimpleNamespace(run=look))  # type: ignore[arg-type]
         assert looking.wait(10.0)
-        go_on.set()
-        while len(done) < 2:
+        rig.keyframe(1)
+        assert solving.wait(10.0)
+        if solves_end:
+            time.sleep(0.05)  # in which the check would end if it did not wait
+            go_on.set()
+        while len(done) < (2 if solves_end else 1):
             rig.wait_for_output()
-        assert done == ["solved", "looked"]
+        go_on.set()
+        assert done == ["solved", "looked"][not solves_end :]
     finally:
         go_on.set()
         assert rig.worker.stop()

@@ -1,7 +1,5 @@
 // Copyright 2026 The ba_node Authors
 // SPDX-License-Identifier: Apache-2.0
-#include "front_end/patches.hpp"
-
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -9,6 +7,7 @@
 
 #include "bindings/arrays.hpp"
 #include "bindings/window.hpp"
+#include "targets/target.hpp"
 
 namespace ba {
 
@@ -22,7 +21,7 @@ Floats cut(const Floats& image, const Doubles& uv, const Floats& offsets) {
   const py::ssize_t n = uv.shape(0), m = offsets.shape(0);
   Floats values({n, m});
   float* out = values.mutable_data();
-  without_gil([&] { cut_patches(view_of(image), uv.data(), n, offsets.data(), m, out); });
+  without_gil([&] { active_target().cut_patches(view_of(image), uv.data(), n, offsets.data(), m, out); });
   return values;
 }
 
@@ -43,11 +42,21 @@ py::tuple align(const Floats& image, const std::tuple<Floats, Floats, Floats, Do
       grid.data(), window.data()};
   const PlacesSpan to{place.mutable_data(), shape.mutable_data(), correlation.mutable_data(), left.mutable_data()};
   const double* bends = bend.size() ? bend.data() : nullptr;
-  without_gil([&] {
-    Aligner aligner(view_of(image), view, {iterations, step_px, farthest_px});
-    for (std::int64_t i = 0; i < n; ++i) aligner.align(i, bends, to);
-  });
+  without_gil(
+      [&] { active_target().align_patches(view_of(image), view, {iterations, step_px, farthest_px}, bends, to); });
   return py::make_tuple(place, shape, correlation, left);
+}
+
+// seen: points, along, uv, sigma and (focal, u, v) of the camera.
+py::tuple equations(const std::tuple<Doubles, Doubles, Doubles, Doubles, Doubles>& seen, const Doubles& rotation,
+                    const Doubles& translation, double cauchy) {
+  const auto& [points, along, uv, sigma, camera] = seen;
+  const py::ssize_t n = points.shape(0);
+  Doubles matrix({py::ssize_t{6}, py::ssize_t{6}}), vector(py::ssize_t{6}), size(n);
+  const SeenView view{n, points.data(), along.data(), uv.data(), sigma.data(), camera.data()};
+  const PoseEquationsSpan to{matrix.mutable_data(), vector.mutable_data(), size.mutable_data()};
+  without_gil([&] { active_target().pose_equations(view, rotation.data(), translation.data(), cauchy, to); });
+  return py::make_tuple(matrix, vector, size);
 }
 
 }  // namespace
@@ -55,6 +64,7 @@ py::tuple align(const Floats& image, const std::tuple<Floats, Floats, Floats, Do
 void bind_patches(py::module_& m) {
   m.def("cut_patches", &cut);
   m.def("align_patches", &align);
+  m.def("pose_equations", &equations);
 }
 
 }  // namespace ba

@@ -12,31 +12,10 @@
 #include <cstdint>
 #include <vector>
 
-namespace ba {
+#include "front_end/types.hpp"
+#include "simd/target.hpp"
 
-// Grey values (height, width).
-struct ImageView {
-  const float* at;
-  std::int64_t height, width;
-};
-
-// As patches.Templates, with the inverse of its Hessian; pixels are those that are compared, values in each of n.
-struct TemplatesView {
-  std::int64_t n, movements, pixels;
-  const float *weighted, *std, *jacobian;
-  const double* inverse;
-  const float *grid, *window;
-};
-
-// Where templates are: (n, 2) px, (n, 2, 2), and how they look there.
-struct PlacesSpan {
-  double *place, *affine, *correlation, *left;
-};
-
-struct AlignLimits {
-  int iterations;
-  double step_px, farthest_px;
-};
+namespace ba::BA_TARGET {
 
 // Values between pixels, at places that are set first; beyond the border as at the border. Images have two rows and
 // columns at least.
@@ -175,4 +154,10 @@ class Aligner {
   std::vector<float> seen_;
 };
 
-}  // namespace ba
+inline void align_patches(const ImageView& image, const TemplatesView& templates, const AlignLimits& limits,
+                          const double* bend, const PlacesSpan& to) {
+  Aligner aligner(image, templates, limits);
+  for (std::int64_t i = 0; i < templates.n; ++i) aligner.align(i, bend, to);
+}
+
+}  // namespace ba::BA_TARGET

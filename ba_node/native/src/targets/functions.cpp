@@ -6,6 +6,8 @@
 #include "adjustment/norms.hpp"
 #include "adjustment/relative_poses.hpp"
 #include "adjustment/triangulate.hpp"
+#include "front_end/patches.hpp"
+#include "front_end/pose.hpp"
 #include "targets/target.hpp"
 
 #define BA_QUOTED(name) #name
@@ -27,7 +29,8 @@ void agreeing(const RaysView& rays, std::int64_t n_points, double gate, bool* ag
 
 }  // namespace
 
-const Target kTarget{BA_NAME(BA_TARGET),  make_kernel6,   make_kernel9, make_factor6, make_factor9,
-                     make_relative_poses, residual_norms, triangulate,  agreeing,     consensus};
+const Target kTarget{BA_NAME(BA_TARGET),  make_kernel6,   make_kernel9,  make_factor6, make_factor9,
+                     make_relative_poses, residual_norms, triangulate,   agreeing,     consensus,
+                     cut_patches,         align_patches,  pose_equations};
 
 }  // namespace ba::BA_TARGET

@@ -7,6 +7,7 @@
 #include <cstdint>
 
 #include "adjustment/types.hpp"
+#include "front_end/types.hpp"
 #include "linalg/types.hpp"
 
 namespace ba {
@@ -113,6 +114,12 @@ struct Target {
   void (*agreeing)(const RaysView&, std::int64_t n_points, double gate, bool* agrees);
   void (*consensus)(const RaysView&, std::int64_t n_points, double gate, double* points, double* parallax,
                     bool* measured, bool* agrees);
+  void (*cut_patches)(const ImageView&, const double* uv, std::int64_t n, const float* offsets, std::int64_t m,
+                      float* out);
+  void (*align_patches)(const ImageView&, const TemplatesView&, const AlignLimits&, const double* bend,
+                        const PlacesSpan&);
+  void (*pose_equations)(const SeenView&, const double* rotation, const double* translation, double cauchy,
+                         const PoseEquationsSpan&);
 };
 
 #define BA_DECLARE_TARGET(name)                      \
