@@ -7,6 +7,8 @@ there from so far, and would take what is right for outliers. So the keyframes a
 each step between consecutive keyframes is as the map has it, to a third of what a step of the front-end is worth, and
 what is measured beside pixels pulls. Points follow the keyframe that saw them first.
 
+A map that grows is refined as a whole from time to time without being bent.
+
 All this is done to a copy of the map, on any thread, while windows go on being solved; the map then follows it.
 """
 
@@ -35,12 +37,17 @@ _SEAM_RAD, _SEAM_M = 0.1, 1.0
 _UPRIGHT_RAD = 0.02
 # Absolute measurements of so many keyframes tell whether the map has left the world, at so many standard deviations.
 _RECENT, _TELLING = 50, 4.0
+# That is asked once in so many keyframes.
+_ASKED = 5
 # One that lies far beside the map may be wrong, and nothing else may tell: it takes so many that agree to move it.
 _CONFIRMED = 2
 # Map and world are tried to be aligned again once the map has grown by this share.
 _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
+# A map of at most so many keyframes is refined as a whole each time that it is so many times as large, by whether
+# images show its scale: that of one camera drifts.
+_YOUNG, _AGAIN = 320, (1.25, 1.5)
 _ITERATIONS = 30
 _NOTHING_CAME = "nothing came of a solve of everything"
 # Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
@@ -65,7 +72,7 @@ class Adjustment:
 
     def run(self) -> None:
         """Bend and refine the copy, on any thread."""
-        self.why = bend(self._copy, self.config, self.due) or self._refine()
+        self.why = (not self.due.grown and bend(self._copy, self.config, self.due)) or self._refine()
 
     def _refine(self) -> str:
         """Refine all of the copy if that can be; return why the map is to stay as it is."""
@@ -85,9 +92,11 @@ class Adjustment:
 
     def _solved(self, scene: Scene, config: Config) -> full.Optimization | str:
         """Return a solve of everything in a copy, or why there is none, in words."""
-        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=True)
+        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=not self.due.grown)
         if isinstance(begun, str):
             return f"no solve of everything can begin: {begun}"
+        if self.due.grown and begun.selection.much_moves:
+            return "much of what is seen moves"
         begun.solve(self.config.solver)
         result = begun.result
         usable = result.status.usable and result.state.is_finite()
@@ -129,6 +138,10 @@ class Adjustment:
     def end(self, why: str) -> None:
         """Take note that it is over, and why the map stays as it was, in words; empty if it does not."""
         known = self.scene.constraints
+        if self.due.grown:
+            if why:
+                self.scene.log.notice("not_refined")
+            return
         known.adjusted_at = len(self.scene.keyframes)
         if not why:
             contradicted.say_contradicted(self.scene, self.config.factors)
@@ -181,7 +194,28 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
     if known.steps_precise and not found:
         known.steps_precise = False
         found = loops.Due("the front-end's steps are more precise than was stated")
-    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final))
+    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final) or _grown(scene, config))
+
+
+def _grown(scene: Scene, config: Config) -> loops.Due | None:
+    """Return whether a young map has grown by so much that all of it is to be refined again.
+
+    Windows hold what is older as it was found when less was known, and with it the scale of one camera. Not where more
+    than pixels and steps places the map, or where the last windows are not known well.
+    """
+    known, n, window = scene.constraints, len(scene.keyframes), config.window
+    if not max(window.max_keyframes + 1, min(_AGAIN) * known.grown_at) <= n <= _YOUNG:
+        return None
+    if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0:
+        return None
+    looped = known.renamed or any(one.is_loop for one in known.relative.values())
+    if known.absolute or known.landmarks or known.seams or looped:
+        return None
+    sure = scene.keyframes.refined[scene.order[-window.max_keyframes :]].all()
+    if not sure or n < _AGAIN[retriangulation.has_scale(scene)] * known.grown_at:
+        return None
+    known.grown_at = n
+    return loops.Due("the map has grown", grown=True)
 
 
 def bend(scene: Scene, config: Config, what: loops.Due) -> str:
@@ -287,8 +321,9 @@ def _left_the_world(scene: Scene, config: Config, final: bool) -> loops.Due | No
     known, n = scene.constraints, len(scene.keyframes)
     if known.map_from_world is None or config.factors.adjust_m <= 0.0:
         return None
-    if n - known.adjusted_at < (1 if final else max(_FEW, _GROWN * n)):
+    if n - known.adjusted_at < (1 if final else max(_FEW, _GROWN * n)) or (n - known.asked_at < _ASKED and not final):
         return None
+    known.asked_at = n
     pairs = constraints.every_pair(scene, config.factors, max(n - _RECENT, 0))
     if not len(pairs):
         return None

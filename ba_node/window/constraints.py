@@ -96,14 +96,9 @@ def pair(scene: Scene, config: FactorsConfig, first: int = 0, *, everything: boo
     b = np.minimum(a + 1, len(stamps) - 1)
     share = (time[which] - stamps[a]) / np.maximum(stamps[b] - stamps[a], 1)
     nearer = np.where(share > 0.5, b, a)
-    # Constant velocity from a to b by the front-end, then seen from the nearer one.
-    poses = table.input_rotation[order], table.input_position[order]
-    step = geometry.compose(*geometry.inverse(poses[0][a], poses[1][a]), poses[0][b], poses[1][b])
-    from_a = geometry.so3_exp(share[:, None] * geometry.so3_log(step[0])), share[:, None] * step[1]
-    back = geometry.inverse(*step)
-    is_b = nearer == b
-    start = np.where(is_b[:, None, None], back[0], np.eye(3)), np.where(is_b[:, None], back[1], 0.0)
-    turn, move = geometry.compose(*start, *from_a)
+    turn, move = np.tile(np.eye(3), (len(which), 1, 1)), np.zeros((len(which), 3))
+    if share.any():
+        turn, move = _between(scene, order[a], order[b], share)
     antenna = np.array([config.antenna_x_m, config.antenna_y_m, config.antenna_z_m])
     arm = np.array([antenna * known[i].of_antenna for i in which]).reshape(-1, 3)
     measured = [known[i].rotation for i in which]
@@ -122,6 +117,20 @@ def pair(scene: Scene, config: FactorsConfig, first: int = 0, *, everything: boo
         time[which],
         source,
     )
+
+
+def _between(scene: Scene, a: IntArray, b: IntArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the body at a ``share`` (n,) of the time from keyframes a to b (rows), seen from the nearer one.
+
+    By the front-end, at constant velocity.
+    """
+    table = scene.keyframes
+    back = geometry.inverse(table.input_rotation[a], table.input_position[a])
+    step = geometry.compose(*back, table.input_rotation[b], table.input_position[b])
+    from_a = geometry.so3_exp(share[:, None] * geometry.so3_log(step[0])), share[:, None] * step[1]
+    back, is_b = geometry.inverse(*step), share > 0.5
+    start = np.where(is_b[:, None, None], back[0], np.eye(3)), np.where(is_b[:, None], back[1], 0.0)
+    return geometry.compose(*start, *from_a)
 
 
 def every_pair(scene: Scene, config: FactorsConfig, first: int = 0, *, everything: bool = False) -> Pairs:
