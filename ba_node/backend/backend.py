@@ -226,7 +226,7 @@ class Backend:
         self._adjusting = None
         why, merged = done.why, None
         if not why and done.taken is not None:
-            merged = self.merge(done.taken, done.put, says=not done.due.grown)
+            merged = self.merge(done.taken, done.put)
             why = self.refusal or ("" if merged else "nothing came of a solve of everything")
         elif not why:
             done.put()
@@ -301,11 +301,11 @@ class Backend:
         return optimization.scene is self.scene
 
     def merge(
-        self, optimization: full.Optimization, first: Callable[[], None] = lambda: None, *, says: bool = True
+        self, optimization: full.Optimization, first: Callable[[], None] = lambda: None
     ) -> tuple[Estimate, int] | None:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
 
-        ``first`` is done to the map before, once it is known that the result is taken. ``says``: warn where it is not.
+        ``first`` is done to the map before, once it is known that the result is taken.
 
         Returns:
             What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
@@ -318,8 +318,7 @@ class Backend:
         wrong = self.setup.reason(self.scene) if self.config.checks_setup else ""
         self.refusal = wrong or ("" if verdict.odd else verdict.reason)
         if self.refusal:
-            if says:
-                self.map.hold(f"a solve of everything: {self.refusal}")
+            self.map.hold(f"a solve of everything: {self.refusal}")
             return None
         assert found.state is not None
         first()

@@ -7,8 +7,6 @@ there from so far, and would take what is right for outliers. So the keyframes a
 each step between consecutive keyframes is as the map has it, to a third of what a step of the front-end is worth, and
 what is measured beside pixels pulls. Points follow the keyframe that saw them first.
 
-A map that grows is refined as a whole from time to time without being bent.
-
 All this is done to a copy of the map, on any thread, while windows go on being solved; the map then follows it.
 """
 
@@ -45,9 +43,6 @@ _CONFIRMED = 2
 _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
-# A map of at most so many keyframes is refined as a whole each time that it is so many times as large, by whether
-# images show its scale: that of one camera drifts.
-_YOUNG, _AGAIN = 320, (1.25, 1.5)
 _ITERATIONS = 30
 _NOTHING_CAME = "nothing came of a solve of everything"
 # Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
@@ -72,7 +67,7 @@ class Adjustment:
 
     def run(self) -> None:
         """Bend and refine the copy, on any thread."""
-        self.why = (not self.due.grown and bend(self._copy, self.config, self.due)) or self._refine()
+        self.why = bend(self._copy, self.config, self.due) or self._refine()
 
     def _refine(self) -> str:
         """Refine all of the copy if that can be; return why the map is to stay as it is."""
@@ -92,11 +87,9 @@ class Adjustment:
 
     def _solved(self, scene: Scene, config: Config) -> full.Optimization | str:
         """Return a solve of everything in a copy, or why there is none, in words."""
-        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=not self.due.grown)
+        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=True)
         if isinstance(begun, str):
             return f"no solve of everything can begin: {begun}"
-        if self.due.grown and begun.selection.much_moves:
-            return "much of what is seen moves"
         begun.solve(self.config.solver)
         result = begun.result
         usable = result.status.usable and result.state.is_finite()
@@ -138,10 +131,6 @@ class Adjustment:
     def end(self, why: str) -> None:
         """Take note that it is over, and why the map stays as it was, in words; empty if it does not."""
         known = self.scene.constraints
-        if self.due.grown:
-            if why:
-                self.scene.log.notice("not_refined")
-            return
         known.adjusted_at = len(self.scene.keyframes)
         if not why:
             contradicted.say_contradicted(self.scene, self.config.factors)
@@ -194,28 +183,7 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
     if known.steps_precise and not found:
         known.steps_precise = False
         found = loops.Due("the front-end's steps are more precise than was stated")
-    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final) or _grown(scene, config))
-
-
-def _grown(scene: Scene, config: Config) -> loops.Due | None:
-    """Return whether a young map has grown by so much that all of it is to be refined again.
-
-    Windows hold what is older as it was found when less was known, and with it the scale of one camera. Not where more
-    than pixels and steps places the map, or where the last windows are not known well.
-    """
-    known, n, window = scene.constraints, len(scene.keyframes), config.window
-    if not max(window.max_keyframes + 1, min(_AGAIN) * known.grown_at) <= n <= _YOUNG:
-        return None
-    if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0:
-        return None
-    looped = known.renamed or any(one.is_loop for one in known.relative.values())
-    if known.absolute or known.landmarks or known.seams or looped:
-        return None
-    sure = scene.keyframes.refined[scene.order[-window.max_keyframes :]].all()
-    if not sure or n < _AGAIN[retriangulation.has_scale(scene)] * known.grown_at:
-        return None
-    known.grown_at = n
-    return loops.Due("the map has grown", grown=True)
+    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final))
 
 
 def bend(scene: Scene, config: Config, what: loops.Due) -> str:

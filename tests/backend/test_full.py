@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 # With windows so small the scale of one camera drifts.
-# By itself nothing but windows refines the map.
-CONFIG = Config().with_values({"window.max_keyframes": 8, "guard.max_scale_error": 0.5, "factors.adjust_m": 0.0})
+CONFIG = Config().with_values({"window.max_keyframes": 8, "guard.max_scale_error": 0.5})
 KINDS: dict[str, dict[str, Any]] = {"stereo": {}, "one camera": {"baseline_m": 0.0}, "depth": {"depth_share": 0.5}}
 
 
