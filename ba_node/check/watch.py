@@ -110,6 +110,8 @@ class SetUpWatch:
             return False
         self._busy = False
         self._told |= found.told
+        for kind in found.notices:
+            scene.log.notice(kind, kind not in scene.log.notices)
         if found.findings:
             scene.log.warn(kind="setup", text=found.summary())
         if not found.harmful:
