@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from ba_node.check.departure import departed
 from ba_node.check.diagnosis import Diagnosis, Finding
-from ba_node.check.watch import Check
+from ba_node.check.watch import Check, of_few_keyframes
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
@@ -28,7 +28,7 @@ def is_worse(before: float, after: float, share: float = _SHARE) -> bool:
 
 def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
     """Return what is wrong with a young map as a whole when no more will come, None if nothing is."""
-    return departed(scene, final=True) or explains_worse(scene, config)
+    return departed(scene, final=True) or explains_worse(scene, config) or of_few_keyframes(scene)
 
 
 def explains_worse(scene: Scene, config: Config) -> Check | None:

@@ -132,6 +132,12 @@ def test_one_camera_tells_after_ten_keyframes(wrong: str) -> None:
     assert re.search(NAMED[wrong][1], found.causes()), found.summary()
 
 
+@pytest.mark.parametrize("wrong", ["axes missing", "extrinsics inverted"])
+def test_one_camera_tells_after_five_keyframes_what_is_plain(wrong: str) -> None:
+    found = examine(seen(recording(wrong=wrong, mode="mono", path="line"), keyframes=5))
+    assert "axes confused" in found.causes(), found.summary()
+
+
 @pytest.mark.parametrize(
     "options",
     [
