@@ -22,7 +22,7 @@ from ba_node.core import geometry
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
-# Fewer pairs, but so many, do where every one of them is off by an absurd angle, and none by a doubtful one once a known
+# Fewer pairs, but so many, do where all of them are off by an absurd angle, and none by a doubtful one once a known
 # mistake is undone.
 _FEW_PAIRS = 3
 # Usual angle beyond which poses are said to be wrong where a known mistake explains them, and where none does.

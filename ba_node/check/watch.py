@@ -55,8 +55,8 @@ def of_few_keyframes(scene: Scene) -> Check | None:
     tracks = tracks_of(scene) if _AT[0] < len(scene.keyframes) < _FEW and scene.keyframes.refined.any() else None
     if tracks is None or not two_view.available():
         return None
-    check = Check(scene, lambda: examine(tracks))
-    return check if check.run().found and check.found.harmful else None
+    found = examine(tracks)
+    return Check(scene, lambda: found, found) if found.harmful else None
 
 
 class SetUpWatch:
