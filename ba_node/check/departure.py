@@ -29,7 +29,11 @@ from ba_node.scene.scene import Scene
 
 # Factors beyond which lengths are said to differ, each if it is so many standard errors from 1: rigs and wheels are
 # known better, and odometry that shows a smaller factor so clearly is precise. Directions differ by as much aside.
-_FACTORS = ((1.015, 4.5), (1.012, 8.0))
+Limits = tuple[tuple[float, float], ...]
+_FACTORS: Limits = ((1.015, 4.5), (1.012, 8.0))
+# At the end, when it is asked but once, this many standard errors are a warning: 2 or 3 in 10 000 sound drives have as
+# much by chance, in lengths or along an axis, too many to give up what was refined.
+DOUBTED: Limits = ((1.012, 3.6),)
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
 # Student's distribution asks for.
 _FEW = 8.0
@@ -47,11 +51,12 @@ _LEAST_M = 0.02
 _TELLING, _TRIMMED = 0.3, 0.1
 
 
-def departed(scene: Scene, *, final: bool = False) -> Check | None:
+def departed(scene: Scene, *, final: bool = False, limits: Limits = _FACTORS) -> Check | None:
     """Return what is wrong if the refined steps of a young map are off the front-end's by one factor or to one side.
 
     ``final``: no more keyframes will come, so that it is asked at any number of them, and of directions too: another
-    test of the set-up would have told by now that two cameras do not fit each other.
+    test of the set-up would have told by now that two cameras do not fit each other. ``limits``: least factor and
+    standard errors of it, either pair of which is enough; with ``DOUBTED`` it is a warning alone.
     """
     count, least = len(scene.keyframes), _STEPS if final else _STEPS_BEFORE
     if (count % _EVERY and not final) or not least < count <= _YOUNG or scene.cameras is None:
@@ -61,21 +66,21 @@ def departed(scene: Scene, *, final: bool = False) -> Check | None:
     refined, given = _steps(scene)
     if len(refined) < least:
         return None
-    finding = _by_a_factor(scene, refined, given) if _has_scale(scene) else None
+    finding = _by_a_factor(scene, refined, given, limits) if _has_scale(scene) else None
     if final:
-        finding = finding or _aside(scene, refined, given)
+        finding = finding or _aside(scene, refined, given, limits)
     if finding is None:
         return None
     found = Diagnosis([finding])
     return Check(scene, lambda: found, found)
 
 
-def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | None:
+def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
     """Return what is wrong if refined steps (n, 3) are longer or shorter than the given ones."""
     along = refined + given
     ratio = np.sum(refined * along, axis=1) / np.sum(given * along, axis=1)
     mean, error = _trimmed_mean(np.log(ratio))
-    if not _differs(mean, error, len(given)):
+    if not _differs(mean, error, len(given), limits):
         return None
     factor = float(np.exp(mean))
     evidence = f"refined steps are {factor:.3g} times as long as the front-end's, over {len(ratio)} of them"
@@ -87,16 +92,17 @@ def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray) -> Findin
         ours = f"scale of focal length or baseline: lengths are {factor:.3g} times what the front-end's steps tell"
         change = "k in the camera_info, or body_from_camera, of the camera_rig"
     steps = f"scale of the front-end's steps: they are {1.0 / factor:.3g} times what {by}"
-    return Finding((ours, steps), evidence, (change, "the position in the keyframes, expected metres"))
+    changes = (change, "the position in the keyframes, expected metres")
+    return Finding((ours, steps), evidence, changes, harmful=limits is _FACTORS)
 
 
-def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | None:
+def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
     """Return what is wrong if refined steps (n, 3) point to another side of the body than the given ones."""
     lengths = np.linalg.norm(refined, axis=1) * np.linalg.norm(given, axis=1)
     turns = np.cross(given, refined) / lengths[:, None]
     found = [_trimmed_mean(of_axis) for of_axis in turns.T]
     times = 1.0 if _has_scale(scene) else _ONE_CAMERA
-    if not any(_differs(mean, error, len(given), times) for mean, error in found):
+    if not any(_differs(mean, error, len(given), limits, times) for mean, error in found):
         return None
     assert scene.cameras is not None
     turn = np.array([mean for mean, _ in found])
@@ -110,12 +116,12 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray) -> Finding | No
         "roi in camera_info in camera_rig, or subtract its offset from the principal point in k",
         "body_from_camera in camera_rig (or tf_static), or the pose in the keyframes if it is not that of the body",
     )
-    return Finding((region, place), evidence, changes)
+    return Finding((region, place), evidence, changes, harmful=limits is _FACTORS)
 
 
-def _differs(mean: float, error: float, count: int, times: float = 1.0) -> bool:
+def _differs(mean: float, error: float, count: int, limits: Limits, times: float = 1.0) -> bool:
     more = 1.0 + (_FEW / count) ** 1.5
-    return any(abs(mean) >= max(times * np.log(factor), more * errors * error) for factor, errors in _FACTORS)
+    return any(abs(mean) >= max(times * np.log(factor), more * errors * error) for factor, errors in limits)
 
 
 def _has_scale(scene: Scene) -> bool:

@@ -54,6 +54,7 @@ class Diagnosis:
     sound: list[str] = field(default_factory=list)  # what was tested and fits, in words
     untold: list[str] = field(default_factory=list)  # what the tracks could not tell (yet), and why
     rows: list[Row] = field(default_factory=list)  # the hypotheses
+    notices: list[str] = field(default_factory=list)  # what is unusual but does no harm, keys of the scene's notices
     told: frozenset[str] = frozenset()  # the tests that need no more tracks
 
     @property
@@ -97,6 +98,7 @@ class Diagnosis:
         self.sound += other.sound
         self.untold += other.untold
         self.rows += other.rows
+        self.notices += other.notices
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for a JSON file."""

@@ -22,6 +22,9 @@ from ba_node.core import geometry
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
+# Fewer pairs, but so many, do where all of them are off by an absurd angle, and none by a doubtful one once a known
+# mistake is undone.
+_FEW_PAIRS = 3
 # Usual angle beyond which poses are said to be wrong where a known mistake explains them, and where none does.
 DOUBTFUL_DEG = 15.0
 _ABSURD_DEG = 50.0
@@ -42,12 +45,11 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     before = compare(tracks, usable)
     moving = before.length > 0.1 * np.median(before.length) if usable else np.zeros(0, bool)
     usable = [one for one, moves in zip(usable, moving, strict=True) if moves]
-    if len(usable) < _PAIRS_NEEDED:
-        return Diagnosis(
-            untold=[f"too little parallax to compare poses with tracks ({len(usable)} pairs of keyframes)"]
-        )
     test = "poses against tracks"
     now = compare(tracks, usable)
+    few = len(usable) < _PAIRS_NEEDED
+    if few and not (len(usable) >= _FEW_PAIRS and now.off.min() > _ABSURD_DEG):
+        return _too_few(usable)
     rows = [now.row(test, "as given"), Row(test, "free", float(np.mean([one.share for one in usable])))]
     if np.median(now.off) > DOUBTFUL_DEG:
         tried = {one: compare(one.undo(tracks, 0), usable) for one in IN_MOTION}
@@ -58,8 +60,15 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             evidence = (
                 f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, {best:.0f} with that undone"
             )
-            return Diagnosis([finding(named, evidence)], rows=rows)
+            if not few or max(float(tried[one].off.max()) for one in named) < DOUBTFUL_DEG:
+                return Diagnosis([finding(named, evidence)], rows=rows)
+    if few:
+        return _too_few(usable)
     return _by_turns(tracks, usable, now, rows) or _unnamed(tracks, usable, now, rows)
+
+
+def _too_few(usable: list[Relation]) -> Diagnosis:
+    return Diagnosis(untold=[f"too little parallax to compare poses with tracks ({len(usable)} pairs of keyframes)"])
 
 
 def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis | None:

@@ -16,8 +16,8 @@ import numpy as np
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding
-from ba_node.check.motion import contradicts
-from ba_node.check.relations import AGREED, Relation, of_cameras, relate, shared_views, spread
+from ba_node.check.motion import check_motion, contradicts
+from ba_node.check.relations import AGREED, Relation, in_motion, of_cameras, relate, shared_views, spread
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 from ba_node.core import geometry
@@ -59,7 +59,7 @@ def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diag
             if shared := shared_views(tracks, camera):
                 outcome.untold.append(f"cameras 0 and {camera} share too few tracks ({shared})")
             elif len(tracks) >= _KEYFRAMES_TO_MEASURE and (overlap := _overlap(tracks, camera)) > _SEE_THE_SAME:
-                outcome.add(Diagnosis([_none_shared(camera, overlap)]))
+                outcome.add(_none_shared(tracks, camera, overlap, related()))
             continue
         found = _check_camera(tracks, camera, relation, related)
         if (best := max(row.share for row in found.rows)) < _CONTRADICT and _agree_alone(tracks, camera):
@@ -147,10 +147,16 @@ def _overlap(tracks: Tracks, camera: int) -> float:
     return float(np.mean((there[:, 2] > 0.0) & (seen > low).all(axis=1) & (seen < high).all(axis=1)))
 
 
-def _none_shared(camera: int, overlap: float) -> Finding:
-    cause = f"cameras 0 and {camera} share no track, though they look at the same: each counts as one camera alone"
-    evidence = f"camera {camera} sees {overlap:.0%} of what camera 0 sees"
-    return Finding((cause,), evidence, (_ONE_ID.format(camera=camera),), harmful=False, usual=True)
+def _none_shared(tracks: Tracks, camera: int, overlap: float, relations: list[Relation]) -> Diagnosis:
+    """Tell of two cameras that are tracked one by one, which is a mistake only where no steps tell the scale."""
+    text = f"cameras 0 and {camera} share no track, though they look at the same: each counts as one camera alone"
+    if all(check_motion(tracks, one).sound for one in (relations, in_motion(tracks, camera))):
+        return Diagnosis(sound=[f"{text}, whose steps fit"], notices=["no_shared_track"])
+    if sum(one.has_direction for one in relations) < _PAIRS_NEEDED:
+        return Diagnosis(untold=[f"{text}, with too little parallax to tell whether its steps fit"])
+    evidence = f"camera {camera} sees {overlap:.0%} of what camera 0 sees, and the front-end's steps do not fit"
+    change = _ONE_ID.format(camera=camera)
+    return Diagnosis([Finding((text,), evidence, (change,), harmful=False, usual=True)])
 
 
 def _same_place(camera: int, relation: Relation, rows: list[Row]) -> Diagnosis:

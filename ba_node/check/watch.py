@@ -25,6 +25,8 @@ from ba_node.scene.scene import Scene
 _AT = (3, 6, 10, 15, 25, 40, 60, 90, 150, 250, 500, 1000)
 # What fits on a straight way, or seems to over a few keyframes, is looked at once more here.
 _AGAIN = (15, 40, 90)
+# A session that ends with fewer is looked at once more with all of them.
+_FEW = 10
 _ONCE = frozenset({"pixels", "stamps"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
@@ -46,6 +48,15 @@ class Check:
         """Do the work."""
         self.found = self.work()
         return self
+
+
+def of_few_keyframes(scene: Scene) -> Check | None:
+    """Return the check of a session that ends with so few keyframes that it was hardly looked at; None for others."""
+    tracks = tracks_of(scene) if _AT[0] < len(scene.keyframes) < _FEW and scene.keyframes.refined.any() else None
+    if tracks is None or not two_view.available():
+        return None
+    found = examine(tracks)
+    return Check(scene, lambda: found, found) if found.harmful else None
 
 
 class SetUpWatch:
@@ -110,6 +121,8 @@ class SetUpWatch:
             return False
         self._busy = False
         self._told |= found.told
+        for kind in found.notices:
+            scene.log.notice(kind, kind not in scene.log.notices)
         if found.findings:
             scene.log.warn(kind="setup", text=found.summary())
         if not found.harmful:

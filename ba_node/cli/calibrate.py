@@ -14,15 +14,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import (
-    add_parameter_options,
-    add_topic_options,
-    facts,
-    parameters,
-    progress_bar,
-    topic_choice,
-    write_result,
-)
+from ba_node.cli import console
 
 EXAMPLE = "ba calibrate bags/stereo_loop.mcap --out out/rig.yaml --refine intrinsics extrinsics"
 NOTHING_TOLD = 3
@@ -40,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=["intrinsics", "extrinsics"],
         help="what to refine (default: intrinsics extrinsics)",
     )
-    add_topic_options(parser)
-    add_parameter_options(parser)
+    console.add_topic_options(parser)
+    console.add_parameter_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,14 +41,14 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.calibrate import calibrate_recording, write_rig  # noqa: PLC0415
 
     wanted = {f"calibration.{part}": "refined" if part in args.refine else "fixed" for part in _PARTS}
-    config = parameters(args).with_values(wanted)
-    with progress_bar("calibrate", "messages") as progress:
-        refined = calibrate_recording(args.bag, config, topic_choice(args), progress)
+    config = console.parameters(args).with_values(wanted)
+    with console.progress_bar("calibrate", "messages") as progress:
+        refined = calibrate_recording(args.bag, config, console.topic_choice(args), progress)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write_rig(args.out, refined)
     rows = [("keyframes", str(refined.keyframes)), ("rms without outliers", f"{refined.rms_px[-1]:.3f} px")]
-    print(facts([*rows, *((f"camera {i}", text) for i, text in enumerate(refined.found.lines()))]))
+    print(console.facts([*rows, *((f"camera {i}", text) for i, text in enumerate(refined.found.lines()))]))
     print(f"written to {args.out}")
     found = {"keyframes": refined.keyframes, "rms_px": refined.rms_px, "parameters": refined.found.as_dicts()}
-    write_result(args.json, found)
+    console.write_result(args.json, found)
     return 0 if any(one.told for one in refined.found.parameters) else NOTHING_TOLD

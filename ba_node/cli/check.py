@@ -22,14 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import (
-    add_fleet_options,
-    add_parameter_options,
-    parameters,
-    progress_bar,
-    table,
-    write_result,
-)
+from ba_node.cli import console
 
 if TYPE_CHECKING:
     from ba_node.backend import Diagnosis, Row
@@ -47,15 +40,15 @@ _SHOWN = {"free": "best fit to the tracks, whatever is given"}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", nargs="+", metavar="RECORDING", help="a file, a folder, or a URL; repeatable")
-    add_fleet_options(parser)
-    add_parameter_options(parser)
+    console.add_fleet_options(parser)
+    console.add_parameter_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
     from ba_node.offline.check import check_recording  # noqa: PLC0415
 
-    config = parameters(args)
+    config = console.parameters(args)
     if len(args.bag) > 1 or args.scheduler or "://" in args.bag[0]:
         return _check_all(args, config)
     checked = check_recording(Path(args.bag[0]), config)
@@ -72,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         for text in session.warnings:
             print(f"ba: warning: {text}", file=sys.stderr)
-    write_result(args.json, checked.as_dict())
+    console.write_result(args.json, checked.as_dict())
     if checked.all_warnings or any(session.found.findings for session in sessions):
         return MISTAKE
     return 0 if any(session.found.sound for session in sessions) else TOO_LITTLE
@@ -85,11 +78,11 @@ def _check_all(args: argparse.Namespace, config: Config) -> int:
     from ba_node.offline.fleet import Fleet, expand  # noqa: PLC0415
 
     tasks = [batch.ReplayTask((place,), "", config, TopicChoice()) for place in expand(args.bag)]
-    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("check", "recordings") as progress:
+    with Fleet(args.jobs, args.scheduler) as fleet, console.progress_bar("check", "recordings") as progress:
         rows = batch.each(fleet, batch.check_one, tasks, progress)
     for row in rows:
         print(f"{row['recording']}: {row['state']}", *_wrapped(row["note"], _WIDTH, "    ", "    "), sep="\n")
-    write_result(args.json, {"recordings": rows})
+    console.write_result(args.json, {"recordings": rows})
     if all(row["state"] == batch.FAILED for row in rows):
         return TOO_LITTLE
     return 0 if all(row["state"] == batch.OK for row in rows) else MISTAKE
@@ -120,7 +113,7 @@ def _table(rows: list[Row]) -> str:
             lines += [(f"  {text}", "", "", "") for text in above]
             angles = (row.rotation_deg, row.direction_deg)
             lines.append((f"  {last}", f"{row.share:.0%}", *("" if math.isnan(a) else f"{a:.2f} deg" for a in angles)))
-    return table(lines[0], lines[1:])
+    return console.table(lines[0], lines[1:])
 
 
 def _entry(name: str, texts: Sequence[str]) -> str:

@@ -23,15 +23,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import (
-    TargetError,
-    add_topic_options,
-    progress_bar,
-    require_folder,
-    require_mcap,
-    topic_choice,
-    write_result,
-)
+from ba_node.cli import console
 
 EXAMPLE = (
     "ba convert sparse/0 scene.mcap\n  ba convert bags/stereo_loop.mcap model/\n"
@@ -62,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", type=Path, metavar="IN")
     parser.add_argument("target", type=Path, metavar="OUT")
     parser.add_argument("--to", choices=_FORMATS, help="format of OUT, where its name does not tell it")
-    add_topic_options(parser)
+    console.add_topic_options(parser)
     _add_front_end_options(parser.add_argument_group("recordings of other front-ends"))
 
 
@@ -83,14 +75,14 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline import convert  # noqa: PLC0415
 
     form = convert.format_of(args.target, args.to)
-    require_folder(args.target)
+    console.require_folder(args.target)
     if form == "mcap":
-        require_mcap(args.target)
-    with progress_bar("convert", "messages") as progress:
-        what = convert.read(args.source, topic_choice(args), progress)
+        console.require_mcap(args.target)
+    with console.progress_bar("convert", "messages") as progress:
+        what = convert.read(args.source, console.topic_choice(args), progress)
     left_out = convert.write(args.target, what, form)
     print(f"{args.target}: {convert.counts(what)}{f', without {left_out}' if left_out else ''}")
-    write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})
+    console.write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})
     return 0
 
 
@@ -99,20 +91,20 @@ def _convert_front_end(args: argparse.Namespace) -> int:
     from ba_node.offline.adapt import adapt  # noqa: PLC0415
     from ba_node.offline.rig import load_rig  # noqa: PLC0415
 
-    require_mcap(args.target)
+    console.require_mcap(args.target)
     topics = dict(text.split("=", 1) for text in args.topic if "=" in text)
     if len(topics) < len(args.topic):
-        raise TargetError(f"--topic {' '.join(args.topic)}: expected NAME=TOPIC, each name once")
+        raise console.TargetError(f"--topic {' '.join(args.topic)}: expected NAME=TOPIC, each name once")
     for name, least in (("tolerance", 0.0), ("parallax", 0.0), ("cameras", 0)):
         if not least <= getattr(args, name) < float("inf"):
-            raise TargetError(f"--{name} {getattr(args, name):g}: expected a number, {least:g} or more")
+            raise console.TargetError(f"--{name} {getattr(args, name):g}: expected a number, {least:g} or more")
     rig = load_rig(args.rig) if args.rig else None
     options = AdapterOptions(args.tolerance, args.parallax, rig=rig)
     adapter = adapt(args.source, args.target, args.front_end, options, args.cameras or (len(rig) if rig else 1), topics)
     print(f"{args.target}: {adapter.summary()}")
     left_out = dict(sorted(adapter.counted.items()))
     result = {"keyframes": adapter.sent, "images": adapter.images, "left_out": left_out, "notes": adapter.told()}
-    write_result(args.json, {"target": args.target.name, **result})
+    console.write_result(args.json, {"target": args.target.name, **result})
     for note in adapter.told():
         print(f"  {note}")
     # Stamps that are all alike leave one keyframe, and are counted as that coming again.

@@ -62,12 +62,12 @@ def run(args: argparse.Namespace) -> int:
     paired = pair(estimate, reference, args.align, args.max_difference)
     interval = relative.Interval(args.interval, args.unit, args.all_pairs)
     absolute = absolute_error_of(paired)
-    found = {"translation_m": absolute.translation.as_dict(), "rotation_deg": absolute.rotation.as_dict()}
+    found = {"translation_m": vars(absolute.translation), "rotation_deg": vars(absolute.rotation)}
     over = ""
     if len(paired.stamp_ns) > 1:
         moved = relative.relative_error(paired, interval)
-        found["relative_translation_m"] = moved.translation.as_dict()
-        found["relative_rotation_deg"] = moved.rotation.as_dict()
+        found["relative_translation_m"] = vars(moved.translation)
+        found["relative_rotation_deg"] = vars(moved.rotation)
         over = f"{interval}, {len(moved.pairs)} pairs"
     print(f"{len(paired.stamp_ns)} of {len(estimate)} poses have a partner; alignment {args.align}")
     print(_table(found, over))

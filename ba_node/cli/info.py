@@ -12,14 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import (
-    add_topic_options,
-    facts,
-    progress_bar,
-    table,
-    topic_choice,
-    write_result,
-)
+from ba_node.cli import console
 
 if TYPE_CHECKING:
     from ba_node.offline.bag_tools import RecordingFacts
@@ -31,19 +24,19 @@ ATTENTION = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("bag", type=Path, nargs="+", metavar="RECORDING", help="a file, a folder, or all files of one")
-    add_topic_options(parser)
+    console.add_topic_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Tell."""
     from ba_node.offline.bag_tools import examine  # noqa: PLC0415
 
-    with progress_bar("info", "messages") as progress:
-        found = examine(args.bag, topic_choice(args), progress)
+    with console.progress_bar("info", "messages") as progress:
+        found = examine(args.bag, console.topic_choice(args), progress)
     _print(found)
     for line in found.attention:
         print(f"ba: warning: {line}", file=sys.stderr)
-    write_result(args.json, found.as_dict())
+    console.write_result(args.json, found.as_dict())
     return ATTENTION if found.refusal or found.attention else 0
 
 
@@ -64,11 +57,11 @@ def _print(found: RecordingFacts) -> None:
             *(("pauses", used["pauses"]) for _ in range(bool(used["pauses"]))),
             ("observations", f"{used['observations']}, {used['depths']} with depth; {used['guesses']} guesses"),
         ]
-        print(facts(rows), end="\n\n")
+        print(console.facts(rows), end="\n\n")
     cells = []
     for topic, of in sorted(found.topics.items()):
         span = (of.last_ns - of.first_ns) * 1e-9
         rate = f"{(of.count - 1) / span:.1f}" if span > 0.0 else ""
         gap = f"{of.gap_s:.2f} at {of.gap_at_s:.1f}" if of.gap_s > 0.0 else ""
         cells.append((topic, of.type_name, str(of.count), rate, gap))
-    print(table(("topic", "type", "messages", "Hz", "longest pause [s]"), cells))
+    print(console.table(("topic", "type", "messages", "Hz", "longest pause [s]"), cells))

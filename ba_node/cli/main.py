@@ -85,16 +85,7 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 NOBODY_READS = 141  # as a shell has it: 128 and the number of SIGPIPE
 FAULT = 1
-_ROS_PACKAGES = (
-    "rclpy",
-    "ba_msgs",
-    "std_msgs",
-    "std_srvs",
-    "geometry_msgs",
-    "sensor_msgs",
-    "nav_msgs",
-    "rcl_interfaces",
-)
+_MESSAGES = ("ba_msgs", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rcl_interfaces")
 
 
 class Parser(argparse.ArgumentParser):
@@ -225,7 +216,7 @@ def _run(argv: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         return _end(INTERRUPTED, "interrupted")
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] not in _ROS_PACKAGES:
+        if (error.name or "").split(".")[0] not in ("rclpy", *_MESSAGES):
             raise
         return _end(USAGE_ERROR, f"error: {error}: run this where ROS 2 is: after make setup in .venv, or sourced")
     except OSError as error:

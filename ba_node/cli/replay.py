@@ -27,20 +27,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ba_node.cli.console import (
-    TargetError,
-    add_fleet_options,
-    add_parameter_options,
-    add_topic_options,
-    facts,
-    parameters,
-    progress_bar,
-    require_folder,
-    say_left_out,
-    table,
-    topic_choice,
-    write_result,
-)
+from ba_node.cli import console
 from ba_node.cli.ranks import start_ranks, together
 from ba_node.config import ConfigError
 from ba_node.offline.attention import HARMLESS
@@ -69,9 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="of several, leave alone those whose results are there already"
     )
-    add_fleet_options(parser)
-    add_topic_options(parser)
-    add_parameter_options(parser)
+    console.add_fleet_options(parser)
+    console.add_topic_options(parser)
+    console.add_parameter_options(parser)
     parser.add_argument(
         "--load-map", type=Path, metavar="FILE", help="begin with a map; the recording goes on in its session"
     )
@@ -96,12 +83,12 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.fleet import is_url  # noqa: PLC0415
     from ba_node.offline.ranks import started_as_ranks  # noqa: PLC0415
 
-    require_folder(args.save_map)
+    console.require_folder(args.save_map)
     if args.ranks is not None and not args.final_optimize:
         raise ConfigError("--ranks share a solve of everything: add --final-optimize")
     if args.covariance and not args.final_optimize:
         raise ConfigError("--covariance is worked out by a solve of everything: add --final-optimize")
-    config = parameters(args)
+    config = console.parameters(args)
     if config.calibration.wanted and not args.final_optimize:
         raise ConfigError("calibration.* = refined is for a solve of everything: add --final-optimize")
     if config.calibration.wanted and args.ranks is not None:
@@ -117,17 +104,17 @@ def run(args: argparse.Namespace) -> int:
     if report is None:
         args.json = None  # rank 0 writes it
         return 0
-    print(facts(_rows(report)))
+    print(console.facts(_rows(report)))
     _tell(report)
     if args.no_report:
         print(f"written to {args.out}")
     else:
         from ba_node.offline.report import show  # noqa: PLC0415
 
-        with progress_bar("report", "figures") as progress:
+        with console.progress_bar("report", "figures") as progress:
             written = show(args.out, progress)
         print(f"written to {args.out}: {written}")
-    write_result(args.json, report)
+    console.write_result(args.json, report)
     return ATTENTION if report["attention"] else 0
 
 
@@ -135,9 +122,9 @@ def _replayed(args: argparse.Namespace, config: Config, **more: Any) -> dict[str
     """Replay one recording; return its report."""
     from ba_node.offline.replay import MapOptions, Watch, replay  # noqa: PLC0415
 
-    with progress_bar("replay", "messages") as progress:
+    with console.progress_bar("replay", "messages") as progress:
         wanted = args.final_optimize, args.final_optimize and args.covariance
-        options = MapOptions(args.load_map, *wanted, args.save_map, topic_choice(args), **more)
+        options = MapOptions(args.load_map, *wanted, args.save_map, console.topic_choice(args), **more)
         return replay(args.bag, args.out, config, Watch(time.perf_counter, progress), options)
 
 
@@ -166,29 +153,35 @@ def _replay_all(args: argparse.Namespace, config: Config, found: list[tuple[str,
 
     alone = [name for name in ("load_map", "save_map", "final_optimize", "ranks") if getattr(args, name)]
     if alone:
-        raise TargetError(f"--{alone[0].replace('_', '-')} is for one recording: give it alone, by its path")
+        raise console.TargetError(f"--{alone[0].replace('_', '-')} is for one recording: give it alone, by its path")
     tasks = [
         batch.ReplayTask(
-            group, f"{args.out}/{name}", config, topic_choice(args), not args.no_report, args.resume, time.perf_counter
+            group,
+            f"{args.out}/{name}",
+            config,
+            console.topic_choice(args),
+            not args.no_report,
+            args.resume,
+            time.perf_counter,
         )
         for group, name in zip(found, batch.folder_names(found), strict=True)
     ]
-    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("replay", "recordings") as progress:
+    with Fleet(args.jobs, args.scheduler) as fleet, console.progress_bar("replay", "recordings") as progress:
         rows = batch.each(fleet, batch.replay_one, tasks, progress)
-    print(table(list(batch.COLUMNS.values())[:-1], [batch.cells(row)[:-1] for row in rows]))
+    print(console.table(list(batch.COLUMNS.values())[:-1], [batch.cells(row)[:-1] for row in rows]))
     for row in rows:
         if row["state"] == batch.LOOK:
             print(f"ba: warning: {row['recording']}: {row['note']}", file=sys.stderr)
     failed = [row for row in rows if row["state"] == batch.FAILED]
-    say_left_out({row["recording"]: row["note"] for row in failed})
+    console.say_left_out({row["recording"]: row["note"] for row in failed})
     with delivered(args.out) as folder:
         names = batch.write_summary(folder, rows)
     print(f"written to {args.out}: {names}, a folder for each recording")
-    write_result(args.json, {"recordings": rows})
+    console.write_result(args.json, {"recordings": rows})
     if not is_url(args.out):
         lost = [row for row in rows if row not in failed and not (Path(row["folder"]) / "report.json").is_file()]
         if lost:
-            raise TargetError(
+            raise console.TargetError(
                 f"{args.out}: {len(lost)} results are not there: the workers wrote them to disks of their own; give a"
                 " folder that all machines share, or a URL"
             )

@@ -12,15 +12,7 @@ from __future__ import annotations
 
 import argparse
 
-from ba_node.cli.console import (
-    add_search_options,
-    parameters,
-    progress_bar,
-    say_left_out,
-    table,
-    topic_choice,
-    write_result,
-)
+from ba_node.cli import console
 
 EXAMPLE = "ba sweep bags/*.mcap --out out/sweep --values window.max_keyframes=5,10,20 --values tracks.outlier_px=3,6"
 
@@ -31,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--values", action="append", required=True, metavar="NAME=A,B,C", help="values of a parameter; repeatable"
     )
-    add_search_options(parser)
+    console.add_search_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,24 +34,28 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.offline.fleet import Fleet  # noqa: PLC0415
     from ba_node.offline.study import Plan  # noqa: PLC0415
 
-    base = parameters(args)
+    base = console.parameters(args)
     values = {}
     for text in args.values:
         name, listed = split_assignment(text, "window.max_keyframes=5,10,20")
         parameter = find(name)
         values[parameter.name] = [parameter.read(one.strip()) for one in listed.split(",")]
     plan = Plan(
-        tuple(recordings(args.bag, each=args.each)), None, (), objective=args.objective, topics=topic_choice(args)
+        tuple(recordings(args.bag, each=args.each)),
+        None,
+        (),
+        objective=args.objective,
+        topics=console.topic_choice(args),
     )
     args.out.mkdir(parents=True, exist_ok=True)
-    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("sweep", "replays") as progress:
+    with Fleet(args.jobs, args.scheduler) as fleet, console.progress_bar("sweep", "replays") as progress:
 
         def keep(done: int, total: int, found: tuning.Swept) -> None:
             progress(done, total)
             tuning_page.keep_sweep(args.out, found)
 
         found, left_out = tuning.sweep(plan, base, fleet, list(tuning.grid(values)), keep)
-    print(table(*tuning_page.sweep_rows(found)))
+    print(console.table(*tuning_page.sweep_rows(found)))
     print(f"written to {args.out}: {tuning_page.write_sweep(args.out, found)}")
-    write_result(args.json, tuning_page.sweep_as_dict(found))
-    return say_left_out(left_out)
+    console.write_result(args.json, tuning_page.sweep_as_dict(found))
+    return console.say_left_out(left_out)

@@ -23,17 +23,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ba_node.cli.console import (
-    TargetError,
-    add_search_options,
-    parameters,
-    progress_bar,
-    require_folder,
-    say_left_out,
-    table,
-    topic_choice,
-    write_result,
-)
+from ba_node.cli import console
 
 if TYPE_CHECKING:
     from ba_node.offline.study import Plan, Trial
@@ -67,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the search (default: 1)")
     parser.add_argument("--storage", type=Path, metavar="FILE", help="where trials are kept (default: DIR/trials.log)")
     parser.add_argument("--apply", metavar="NODE", help="set the parameters found on a running node, e.g. /ba_node")
-    add_search_options(parser)
+    console.add_search_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,7 +66,9 @@ def run(args: argparse.Namespace) -> int:
     if args.bag:
         code = _tune(args)
     elif not args.apply:
-        raise TargetError("no recording to tune on: give one, or --apply NODE with the folder of an earlier search")
+        raise console.TargetError(
+            "no recording to tune on: give one, or --apply NODE with the folder of an earlier search"
+        )
     if args.apply:
         from ba_node.ros.tools.set_parameters import set_parameters  # noqa: PLC0415
 
@@ -89,10 +81,10 @@ def _tune(args: argparse.Namespace) -> int:
     from ba_node.offline import tuning, tuning_page  # noqa: PLC0415
     from ba_node.offline.fleet import Fleet  # noqa: PLC0415
 
-    base = parameters(args)
+    base = console.parameters(args)
     plan = _plan(args)
     storage = args.storage or args.out / "trials.log"
-    require_folder(args.storage)
+    console.require_folder(args.storage)
     args.out.mkdir(parents=True, exist_ok=True)
     print(f"tuning {len(plan.parameters)} parameters on {', '.join(place[0] for place in plan.recordings)}")
     if plan.validation is None:
@@ -101,14 +93,14 @@ def _tune(args: argparse.Namespace) -> int:
     def better(trial: Trial) -> None:
         tuning_page.write_parameters(args.out, base, trial.values)
 
-    with Fleet(args.jobs, args.scheduler) as fleet, progress_bar("tune", "trials") as progress:
+    with Fleet(args.jobs, args.scheduler) as fleet, console.progress_bar("tune", "trials") as progress:
         tuned = tuning.tune(plan, base, fleet, storage, better, progress)
     names = tuning_page.write_tuned(args.out, tuned, base)
-    print(table(tuning_page.ERRORS, tuning_page.error_rows(tuned)), end="\n\n")
-    print(table(tuning_page.PARAMETERS, tuning_page.parameter_rows(tuned, base)))
+    print(console.table(tuning_page.ERRORS, tuning_page.error_rows(tuned)), end="\n\n")
+    print(console.table(tuning_page.PARAMETERS, tuning_page.parameter_rows(tuned, base)))
     print(f"written to {args.out}: {names}")
-    write_result(args.json, tuning_page.tuned_as_dict(tuned))
-    return max(say_left_out(tuned.left_out), _verdict(tuned))
+    console.write_result(args.json, tuning_page.tuned_as_dict(tuned))
+    return max(console.say_left_out(tuned.left_out), _verdict(tuned))
 
 
 def _plan(args: argparse.Namespace) -> Plan:
@@ -135,7 +127,7 @@ def _plan(args: argparse.Namespace) -> Plan:
         args.max_latency_ms,
         args.trials,
         args.seed,
-        topic_choice(args),
+        console.topic_choice(args),
     )
 
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,10 +44,6 @@ class Statistics:
             min=float(np.min(errors)),
             sse=float(np.sum(errors**2)),
         )
-
-    def as_dict(self) -> dict[str, float | int]:
-        """Return the fields by name."""
-        return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)

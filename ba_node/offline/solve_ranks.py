@@ -91,9 +91,9 @@ def solve_on_ranks(
     began = clock()
     digest = together(communicator, lambda: _digest(path))
     _require_same(communicator, digest, options)
-    own = _read(path, communicator)
+    share, origin, bundler = _read(path, communicator)
     options, kernels, problem = together(
-        communicator, lambda: _prepared(own.share, options, digest, communicator, checkpoint)
+        communicator, lambda: _prepared(share, options, digest, communicator, checkpoint)
     )
     ready = clock()
 
@@ -111,36 +111,27 @@ def solve_on_ranks(
 
     result = solve(problem, options, clock=clock, on_iteration=seen, kernels=kernels)
     solved = clock()
-    summed = totals(own.share.bal, problem, result.state, communicator.sum)
-    state, bal = _whole(communicator, result.state), whole(own.share, communicator)
+    summed = totals(share.bal, problem, result.state, communicator.sum)
+    state, bal = _whole(communicator, result.state), whole(share, communicator)
     if state is None or bal is None:
         return None
     result = dataclasses.replace(result, state=state)
     return Solution(
         source=str(path),
-        origin=own.origin,
+        origin=origin,
         problem=problem,
         result=result,
         options=options,
         setup_s=ready - began,
         solve_s=solved - ready,
         bal=bal,
-        bundler=own.bundler,
+        bundler=bundler,
         summed=summed,
     )
 
 
-@dataclass(frozen=True)
-class _Read:
-    """What a rank has read."""
-
-    share: BalShare  # moved by minus the origin
-    origin: FloatArray  # (3,)
-    bundler: BundlerScene | None  # the whole
-
-
-def _read(path: Path, communicator: Communicator) -> _Read:
-    """Read this rank's share of a file."""
+def _read(path: Path, communicator: Communicator) -> tuple[BalShare, FloatArray, BundlerScene | None]:
+    """Return this rank's share of a file, moved by minus the origin, (3,) that, and of a scene of Bundler the whole."""
     scene = together(communicator, lambda: read_bundler(path) if is_bundler(path) else None)
     if scene is None:
         share = read_share(path, communicator)
@@ -150,7 +141,7 @@ def _read(path: Path, communicator: Communicator) -> _Read:
     origin = communicator.broadcast(None if points is None else middle_if_far(np.concatenate(points)))
     if origin.any():
         share = dataclasses.replace(share, bal=translated(share.bal, -origin))
-    return _Read(share, origin, None if communicator.rank else scene)
+    return share, origin, None if communicator.rank else scene
 
 
 def _digest(path: Path) -> str:

@@ -44,6 +44,7 @@ REASONS: dict[str, str] = {
 NOTICES: dict[str, str] = {
     "reordered": "A keyframe whose stamp lies before the newest one; it was sorted in.",
     "setup_unchecked": "A session whose set-up was not checked, as OpenCV (rosdep key python3-opencv) is missing.",
+    "no_shared_track": "A camera that shares no track with camera 0, though both see the same: it counts as one alone.",
     "repeated_guess": "A second guess for a track; the first one stays.",
     "ids_reused": "A track whose views went over to another point; the older views keep theirs under another id.",
     "repeated_factor": "A second relative pose of the same keyframes, or gravity at the same; the first one stays.",

@@ -12,14 +12,13 @@ sit on the body as the rig says, a solution is a compromise that each camera by 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ba_node import native
 from ba_node.arrays import FloatArray, IdArray, IntArray, ranges
 from ba_node.core import native_kernels, triangulation
-from ba_node.core.cameras import FX, FY, rays
 from ba_node.core.problem import Observations, Problem, State
 
 # One track in so many may sit a solve out: more would be missed by a small window.
@@ -91,7 +90,7 @@ def explained(
     tried, n_out = tracks
     rows, track = _views_of(tried, problem.observations.point)
     if kernels == "numpy" or native.kernels is None:
-        return _Trial(problem, rows, track, (len(tried), n_out)).explained(before, after)
+        return _explained(problem, (rows, track), (len(tried), n_out), (before, after))
     limits = MIN_PARALLAX, _BOUND, _BEHIND, _MIN_VIEWS, _MIN_RESIDUALS
     others = (len(tried), n_out), (*before, *after), limits
     found = native.kernels.explained(problem, (rows, track, np.empty(0)), *others)
@@ -110,101 +109,46 @@ def _views_of(tried: IntArray, point: IntArray) -> tuple[IntArray, IntArray]:
     return ranges(begin, end), np.repeat(np.arange(len(tried)), end - begin)
 
 
-class _Trial:
-    """Some tracks of a problem, to be tried with two sets of poses at once: each view stands in all arrays twice."""
-
-    def __init__(self, problem: Problem, rows: IntArray, track: IntArray, sizes: tuple[int, int]) -> None:
-        """Take the views ``rows`` out of a problem, each of a ``track``; see :func:`explained`."""
-        self._problem = problem
-        self._n_cam, (self._n_tried, self._n_out) = len(problem.cameras.model), sizes
-        self._rays(problem.observations, rows, track)
-
-    def _rays(self, obs: Observations, rows: IntArray, group: IntArray) -> None:
-        """Keep the rays of some observations, in the body, and to which track each belongs."""
-        cams, n_kf = self._problem.cameras, self._problem.n_keyframes
-        camera = obs.camera.take(rows)
-        ray = rays(obs.uv.take(rows, axis=0), cams.model.take(camera), cams.params.take(camera, axis=0))
-        good = np.isfinite(ray[:, 2])
-        if not good.all():
-            rows, group, camera, ray = rows[good], group[good], camera[good], ray[good]
-        turn = np.swapaxes(cams.rotation, 1, 2)
-        self._direction = np.tile(np.einsum("nij,nj->ni", turn.take(camera, axis=0), ray), (2, 1))
-        self._centres = -(turn @ cams.translation[:, :, None])[..., 0]
-        self._keyframe = _twice(obs.keyframe.take(rows), n_kf)
-        order, n_groups = np.arange(len(rows)), self._n_tried
-        if self._n_cam > 1:
-            # All views of each track, and then those of each camera.
-            alone = group * self._n_cam + camera
-            by_camera = np.argsort(alone, kind="stable")
-            group = np.concatenate([group, alone.take(by_camera) + self._n_tried])
-            order = np.concatenate([order, by_camera])
-            n_groups *= 1 + self._n_cam
-        self._order = _twice(order, len(rows))
-        self._views(obs, rows[order], group, n_groups)
-
-    def _views(self, obs: Observations, rows: IntArray, group: IntArray, n_groups: int) -> None:
-        """Keep the views by group, and which groups count."""
-        cams, n_kf = self._problem.cameras, self._problem.n_keyframes
-        keyframe, camera, sigma_px = obs.keyframe.take(rows), obs.camera.take(rows), obs.sigma_px.take(rows)
+def _explained(
+    problem: Problem, views: tuple[IntArray, IntArray], sizes: tuple[int, int], poses: tuple[Poses, Poses]
+) -> Explained:
+    """Return the same of observations, each of a track; ``sizes`` are numbers of tracks, and of those held out."""
+    (rows, track), (n_tried, n_out), n_cam = views, sizes, len(problem.cameras.model)
+    good = np.isfinite(triangulation.rays_in_cameras(problem, rows)[:, 2])
+    none = np.empty(0)
+    seen = replace(problem.observations.take(rows[good]), point=track[good], depth_m=none, depth_sigma_m=none)
+    held_out, mean = np.zeros(2), np.full((2, 1 + n_cam), np.nan)
+    of_all = [_Fit(problem, seen, n_tried, of) for of in poses]
+    noise_rad = 1.0 / median(of_all[0].rays.px_per_rad) if len(seen) else 0.0
+    # One camera is both: all, and alone.
+    for kind in range(1 + n_cam if n_cam > 1 else 1):
+        own = seen.take(np.flatnonzero(seen.camera == kind - 1)) if kind else seen
+        fits = [_Fit(problem, own, n_tried, of) for of in poses] if kind else of_all
         # Views by different keyframes; a track of fewer is explained by any poses.
-        key = group * n_kf + keyframe
-        distinct = np.ones(len(key), bool)
-        distinct[1:] = key[1:] != key[:-1]
-        self._group, self._n_groups = group, n_groups
-        self._counts = np.bincount(group[distinct], minlength=n_groups) >= _MIN_VIEWS
-        # 0 for all cameras together, then each alone; one camera is both.
-        self._of = np.where(group < self._n_tried, 0, 1 + camera)
-        uv, none = np.tile(obs.uv.take(rows, axis=0), (2, 1)), np.empty(0)
-        self._obs = Observations(
-            _twice(keyframe, n_kf), np.tile(camera, 2), _twice(group, n_groups), uv, np.tile(sigma_px, 2), none, none
-        )
-        px_per_rad = np.sqrt(cams.params[:, FX] * cams.params[:, FY]).take(camera) / sigma_px
-        self._noise_rad = 1.0 / median(px_per_rad) if len(rows) else 0.0
-        self._px_per_rad = np.tile(px_per_rad, 2)
-        self._image = _twice(keyframe * self._n_cam + camera, n_kf * self._n_cam)
-
-    def explained(self, before: Poses, after: Poses) -> Explained:
-        """Return how well two sets of poses explain the tracks."""
-        points, parallax, norms = self._tried(*(np.concatenate(pair) for pair in zip(before, after, strict=True)))
-        # Rays that are parallel by either set meet anywhere.
-        wide = (parallax > MIN_PARALLAX * self._noise_rad).all(axis=0)
-        rows = np.flatnonzero((self._counts & wide).take(self._group))
-        n = 1 + self._n_cam
-        count = np.bincount(self._of[rows], minlength=n)
-        sums = [np.bincount(self._of[rows], np.minimum(norm[rows], _BOUND), n) for norm in norms]
-        mean = np.where(count >= _MIN_RESIDUALS, np.array(sums) / np.maximum(count, 1), np.nan)
-        out = rows[self._group[rows] < self._n_out]
-        return Explained(
-            np.array([min(median(norm[out]), _BEHIND) if len(out) else 0.0 for norm in norms]),
-            mean,
-            median(parallax[1, : self._n_tried]) if self._n_tried else 0.0,
-            points[1, : self._n_out],
-        )
-
-    def _tried(self, rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return points (2, n_groups, 3) m, their parallax (2, n_groups) rad, and residuals (2, n_obs) sigmas."""
-        back = np.swapaxes(rotation, 1, 2)
-        centres = (back[:, None] @ (self._centres - translation[:, None, :])[..., None]).reshape(-1, 3)
-        directions = np.einsum("nij,nj->ni", back.take(self._keyframe, axis=0), self._direction)
-        nan = np.full(len(self._order), np.nan)
-        seen = triangulation.Rays(
-            self._obs.point,
-            centres.take(self._image, axis=0),
-            directions.take(self._order, axis=0),
-            self._px_per_rad,
-            nan,
-            nan,
-        )
-        found = triangulation.triangulate(seen, 2 * self._n_groups, "numpy")
-        state = State(rotation, translation, np.nan_to_num(found.points), np.empty((0, 3)))
-        problem = Problem(state, np.zeros(len(rotation), bool), self._problem.cameras, self._obs)
-        norms = native_kernels.residual_norms(problem, state, "numpy")
-        return found.points.reshape(2, -1, 3), found.parallax_rad.reshape(2, -1), norms.reshape(2, -1)
+        by_keyframe = np.unique(own.point * problem.n_keyframes + own.keyframe)
+        counts = np.bincount(by_keyframe // problem.n_keyframes, minlength=n_tried) >= _MIN_VIEWS
+        for fit in fits:  # rays that are parallel by either set meet anywhere
+            counts &= fit.found.parallax_rad > MIN_PARALLAX * noise_rad
+        counted, is_out = counts[own.point], own.point < n_out
+        for i, fit in enumerate(fits):
+            if np.count_nonzero(counted) >= _MIN_RESIDUALS:
+                mean[i, kind] = np.minimum(fit.norms[counted], _BOUND).mean()
+            if kind == 0 and (counted & is_out).any():
+                held_out[i] = min(median(fit.norms[counted & is_out]), _BEHIND)
+    found = of_all[1].found
+    return Explained(held_out, mean, median(found.parallax_rad) if n_tried else 0.0, found.points[:n_out])
 
 
-def _twice(index: IntArray, n: int) -> IntArray:
-    """Return indices into a list of n, and once more into another list after it."""
-    return np.concatenate([index, index + n])
+class _Fit:
+    """Points of some observations as one set of poses sees them, and the residuals of these (n_obs,), sigmas."""
+
+    def __init__(self, problem: Problem, seen: Observations, n_points: int, poses: Poses) -> None:
+        state = State(*poses, np.zeros((n_points, 3)), np.empty((0, 3)))
+        tried = Problem(state, np.zeros(len(poses[0]), bool), problem.cameras, seen)
+        self.rays = triangulation.rays_of(tried, "numpy")
+        self.found = triangulation.triangulate(self.rays, n_points, "numpy")
+        state = replace(state, points=np.nan_to_num(self.found.points))
+        self.norms = native_kernels.residual_norms(tried, state, "numpy")
 
 
 def median(values: FloatArray) -> float:

@@ -128,3 +128,11 @@ def test_a_recording_that_plays_again_is_no_step() -> None:
             backend.add(one)
     assert "clock_step" not in backend.scene.log.warnings
     assert backend.map.index == 1, "the second lap is a map of its own"
+
+
+def test_steps_are_told_from_a_tenth_of_a_second_on() -> None:
+    """Below that there is nothing to look at, however even the keyframes come."""
+    time = 0.5 * np.arange(N)
+    late = np.random.default_rng(0).uniform(0.0, 1e-3, N)
+    for step_s, at in ((0.102, [23]), (-0.102, [23]), (0.098, []), (-0.098, []), (0.04, []), (0.06, [])):
+        assert [k for k, _ in clock_steps(time + step_s * (np.arange(N) >= 23), time + late)] == at, step_s

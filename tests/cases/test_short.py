@@ -29,6 +29,19 @@ def test_a_baseline_is_compared_once_more_at_the_end(
     outcome.tells("baseline|scale of focal")
 
 
+@pytest.mark.parametrize(
+    ("fault", "keyframes", "words"), [("axes_confused", 5, "axes"), ("poses_inverted", 8, "invert")]
+)
+def test_a_few_keyframes_tell_what_is_plain(
+    fault: str, keyframes: int, words: str, tmp_path: Path, run: Replay
+) -> None:
+    recording = spoiled(fault, "mono", seed=603, keyframes=keyframes, length_m=10.0)
+    outcome = run(write(tmp_path, recording))
+    assert outcome.code == 3, outcome.words
+    harmless(outcome.errors(recording.truth), 1.0, keyframes)
+    outcome.tells(words)
+
+
 def test_each_of_two_sessions_is_compared_at_its_end(tmp_path: Path, run: Replay) -> None:
     recording = spoiled_by([("session_lowered", 3.0), ("baseline_off", 1.3)], "stereo", 88)
     outcome = run(write(tmp_path, recording))
@@ -70,3 +83,12 @@ def test_depths_that_change_their_unit_near_the_end_are_named(
     (found,) = outcome.errors(recording.truth)
     assert found.published_m < 0.5 * found.input_m, "the images go on without them"
     outcome.tells(rf"depth_m of \d+ keyframes \({late} to \d+\).*{unit}")
+
+
+@pytest.mark.slow
+def test_a_baseline_that_is_off_by_little_is_said_and_the_result_stays(tmp_path: Path, run: Replay) -> None:
+    recording = spoiled("baseline_off", "stereo", 0.98, 401, path="loop", length_m=30.0, keyframes=60)
+    outcome = run(write(tmp_path, recording))
+    assert outcome.code == 3, outcome.words
+    outcome.tells("scale of focal length or baseline: lengths are 0.98")
+    assert outcome.report["keyframes_refined"] == len(recording.keyframes)

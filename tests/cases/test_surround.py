@@ -62,6 +62,18 @@ def test_sound_rig_is_refined(seed: int, tmp_path: Path, run: Replay) -> None:
     assert error.published_m < 0.25 * error.input_m, f"{error.input_m:.4f} -> {error.published_m:.4f} m"
 
 
+@pytest.mark.parametrize("path", ["line", "loop"])
+def test_cameras_that_look_at_the_same_may_be_tracked_one_by_one(path: str, tmp_path: Path, run: Replay) -> None:
+    recording = spoiled(SOUND, "stereo", seed=903, path=path).changed(
+        FeatureTracks,
+        lambda image: dataclasses.replace(image, track_id=2 * image.track_id + np.uint64(image.camera_index)),
+    )
+    outcome = run(write(tmp_path, recording))
+    assert outcome.code == 0 and outcome.report["attention"] == [], outcome.words
+    assert outcome.report["notices"]["no_shared_track"] == 1
+    harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
+
+
 @pytest.mark.parametrize(
     ("edit", "options", "looks", "named"),
     [

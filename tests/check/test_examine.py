@@ -20,7 +20,7 @@ from ba_node.scene.scene import Scene
 from experiments.robustness.faults import spoiled
 from experiments.synthetic import SyntheticOptions, generate
 from experiments.synthetic.world import Path, World
-from tests.check.set_ups import recording, seen
+from tests.check.set_ups import poses, recording, seen
 from tests.window.street import round_trip
 
 # Mistake -> modes in which it shows, and what the likely mistake says.
@@ -65,7 +65,6 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "inverse depth": (("rgbd",), "depth_m holds inverse depths"),
     "normalised": (("stereo", "mono"), "image coordinates are not in pixels"),
     "ids of each camera": (("stereo",), "track ids of cameras 0 and 1 do not name the same points"),
-    "other ids of each camera": (("stereo",), "cameras 0 and 1 share no track, though they look at the same"),
     "slots": (("stereo", "mono"), "ids reused"),
     "ids modulo 200": (("stereo", "mono", "rgbd"), "ids reused"),
     "rows for ids": (("stereo", "mono", "rgbd"), "ids reused"),
@@ -102,10 +101,23 @@ def test_mistake_is_named(wrong: str, mode: str) -> None:
     found = examine(seen(recording(wrong=wrong, mode=mode)))
     assert re.search(NAMED[wrong][1], found.causes()), found.summary()
     assert found.harmful == (
-        wrong not in ("other ids of each camera", "slots", "ids modulo 200", "rows for ids")
-        and not wrong.startswith(("stamps", "sigma"))
+        wrong not in ("slots", "ids modulo 200", "rows for ids") and not wrong.startswith(("stamps", "sigma"))
     )
     assert all(finding.changes for finding in found.findings)
+
+
+@pytest.mark.parametrize("keyframes", [10, 25])
+def test_cameras_that_are_tracked_one_by_one_are_no_mistake(keyframes: int) -> None:
+    found = examine(seen(recording(wrong="other ids of each camera"), keyframes))
+    assert found.findings == [] and found.notices == ["no_shared_track"], found.summary()
+    assert any("cameras 0 and 1 share no track" in text for text in found.sound), found.summary()
+
+
+def test_two_cameras_without_a_common_track_are_named_where_the_steps_tell_no_scale() -> None:
+    still = poses(lambda rotation, position, _: (rotation, np.repeat(position[:1], len(position), axis=0)))
+    found = examine(seen(still(recording(wrong="other ids of each camera"))))
+    assert "cameras 0 and 1 share no track, though they look at the same" in found.causes(), found.summary()
+    assert found.notices == []
 
 
 @pytest.mark.parametrize("wrong", ["baseline reversed", "extrinsics inverted", "axes missing"])
@@ -118,6 +130,12 @@ def test_two_cameras_tell_after_three_keyframes(wrong: str) -> None:
 def test_one_camera_tells_after_ten_keyframes(wrong: str) -> None:
     found = examine(seen(recording(wrong=wrong, mode="mono"), keyframes=10))
     assert re.search(NAMED[wrong][1], found.causes()), found.summary()
+
+
+@pytest.mark.parametrize("wrong", ["axes missing", "extrinsics inverted"])
+def test_one_camera_tells_after_five_keyframes_what_is_plain(wrong: str) -> None:
+    found = examine(seen(recording(wrong=wrong, mode="mono", path="line"), keyframes=5))
+    assert "axes confused" in found.causes(), found.summary()
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_numbers_worked_out_by_hand() -> None:
     assert summary.std == pytest.approx(np.sqrt(30 / 4 - 4))
     assert summary.sse == pytest.approx(30.0)
     assert summary.min == 0.0
-    assert set(summary.as_dict()) == {"rmse", "mean", "median", "max", "std", "count", "min", "sse"}
+    assert set(vars(summary)) == {"rmse", "mean", "median", "max", "std", "count", "min", "sse"}
 
 
 def test_rotation_error_is_the_angle_between_the_poses() -> None:

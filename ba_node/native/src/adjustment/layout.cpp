@@ -224,30 +224,36 @@ void Layout::index_by_keyframe() {
 }
 
 void Layout::list_observations() {
-  const std::int64_t partials = n_lists(), lists = partials * n_free;
-  Buffer<std::int32_t> column_of_image(images.size());
-  for (std::size_t m = 0; m < images.size(); ++m) column_of_image[m] = column_[images[m] / n_cameras];
-  // take(list, observation, where its point is)
-  const auto each = [&](auto take) {
-    for (std::int64_t partial = 0; partial < partials; ++partial)
-      for (std::int64_t b = sections[partial]; b < (partials > 1 ? sections[partial + 1] : n_batches); ++b)
-        for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at) {
-          if (inverse_sigma[at] == 0.0) continue;
-          const std::int64_t k = column_of_image[slot_image[at]];
-          if (k >= 0) take(partial * n_free + k, at, 3 * kLanes * b + at % kLanes);
-        }
-  };
+  const std::int64_t partials = n_lists(), size = kLanes * n_slots();
+  const auto lists = static_cast<std::int32_t>(partials * n_free);
+  // Where nothing is listed, as beside a batch's shorter points and in fixed keyframes, the list is one more, which is
+  // cut off in the end: what is listed follows no pattern that a processor could foresee.
+  Buffer<std::int32_t> list_of_image(images.size()), list(size), next(lists + 1, 0);
+  for (std::int64_t partial = 0; partial < partials; ++partial) {
+    for (std::size_t m = 0; m < images.size(); ++m) {
+      const std::int32_t column = column_[images[m] / n_cameras];
+      list_of_image[m] = column < 0 ? lists : static_cast<std::int32_t>(partial * n_free) + column;
+    }
+    const std::int64_t end = partials > 1 ? sections[partial + 1] : n_batches;
+    for (std::int64_t at = kLanes * slot_begin[sections[partial]]; at < kLanes * slot_begin[end]; ++at) {
+      list[at] = inverse_sigma[at] == 0.0 ? lists : list_of_image[slot_image[at]];
+      ++next[list[at]];
+    }
+  }
   list_begin.assign(lists + 1, 0);
-  each([this](std::int64_t list, std::int64_t, std::int64_t) { ++list_begin[list + 1]; });
-  for (std::int64_t i = 0; i < lists; ++i)
-    list_begin[i + 1] = list_begin[i] + (list_begin[i + 1] + kLanes - 1) / kLanes * kLanes;
-  listed.assign(list_begin[lists], static_cast<std::int32_t>(kLanes * n_slots()));
+  for (std::int32_t i = 0; i < lists; ++i) list_begin[i + 1] = list_begin[i] + (next[i] + kLanes - 1) / kLanes * kLanes;
+  listed.assign(list_begin[lists] + next[lists], static_cast<std::int32_t>(size));
   listed_point.assign(listed.size(), 0);
-  Buffer<std::int64_t> next(list_begin.begin(), list_begin.end());
-  each([this, &next](std::int64_t list, std::int64_t at, std::int64_t x) {
-    listed[next[list]] = static_cast<std::int32_t>(at);
-    listed_point[next[list]++] = static_cast<std::int32_t>(x);
-  });
+  std::copy(list_begin.begin(), list_begin.end(), next.begin());
+  for (std::int64_t b = 0; b < n_batches; ++b) {
+    for (std::int64_t at = kLanes * slot_begin[b]; at < kLanes * slot_begin[b + 1]; ++at) {
+      const std::int32_t place = next[list[at]]++;
+      listed[place] = static_cast<std::int32_t>(at);
+      listed_point[place] = static_cast<std::int32_t>(3 * kLanes * b + at % kLanes);
+    }
+  }
+  listed.resize(list_begin[lists]);
+  listed_point.resize(list_begin[lists]);
 }
 
 void Layout::cut_chunks() {
