@@ -24,6 +24,8 @@ _BACK_NS = 1_000_000_000
 _USUAL = 3
 # An optical axis farther from the middle than this share of the image is that of another image.
 _OFF_CENTRE = 0.25
+# Of so many rows two are looked at for a mosaic, whose greens differ from the others by this share.
+_ROWS, _MOSAIC = 32, 0.03
 # A pair of which so few features have a partner is looked at with left and right exchanged.
 _FEW_PARTNERS = 0.25
 # No depth camera sees so far, or so near, m.
@@ -85,6 +87,13 @@ class ImageWatch:
                     f" {size[0]} x {size[1]} px: check that its calibration is of this resolution",
                     notes,
                 )
+        if self._before is None and any(_is_mosaic(grey) for grey in images.grey):
+            self.say(
+                "mosaic",
+                f"images at {images.stamp_ns} ns look like a mosaic of colours taken for grey: give their encoding as"
+                " bayer_rggb8, bayer_bggr8, bayer_gbrg8 or bayer_grbg8",
+                notes,
+            )
         if float(images.grey[0][::4, ::4].std()) < _DARK:
             self.say(
                 "dark",
@@ -195,6 +204,15 @@ class ImageWatch:
                 " and that the rig is theirs",
                 notes,
             )
+
+
+def _is_mosaic(image: Grey) -> bool:
+    """Return whether pixels differ, on average, as the black and the white squares of a chessboard do."""
+    if min(image.shape) < 2:
+        return False
+    upper, lower = (rows.mean(axis=0, dtype=np.float32) for rows in (image[:-1:_ROWS], image[1::_ROWS]))
+    differ = (upper - lower)[::2].mean() - (upper - lower)[1::2].mean()
+    return bool(abs(differ) > 2.0 * max(_MOSAIC * float(upper.mean()), 1.0))
 
 
 def _same(image: Grey | Floats, before: Grey | Floats | None) -> bool:

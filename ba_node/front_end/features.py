@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.front_end.opencv import cv2
@@ -61,14 +62,12 @@ def _apart(found: FloatArray, taken: FloatArray, distance: float) -> FloatArray:
     """Leave out corners that are too near to one that was there, or to a stronger one (those come first)."""
     if not len(found):
         return found
-    limit = distance * distance
-    found = found[_squares(found, taken).min(axis=1, initial=np.inf) > limit]
-    return np.asarray(found[~np.tril(_squares(found, found) < limit, -1).any(axis=1)])
-
-
-def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return squared distances: (n, m)."""
-    return np.asarray((a[:, None, 0] - b[None, :, 0]) ** 2 + (a[:, None, 1] - b[None, :, 1]) ** 2)
+    if len(taken):
+        found = found[cKDTree(taken).query(found)[0] > distance]
+    if not len(found):
+        return found
+    pairs = cKDTree(found).query_pairs(np.nextafter(distance, 0.0), output_type="ndarray")
+    return np.asarray(np.delete(found, pairs[:, 1], axis=0))
 
 
 def follow(before: Grey, now: Grey, uv: FloatArray, expected: FloatArray | None) -> tuple[FloatArray, BoolArray]:

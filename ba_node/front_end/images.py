@@ -115,7 +115,7 @@ def _decoded(message: Any, begin: int) -> NDArray[Any]:
     data = np.frombuffer(bytes(message.data)[begin:], np.uint8)
     image = cv2().imdecode(data, cv2().IMREAD_UNCHANGED) if len(data) else None
     if image is None:
-        raise FrontEndError(f"compressed image of format {message.format!r} and {len(data)} bytes cannot be decoded")
+        raise FrontEndError(f"compressed image ({message.format}, {len(data)} bytes) cannot be decoded")
     return np.asarray(image)
 
 

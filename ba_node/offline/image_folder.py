@@ -48,6 +48,8 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _TIME_DIGITS, _UNITS_NS, _LATEST_NS, _STEPS_NS = 10, (10**9, 10**6, 10**3, 1), 5 * 10**18, (10**6, 10**10)
 # Numbers that are further apart (median) do not count pictures.
 _MOST_APART = 10
+# Share of pictures that are named alike, above which the others are slips.
+_USUAL = 0.75
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class PictureFolder:
     path: Path
     mode: str  # stereo, rgbd or mono
     pictures: tuple[list[Path], ...]  # of each camera, by time
+    aside: tuple[Path, ...] = ()  # pictures whose names tell neither their number nor their place among the others
 
     def stamps(self, rate_hz: float) -> list[list[int]]:
         """Return when each picture was taken, ns, by camera.
@@ -70,7 +73,9 @@ class PictureFolder:
         times = self.path / "times.txt"
         if times.exists():
             seconds = _times(times)
-            if len(seconds) < len(rank):
+            if len(seconds) > max(rank):  # a line an image, though some pictures are missing
+                rank = {place: place for place in rank}
+            elif len(seconds) != len(rank):
                 raise BagError(f"{times}: {len(seconds)} lines for {len(rank)} pictures: expected a time for each")
             unit = _unit_ns(seconds)
             return [[round(seconds[rank[place]] * unit) for place in camera] for camera in places]
@@ -121,16 +126,29 @@ def find_pictures(path: Path) -> PictureFolder:
         for kind, names in FOLDERS.items():
             first, second = (_first(root, some) for some in names)
             if first and (second or not pictures_in(root)):
-                return PictureFolder(root, kind if second else "mono", (first, second) if second else (first,))
+                return _named(root, kind if second else "mono", (first, second) if second else (first,))
         files = pictures_in(root)
         if files:
             sides = _by_side(files)
-            return PictureFolder(root, "stereo" if sides else "mono", sides or (files,))
+            return _named(root, "stereo" if sides else "mono", sides or (files,))
     elsewhere = sorted({str(file.parent.relative_to(path)) for file in path.rglob("*") if _is_picture(file)})
     there = f"; there are pictures in {', '.join(elsewhere[:6])}: call them left and right" if elsewhere else ""
     raise BagError(
         f"{path}: no pictures ({', '.join(PICTURES)}), neither here nor in left/ and right/, rgb/ and depth/{there}"
     )
+
+
+def _named(root: Path, mode: str, pictures: tuple[list[Path], ...]) -> PictureFolder:
+    """Return a folder; where numbers come twice, without the few pictures that are named in another way."""
+    kept, aside = [], []
+    for files in pictures:
+        ways = [file.stem.replace(_number_of(file) or file.stem, "#", 1) for file in files]
+        usual = max(ways, key=ways.count)
+        alike = [file for file, way in zip(files, ways, strict=True) if way == usual]
+        few = len({Decimal(_number_of(file) or -1) for file in files}) < len(files) and len(alike) > _USUAL * len(files)
+        kept.append(alike if few else files)
+        aside += [file for file in files if file not in kept[-1]]
+    return PictureFolder(root, mode, tuple(kept), tuple(aside))
 
 
 def pictures_in(folder: Path) -> list[Path]:
@@ -221,7 +239,7 @@ class Picture:
     """A file, with the fields of a CompressedImage."""
 
     def __init__(self, file: Path) -> None:
-        self._file, self.format = file, file.suffix[1:]
+        self._file, self.format = file, f"{file.parent.name}/{file.name}"
 
     @property
     def data(self) -> bytes:

@@ -41,6 +41,8 @@ _FIXED = "odom"
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _QUEUE = 100
+# Share of the first camera's period within which an image of another is near one of it.
+_NEAR = 0.75
 # Bytes of a message until after its header's stamp.
 _STAMPED = 12
 
@@ -234,8 +236,10 @@ def _paired(
 ) -> Iterator[tuple[Images, Transform | None]]:
     """Yield images by time, of entries (stream, stamp in ns, message) in order; each waits until its pose is known."""
     streams, waiting = Streams(MODES[source.mode], frozenset(), _QUEUE), deque[Frame]()
+    came: dict[str, list[int]] = {name: [] for name in MODES[source.mode]}
     source.counted.clear()
     for name, stamp_ns, message in entries:
+        came[name].append(stamp_ns)
         waiting += streams.put(name, stamp_ns, message)
         while waiting and (poses is None or poses.covers(waiting[0].stamp_ns)):
             yield from _read(source, waiting.popleft(), poses)
@@ -244,8 +248,29 @@ def _paired(
     source.counted.update(streams.counted)
     for name, apart_ns in streams.apart_ns.items():
         source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+    first, *others = came
+    for name in others:
+        alone, nearest_ns = _alone(came[first], came[name])
+        if alone:
+            source.counted[f"{name} alone"] = alone
+            source.notes[f"{name} alone"] = f"the nearest of {first} is {nearest_ns / 1e6:+.1f} ms off"
     if poses is not None and poses.sparse:
         source.warnings["sparse odometry"] = poses.sparse
+
+
+def _alone(first_ns: Sequence[int], other_ns: Sequence[int]) -> tuple[int, int]:
+    """Return how many images of a second camera have none of the first near them, and how far off that is of the last.
+
+    Near is by how often the first camera has images, the second one may have more.
+    """
+    if len(first_ns) < 2:
+        return 0, 0
+    first, other = np.unique(first_ns), np.asarray(other_ns, dtype=np.int64)
+    at = np.clip(np.searchsorted(first, other), 1, len(first) - 1)
+    after, before = first[at] - other, first[at - 1] - other
+    off = np.where(np.abs(after) < np.abs(before), after, before)
+    off = off[np.abs(off) > _NEAR * np.median(np.diff(first))]
+    return len(off), int(off[-1]) if len(off) else 0
 
 
 def _messages(
@@ -316,6 +341,9 @@ def _of_folder(path: Path, request: ImageRequest) -> ImageSource:
         return _paired(source, files, request.poses)
 
     source = ImageSource(rig, mode, len(found.pictures[0]), read)
+    if found.aside:
+        words = ", ".join(str(file.relative_to(path)) for file in found.aside[:3])
+        source.warnings["names"] = f"left out {len(found.aside)} pictures, which are not named as the others: {words}"
     return source
 
 

@@ -162,11 +162,15 @@ CASES = {
     "bayer_rggb16": Case(encoded("bayer_rggb16", lambda pixels: deep(bayer("rggb", pixels)))),
     "grey_called_colour": Case(encoded("rgb8", lambda pixels: pixels), 2, "expected 960 bytes a row"),
     "colour_called_grey": Case(encoded("mono8", colour), 2, "with 960 bytes a row: 3 times what mono8 has"),
+    "a_mosaic_called_grey": Case(
+        encoded("mono8", functools.partial(bayer, "rggb")), 3, "look like a mosaic of colours"
+    ),
     "an_unknown_encoding": Case(
         each(lambda one: {"encoding": "hsv8" if one.number == 3 else "mono8"}), 3, "encoding 'hsv8'"
     ),
     "dropped_pairs": Case(without(2, 5)),
     "dropped_images": Case(without(2, 5, sides=("right",)), 3, "left out 2 images: no right/image_raw"),
+    "dropped_first_images": Case(without(2, 5, sides=("left",)), 3, "left out 2 images: right/image_raw alone"),
     "unsynchronised_by_20_ms": Case(late("right", 20_000_000), 3, "the second image is +20.0 ms off the first"),
     "unsynchronised_by_60_ms": Case(late("right", 60_000_000), 3, "the second image is -40.0 ms off the first"),
     "swapped": Case(swapped, 2, "left and right images seem to be exchanged"),

@@ -77,9 +77,33 @@ def test_a_picture_that_is_missing_leaves_a_gap(tmp_path: Path) -> None:
     source, frames = read(tmp_path)
     assert [images.stamp_ns // STEP_NS for images, _ in frames] == [0, 2, 4, 5]
     assert all(np.array_equal(*images.grey) for images, _ in frames)
-    assert source.counted == {"no right/image_raw": 1}
-    (tmp_path / "times.txt").write_text("0\n1\n2\n3\n4\n5\n")
-    assert [images.stamp_ns // 10**9 for images, _ in read(tmp_path)[1]] == [0, 2, 4, 5]
+    assert source.counted == {"no right/image_raw": 1, "right/image_raw alone": 1}
+    assert "-100.0 ms off" in source.notes["right/image_raw alone"]
+    for line_of_both in (False, True):
+        (tmp_path / "times.txt").write_text("0\n1\n2\n3\n4\n5\n")
+        assert [images.stamp_ns // 10**9 for images, _ in read(tmp_path)[1]] == [0, 2, 4, 5]
+        (tmp_path / "left" / "000003.png").unlink(missing_ok=line_of_both)  # now neither camera has it
+    (tmp_path / "times.txt").write_text("0\n1\n2\n3\n5\n")
+    assert [images.stamp_ns // 10**9 for images, _ in read(tmp_path)[1]] == [0, 2, 3, 5]
+    (tmp_path / "times.txt").write_text("0\n1\n2\n3\n")
+    with pytest.raises(BagError, match="4 lines for 5 pictures"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["left", "right"])
+def test_a_picture_that_is_named_amiss_spoils_no_other(place: str, tmp_path: Path) -> None:
+    """Its number is that of another: by their order all after it would be paired with the wrong ones."""
+    for camera in ("left", "right"):
+        folder(tmp_path, {camera: [f"{i:06d}.png" for i in range(8)]}, rig_yaml=RIG)
+    (tmp_path / place / "000004.png").rename(tmp_path / place / "0000O4.png")
+    source, frames = read(tmp_path)
+    assert [images.stamp_ns // STEP_NS for images, _ in frames] == [0, 1, 2, 3, 5, 6, 7]
+    assert all(np.array_equal(*images.grey) for images, _ in frames)
+    assert source.warnings == {"names": f"left out 1 pictures, which are not named as the others: {place}/0000O4.png"}
+    assert list(source.counted.values()) == [1]
+    (tmp_path / place / "000006.png").write_bytes(b"")
+    source, frames = read(tmp_path)
+    assert len(frames) == 6 and f"{place}/000006.png, 0 bytes" in source.notes["unreadable"]
 
 
 @pytest.mark.parametrize(

@@ -57,12 +57,50 @@ class Sampler {
   std::vector<std::int32_t> column_, row_;
 };
 
-// Values at uv (n, 2) by offsets (m, 2).
+// Offsets that are whole pixels side by side: from one of them on, so many.
+struct Run {
+  std::int64_t begin, length, dx, dy;
+};
+
+// Returns the runs of offsets (m, 2), none if one of them is not whole, and sets how far they reach: x, y least and
+// most.
+inline std::vector<Run> runs_of(const float* offsets, std::int64_t m, std::array<std::int64_t, 4>& reach) {
+  std::vector<Run> runs;
+  for (std::int64_t j = 0; j < m; ++j) {
+    const auto dx = static_cast<std::int64_t>(offsets[2 * j]), dy = static_cast<std::int64_t>(offsets[2 * j + 1]);
+    if (static_cast<float>(dx) != offsets[2 * j] || static_cast<float>(dy) != offsets[2 * j + 1]) return {};
+    if (!runs.empty() && runs.back().dy == dy && runs.back().dx + runs.back().length == dx)
+      ++runs.back().length;
+    else
+      runs.push_back({j, 1, dx, dy});
+    reach = {std::min(reach[0], dx), std::max(reach[1], dx), std::min(reach[2], dy), std::max(reach[3], dy)};
+  }
+  return runs;
+}
+
+// Values at uv (n, 2) by offsets (m, 2). Inside the image all pixels of a patch lie alike between those of the image.
 inline void cut_patches(const ImageView& image, const double* uv, std::int64_t n, const float* offsets, std::int64_t m,
                         float* out) {
   Sampler sampler(image, m);
+  std::array<std::int64_t, 4> reach{};
+  const std::vector<Run> runs = runs_of(offsets, m, reach);
   for (std::int64_t i = 0; i < n; ++i, out += m) {
     const auto u = static_cast<float>(uv[2 * i]), v = static_cast<float>(uv[2 * i + 1]);
+    if (!runs.empty() && u + reach[0] >= 0.0F && u + reach[1] < image.width - 1 && v + reach[2] >= 0.0F &&
+        v + reach[3] < image.height - 1) {
+      const auto column = static_cast<std::int64_t>(u), row = static_cast<std::int64_t>(v);
+      const float right = u - static_cast<float>(column), down = v - static_cast<float>(row);
+      for (const Run& run : runs) {
+        const float* above = image.at + (row + run.dy) * image.width + column + run.dx;
+        const float* below = above + image.width;
+        for (std::int64_t j = 0; j < run.length; ++j) {
+          const float upper = above[j] + right * (above[j + 1] - above[j]);
+          const float lower = below[j] + right * (below[j + 1] - below[j]);
+          out[run.begin + j] = upper + down * (lower - upper);
+        }
+      }
+      continue;
+    }
     float *x = sampler.x(), *y = sampler.y();
     for (std::int64_t j = 0; j < m; ++j) {
       x[j] = u + offsets[2 * j];
