@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
     write_result(
         args.json,
         {
-            "error_m": {name: error.translation.as_dict() for name, error in errors.items()},
-            "error_deg": {name: error.rotation.as_dict() for name, error in errors.items()},
+            "error_m": {name: vars(error.translation) for name, error in errors.items()},
+            "error_deg": {name: vars(error.rotation) for name, error in errors.items()},
             "facts": dict(_rows(outcome)),
         },
     )
