@@ -98,6 +98,7 @@ def test_keyframes_that_come_all_at_once_are_refined_together(seed: int, baselin
     assert len(estimate.cloud) > 50
 
 
+@pytest.mark.slow
 def test_a_replay_solves_once_for_every_keyframe() -> None:
     data = recording(landmarks=2000, tracks=120)
     estimates = replay(Backend(Config()), (m for _, _, m in data.timeline()))
@@ -108,12 +109,14 @@ def test_a_replay_solves_once_for_every_keyframe() -> None:
     assert estimates[0].report.reason == "one keyframe only: nothing to refine against"
 
 
+@pytest.mark.slow
 def test_the_same_stream_gives_the_same_bits() -> None:
     stream = messages(outlier_share=0.1)
     first, second = (replay(Backend(Config()), stream) for _ in range(2))
     assert all(same(a, b) for a, b in zip(first, second, strict=True))
 
 
+@pytest.mark.slow
 def test_the_order_of_the_topics_does_not_matter() -> None:
     data = recording(guesses=True)
     as_published = [m for _, _, m in data.timeline()]
@@ -199,6 +202,7 @@ def test_keyframes_that_came_while_solving_are_solved_together() -> None:
     assert backend.scene.keyframes.refined.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_topic", [False, True])
 def test_more_keyframes_at_once_than_a_window_holds(by_topic: bool) -> None:
     data = recording(keyframes=30, landmarks=2000, tracks=120, length_m=30.0, outlier_share=0.0)
@@ -241,6 +245,7 @@ def test_no_keyframe_no_estimate() -> None:
     assert Backend(Config()).solve() is None
 
 
+@pytest.mark.slow
 def test_a_higher_session_begins_a_new_map_and_keeps_the_rig() -> None:
     stream = messages()
     later = [in_session(m, 5) for m in stream[1:] if not isinstance(m, CameraRig)]
@@ -329,6 +334,7 @@ def test_rms_counts_every_observation() -> None:
         backend.map.rms_px("middle")
 
 
+@pytest.mark.slow
 def test_stamps_that_jump_back_begin_a_new_session_with_the_same_result() -> None:
     once = messages()
     backend = Backend(Config().with_values({"scene.max_reorder_s": 1.0}))

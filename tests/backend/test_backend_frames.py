@@ -40,6 +40,7 @@ def matrix(position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
     return out
 
 
+@pytest.mark.slow
 def test_the_correction_leads_from_odometry_to_the_refined_pose() -> None:
     data = data_of()
     estimates = run(Backend(Config()), stream_of(data))
@@ -58,12 +59,14 @@ def test_the_correction_leads_from_odometry_to_the_refined_pose() -> None:
     assert estimates[0].correction is None, "one keyframe gives none"
 
 
+@pytest.mark.slow
 def test_a_gate_holds_the_correction_and_the_report_says_so() -> None:
     config = Config().with_values({"frames.gate_m": 1e-6, "frames.gate_confirmations": 1000})
     reports = [e.report for e in run(Backend(config), stream_of(data_of())) if e.report.status.usable]
     assert [report.correction_held for report in reports] == [False] + [True] * (len(reports) - 1)
 
 
+@pytest.mark.slow
 def test_a_new_session_begins_without_a_correction() -> None:
     data = data_of()
     backend = Backend(Config())
@@ -77,6 +80,7 @@ def test_a_new_session_begins_without_a_correction() -> None:
     assert (estimate.report.session_id, estimate.correction) == (1, None)
 
 
+@pytest.mark.slow
 def test_names_of_frames_come_from_the_parameters_or_the_keyframes() -> None:
     named = Config().with_values({"frames.map_frame": "world", "frames.odom_frame": "vo"})
     last = run(Backend(named), stream_of(data_of()))[-1]
@@ -100,6 +104,7 @@ def as_of_camera(measurement: Measurement, rig: CameraRig) -> Measurement:
     )
 
 
+@pytest.mark.slow
 def test_poses_of_the_camera_give_the_same_map_and_come_back_as_such() -> None:
     data = data_of()
     # Steps of the camera are not as precise as those of the body, by their lever arm: without them.
@@ -123,6 +128,7 @@ def test_a_rig_that_cannot_be_used_is_counted_also_with_poses_of_the_camera() ->
     assert backend.map.rejected == {"bad_rig": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("baseline_m", [0.2, 0.0], ids=["stereo", "one camera"])
 def test_extras_are_worked_out_only_when_asked_for(baseline_m: float) -> None:
     backend = Backend(Config().with_values({"window.max_keyframes": 5}))

@@ -9,6 +9,7 @@ import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -63,6 +64,7 @@ def spoiled(draw: st.DrawFn, m: Measurement) -> Measurement:
 
 
 # Shrinking a stream takes minutes, and the last lines of a failure tell as much.
+@pytest.mark.slow
 @settings(max_examples=40, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(streams())
 def test_no_stream_breaks_the_back_end(stream: list[Measurement]) -> None:

@@ -77,6 +77,7 @@ def estimate_bits(estimate: Estimate | None) -> Any:
     return arrays, estimate.report, estimate.stamp_ns, estimate.frame_id
 
 
+@pytest.mark.slow
 @settings(max_examples=15, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(cut_streams())
 def test_a_copy_goes_on_as_the_first_does(drawn: tuple[list[Measurement], int]) -> None:

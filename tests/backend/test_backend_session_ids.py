@@ -45,6 +45,7 @@ def _tracks(**changes: Any) -> FeatureTracks:
     return dataclasses.replace(data().tracks[5][0], sigma_px=empty, depth_m=empty, **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("session", [1, 2**32 - 1])
 @pytest.mark.parametrize("what", USELESS)
 def test_one_message_of_a_higher_session_does_not_end_the_map(what: str, session: int) -> None:
@@ -56,6 +57,7 @@ def test_one_message_of_a_higher_session_does_not_end_the_map(what: str, session
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", sorted(set(USELESS) - {"a keyframe without a pose", "a sound keyframe"}))
 def test_one_message_of_a_higher_session_does_not_open_the_first_one(what: str) -> None:
     stray = changed([USELESS[what]()], session_id=7)
@@ -64,6 +66,7 @@ def test_one_message_of_a_higher_session_does_not_open_the_first_one(what: str) 
     assert played.map.rejected.total() == 1, played.map.rejected
 
 
+@pytest.mark.slow
 def test_tracks_and_guesses_that_come_before_the_first_keyframe_of_their_session_are_used() -> None:
     first, *others = groups()
     backwards = joined([first[::-1], *others])
@@ -74,6 +77,7 @@ def test_tracks_and_guesses_that_come_before_the_first_keyframe_of_their_session
         assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
+@pytest.mark.slow
 def test_what_waits_for_a_session_is_bounded() -> None:
     ahead = changed([t for both in data().tracks for t in both], session_id=9)
     played = Played([*messages(), *ahead], final=False, settings={"scene.max_pending": 10})
@@ -83,6 +87,7 @@ def test_what_waits_for_a_session_is_bounded() -> None:
     assert "of session 9, which no keyframe began" in played.rejection_notes[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("session", [3, 0])
 def test_a_front_end_that_restarts_with_a_lower_session_is_not_refused_for_ever(session: int) -> None:
     last, again = changed(messages(), session_id=2**32 - 1), changed(messages()[1:], session_id=session)
@@ -94,6 +99,7 @@ def test_a_front_end_that_restarts_with_a_lower_session_is_not_refused_for_ever(
     assert f"3 keyframes in a row are of session {session}, below the current 4294967295" in warning
 
 
+@pytest.mark.slow
 def test_messages_of_a_session_before_are_refused_while_the_current_goes_on() -> None:
     old, new = groups(), [changed(part, session_id=5) for part in groups()]
     played = Played(joined([*new[:6], old[3], new[6], old[4], old[5], *new[7:]]))
@@ -101,6 +107,7 @@ def test_messages_of_a_session_before_are_refused_while_the_current_goes_on() ->
     assert set(played.map.rejected) == {"stale_session"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["map", "/map", "odom2"])
 def test_a_keyframe_in_another_frame_is_turned_away(frame: str) -> None:
     parts = groups()
@@ -119,6 +126,7 @@ def test_a_frame_that_changes_for_good_begins_a_session() -> None:
     assert not played.map.rejected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frame", "words"), [("/odom", "taken as 'odom': leave out"), ("", "names no frame"), ("//", "no")]
 )
@@ -132,12 +140,14 @@ def test_a_frame_without_a_name_for_tf2_is_said(frame: str, words: str) -> None:
     assert correction.odom_frame == "odom"
 
 
+@pytest.mark.slow
 def test_frames_that_are_named_with_and_without_a_slash_are_one() -> None:
     parts = [changed(part, frame_id=("odom", "/odom", "")[i % 3]) for i, part in enumerate(groups())]
     played = Played(joined(parts))
     assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
 
 
+@pytest.mark.slow
 def test_an_empty_frame_is_no_fault_where_a_parameter_names_it() -> None:
     played = Played(changed(messages(), frame_id=""), settings={"frames.odom_frame": "vo"})
     assert not played.scene.log.warnings
@@ -152,6 +162,7 @@ def test_a_rig_that_comes_late_serves_the_session_after_a_jump_too() -> None:
     assert played.scene.keyframes.refined.all()
 
 
+@pytest.mark.slow
 def test_another_rig_is_used_from_a_session_on_that_a_jump_began() -> None:
     other = dataclasses.replace(data().rig, intrinsics=data().rig.intrinsics * 1.1)
     parts = groups()
@@ -178,6 +189,7 @@ def test_silence_begins_a_session_that_was_asked_for_and_no_other() -> None:
         assert len(played.scene.keyframes) == (1 if begins else 5)
 
 
+@pytest.mark.slow
 def test_silence_begins_a_session_where_the_first_keyframe_comes_again_with_its_tracks() -> None:
     near = {"scene.max_reorder_s": 1.0}
     for again, begins in ((groups()[0], True), (groups()[0][:1], False), (groups()[1], False)):

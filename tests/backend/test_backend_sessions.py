@@ -58,6 +58,7 @@ ABSURD: dict[str, Callable[[list[Measurement]], list[Measurement]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [1, 7, N - 1])
 @pytest.mark.parametrize("name", ABSURD)
 def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
@@ -75,6 +76,7 @@ def test_one_absurd_stamp_costs_its_keyframe_alone(name: str, at: int) -> None:
     assert after < 0.6 * before, f"{before:.4f} -> {after:.4f} m"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(ABSURD) - {"12 s ahead", "zero", "negative", "the least"}))
 def test_a_first_keyframe_with_an_absurd_stamp_costs_itself_alone(name: str) -> None:
     parts = groups()
@@ -88,6 +90,7 @@ def test_a_first_keyframe_with_an_absurd_stamp_costs_itself_alone(name: str) -> 
     assert played.map.rejected == {"bad_stamp": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_ns", [0, -5 * S, -(2**63)])
 def test_a_first_keyframe_from_before_the_clock_was_set_costs_itself_alone(at_ns: int) -> None:
     parts = groups()
@@ -97,6 +100,7 @@ def test_a_first_keyframe_from_before_the_clock_was_set_costs_itself_alone(at_ns
     assert played.map.rejected == {"bad_stamp": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pause_ns", [9 * S, 15 * S, HOUR, YEAR])
 def test_after_a_pause_the_map_goes_on(pause_ns: int) -> None:
     parts = groups()
@@ -107,6 +111,7 @@ def test_after_a_pause_the_map_goes_on(pause_ns: int) -> None:
     assert played.scene.keyframes.position.tobytes() == same.position.tobytes(), "what is held does not change a replay"
 
 
+@pytest.mark.slow
 def test_keyframes_that_are_always_far_apart_are_a_map() -> None:
     parts = groups()
     played = Played(joined(stamped(part, 60 * S * i) for i, part in enumerate(parts)))
@@ -132,6 +137,7 @@ def test_two_clocks_mixed_at_random_give_few_sessions(seed: int) -> None:
     assert known + len(played.refused) in (N - 1, N)
 
 
+@pytest.mark.slow
 def test_a_keyframe_that_comes_late_by_less_than_the_bound_is_sorted_in() -> None:
     parts = groups()
     played = Played(joined([*parts[:4], *parts[5:9], parts[4], *parts[9:]]))
@@ -147,6 +153,7 @@ REPEATS: dict[str, Callable[[Keyframe], Keyframe]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", REPEATS)
 @pytest.mark.parametrize("when", [4, 15])
 @pytest.mark.parametrize("count", [1, 2])
@@ -160,6 +167,7 @@ def test_a_repeated_keyframe_changes_nothing(how: str, when: int, count: int) ->
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
+@pytest.mark.slow
 def test_every_message_twice_changes_nothing() -> None:
     played = Played([m for m in messages() for _ in range(2)])
     assert (played.ids, played.finished) == (all_ids(), [])
@@ -167,6 +175,7 @@ def test_every_message_twice_changes_nothing() -> None:
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [2, 3])
 def test_a_recording_that_plays_again_begins_a_session_each_time(times: int) -> None:
     played = Played([m for _ in range(times) for m in messages()], settings={"scene.max_reorder_s": 1.0})
@@ -177,6 +186,7 @@ def test_a_recording_that_plays_again_begins_a_session_each_time(times: int) -> 
     assert "plays again" in played.scene.log.warnings["clock_jump"]
 
 
+@pytest.mark.slow
 def test_an_id_that_is_used_again_is_named_and_its_tracks_do_no_harm() -> None:
     parts = [list(part) for part in groups()]
     reused = all_ids()[3]
@@ -189,6 +199,7 @@ def test_an_id_that_is_used_again_is_named_and_its_tracks_do_no_harm() -> None:
     assert played.scene.keyframes.position.tobytes() == undisturbed().scene.keyframes.position.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_ns", [0, 20 * S])
 def test_a_front_end_that_restarts_under_the_same_ids_is_not_refused_for_ever(shift_ns: int) -> None:
     """Its poses begin at another place, so these are other keyframes, whatever their stamps."""
@@ -214,12 +225,14 @@ def test_a_clock_that_is_set_back_by_less_than_the_bound_does_not_mix_two_maps(b
     assert not played.map.rejected
 
 
+@pytest.mark.slow
 def test_a_block_of_keyframes_that_comes_late_is_sorted_in() -> None:
     parts = groups()
     played = Played(joined([*parts[:1], *parts[4:], *parts[1:4]]))
     assert (played.ids, played.finished, dict(played.map.rejected)) == (all_ids(), [], {})
 
 
+@pytest.mark.slow
 def test_a_short_recording_that_plays_again_is_no_duplicate() -> None:
     """It spans less than scene.max_reorder_s."""
     played = Played([*messages(), *messages()])
@@ -228,6 +241,7 @@ def test_a_short_recording_that_plays_again_is_no_duplicate() -> None:
     assert not played.map.rejected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 4])
 def test_keyframes_that_come_again_long_after_change_nothing(count: int) -> None:
     again = [m for part in groups()[:count] for m in part]
@@ -246,6 +260,7 @@ def test_several_that_are_turned_away_for_one_reason_are_counted_in_the_warning(
     assert warning.endswith(f"turned away; likewise 1 more, the last of them keyframe {last}")
 
 
+@pytest.mark.slow
 def test_stamps_that_are_all_the_same_are_said() -> None:
     played = Played(joined(stamped(part, at_ns=0) for part in groups()))
     assert played.ids == all_ids(), "in order of arrival"

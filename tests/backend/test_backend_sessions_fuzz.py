@@ -14,6 +14,7 @@ import functools
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -115,6 +116,7 @@ def useless(draw: st.DrawFn, session_id: int) -> Measurement:
     return FeatureTracks(at, 77, 0, none, np.empty((0, 2)))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(recordings())
 def test_there_is_one_map_for_each_real_session(drawn: tuple[list[Measurement], list[int], int]) -> None:
@@ -134,6 +136,7 @@ def test_there_is_one_map_for_each_real_session(drawn: tuple[list[Measurement], 
     assert 0 <= lost <= spoiled + 2 * len(lengths), f"{found}, of {lengths}, {spoiled} spoiled"
 
 
+@pytest.mark.slow
 @settings(max_examples=60, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.data())
 def test_no_order_raises_and_every_keyframe_is_accounted_for(source: st.DataObject) -> None:

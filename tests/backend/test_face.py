@@ -16,6 +16,7 @@ from ba_node.measurements import Keyframe
 from tests.backend.session_streams import HOUR, N, Played, all_ids, changed, data, groups, joined, messages, stamped
 
 
+@pytest.mark.slow
 def test_a_stream_is_replayed_with_one_solve_a_keyframe() -> None:
     """The same as by hand: a solve before each keyframe that begins, and the rest at the end."""
     backend, by_hand = Backend(Config()), Played(messages())
@@ -45,6 +46,7 @@ def test_a_map_that_ends_is_summed_up_before_the_next_begins() -> None:
     assert (backend.map.session_id, backend.map.index) == (3, 1)
 
 
+@pytest.mark.slow
 def test_a_lone_keyframe_with_an_absurd_stamp_counts_as_no_map() -> None:
     parts = groups()
     parts[0] = stamped(parts[0], HOUR)
@@ -74,6 +76,7 @@ def test_a_keyframe_is_solved_waits_or_is_not_known() -> None:
         assert abs(abs(float(ours.orientation @ theirs.orientation)) - 1.0) < 1e-12
 
 
+@pytest.mark.slow
 def test_everything_is_solved_in_one_call_as_in_three() -> None:
     one, three = Played(messages()), Played(messages())
     estimate = one.optimize()
@@ -97,6 +100,7 @@ def test_nothing_is_optimised_where_there_is_nothing() -> None:
     assert backend.begin_optimization() == "no camera rig yet: nothing is known about the cameras"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason", ["", "stopped after 2 s"])
 def test_a_result_is_given_other_words(reason: str) -> None:
     begun = Played(messages()).begin_optimization()

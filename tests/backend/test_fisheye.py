@@ -76,6 +76,7 @@ def error_of(node: Backend, refined: bool) -> float:
     return float(np.sqrt(np.mean(np.sum((moved - scene()[1]) ** 2, axis=1))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["auto", "numpy"])
 def test_what_is_seen_beyond_90_degrees_takes_part(backend: str) -> None:
     node = run(False, backend)
@@ -91,12 +92,14 @@ def test_what_is_seen_beyond_90_degrees_takes_part(backend: str) -> None:
     assert not node.scene.log.rejected
 
 
+@pytest.mark.slow
 def test_it_is_worth_more_than_the_front_alone() -> None:
     whole, front = run(False), run(True)
     assert len(whole.scene.observations) > len(front.scene.observations) + 500
     assert error_of(whole, refined=True) < 1.1 * error_of(front, refined=True)
 
 
+@pytest.mark.slow
 def test_a_depth_across_the_axis_is_no_distance() -> None:
     """A depth of a ray that points back contradicts it; it is left to the residuals to say so."""
     node = Backend(Config())

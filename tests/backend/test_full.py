@@ -109,6 +109,7 @@ def error_m(backend: Backend, data: SyntheticData) -> float:
     return float(np.sqrt(np.mean(np.sum((align(positions, truth, "sim3").apply(positions) - truth) ** 2, axis=1))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("keyframes", [30, 20])
 def test_it_explains_all_observations_better(kind: str, keyframes: int) -> None:
@@ -133,6 +134,7 @@ def test_it_explains_all_observations_better(kind: str, keyframes: int) -> None:
     assert estimate.refined.keyframe_id.tolist() == data.truth.keyframe_id.tolist()
 
 
+@pytest.mark.slow
 def test_a_floating_scale_does_not_shrink_the_map() -> None:
     data, backend = recording(baseline_m=0.0), Backend(CONFIG)
     feed(backend, (m for _, _, m in data.timeline()))
@@ -193,6 +195,7 @@ def test_the_same_gives_the_same_bits() -> None:
     assert results[0].cloud.position.tobytes() == results[1].cloud.position.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 1.3])
 def test_what_came_later_follows_the_end_of_the_copy(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A result that only moves and turns (one camera: and stretches) the copy does so to everything."""
@@ -256,6 +259,7 @@ def test_the_result_of_a_map_that_is_gone_changes_nothing(lost: str) -> None:
     np.testing.assert_array_equal(backend.estimate().trajectory.position, before)
 
 
+@pytest.mark.slow
 def test_forgotten_keyframes_are_passed_over() -> None:
     data = recording()
     backend = Backend(CONFIG.with_values({"scene.max_keyframes": 20}))
@@ -304,6 +308,7 @@ def test_there_is_a_reason_where_there_is_nothing_to_solve() -> None:
     assert backend.estimate().trajectory.keyframe_id.tolist() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_observations_are_the_same_bits_after_a_solve_that_did_without_them(kind: str) -> None:
     backend = Backend(CONFIG)
@@ -338,6 +343,7 @@ def test_a_solve_is_stopped_after_an_iteration() -> None:
     assert taken.result.method == "lma_cd"
 
 
+@pytest.mark.slow
 def test_what_is_chosen_of_a_copy_is_the_map_at_that_moment() -> None:
     """Windows go on before the problem of the copy is put together, and the result is merged as that of the map."""
     first, rest = cut(recording(), 20)
@@ -360,6 +366,7 @@ def test_what_is_chosen_of_a_copy_is_the_map_at_that_moment() -> None:
     assert merged[1] == 10, f"{merged[1]} of the 10 later keyframes followed"
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.data())
 def test_whatever_happens_meanwhile_merging_does_not_raise(data: st.DataObject) -> None:

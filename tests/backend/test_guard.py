@@ -137,6 +137,7 @@ WRONG_RIGS: dict[str, tuple[str, Callable[[CameraRig], CameraRig], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRONG_RIGS)
 def test_a_wrong_rig_does_no_harm(name: str) -> None:
     kind, change, words = WRONG_RIGS[name]
@@ -151,6 +152,7 @@ def test_a_wrong_rig_does_no_harm(name: str) -> None:
     assert re.search(words, text), text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "words"), [(1000.0, "measured depths agree"), (1.2, "as long as the front-end's")])
 def test_depths_in_another_unit_do_no_harm(factor: float, words: str) -> None:
     stream, truth = recording(**GOOD, **KINDS["depth"])
@@ -168,6 +170,7 @@ JUMPS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("at", [3, 20, 39])
 @pytest.mark.parametrize("jump", JUMPS)
@@ -195,6 +198,7 @@ def test_a_jump_that_stays_is_followed(kind: str) -> None:
     assert after < 0.02, f"{before:.4f} -> {after:.4f} m"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_keyframes_with_wrong_ids_harm_no_other(kind: str) -> None:
     stream, truth = recording(**USUAL, **KINDS[kind])
@@ -225,6 +229,7 @@ def closing(stream: Stream, shift: tuple[float, float, float]) -> Stream:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shift", [(1.5, 1.5, 1.0), (0.4, -0.4, 0.2)])
 def test_a_loop_that_closes_is_taken(kind: str, shift: tuple[float, float, float]) -> None:
@@ -268,6 +273,7 @@ def test_a_solution_need_not_be_tried_on_tracks(kind: str) -> None:
     assert after < before
 
 
+@pytest.mark.slow
 def test_solves_are_taken_again_when_data_are_good_again() -> None:
     """Depths are wrong for twenty keyframes in the middle of a long way."""
     stream, truth = recording(**USUAL, **KINDS["depth"], keyframes=120, length_m=100.0, landmarks=8000)

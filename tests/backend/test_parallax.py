@@ -35,6 +35,7 @@ def begun(at: FloatArray, turned_deg: FloatArray) -> Callable[[World, Path], tup
     return moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at", "turned_deg"),
     [

@@ -46,6 +46,7 @@ def shuffled(frames: Iterator[tuple[Measurement, ...]]) -> Iterator[tuple[Measur
         yield from (*block[:3], block[4], block[3], *block[5:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", [{}, {"scene.max_keyframes": 25, "scene.max_landmarks": 300}])
 def test_an_estimate_is_the_map_at_its_moment(limits: dict[str, int]) -> None:
     drive = Drive(length=20, tracks=25, session_rounds=0)

@@ -138,6 +138,7 @@ def _cases() -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", _cases())
 def test_no_harm(case: Combined, tmp_path: Path, run: Replay) -> None:
     recording = spoiled_by(case.faults, case.rig, case.seed, **case.changes)

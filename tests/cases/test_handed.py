@@ -49,6 +49,7 @@ def test_no_worse_than_what_came_in(name: str, case: Cases, run: Replay) -> None
     assert sorted(error.folder for error in errors) == sorted(folders)
 
 
+@pytest.mark.slow
 def test_clock_set_back_leaves_two_maps(case: Cases, run: Replay) -> None:
     given = case("clock_set_back")
     assert sorted(error.keyframes for error in run(given.bag).errors(given.truth)) == [20, 20]

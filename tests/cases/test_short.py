@@ -42,6 +42,7 @@ def test_a_few_keyframes_tell_what_is_plain(
     outcome.tells(words)
 
 
+@pytest.mark.slow
 def test_each_of_two_sessions_is_compared_at_its_end(tmp_path: Path, run: Replay) -> None:
     recording = spoiled_by([("session_lowered", 3.0), ("baseline_off", 1.3)], "stereo", 88)
     outcome = run(write(tmp_path, recording))
@@ -49,6 +50,7 @@ def test_each_of_two_sessions_is_compared_at_its_end(tmp_path: Path, run: Replay
     outcome.tells("session", "baseline|scale of focal")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
 def test_a_short_sound_drive_is_refined(rig: str, tmp_path: Path, run: Replay) -> None:
     recording = spoiled(SOUND, rig, seed=923, **SHORT)
@@ -57,6 +59,7 @@ def test_a_short_sound_drive_is_refined(rig: str, tmp_path: Path, run: Replay) -
     harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
 
 
+@pytest.mark.slow
 def test_a_principal_point_off_on_a_straight_way(tmp_path: Path, run: Replay) -> None:
     recording = spoiled("roi_ignored", "mono", 15.0, 924)
     outcome = run(write(tmp_path, recording), "--final-optimize")

@@ -15,13 +15,17 @@ from tests.cases.conftest import Replay, harmless
 
 
 def siblings() -> list[Any]:
-    """Return fault, rig, amount and seed of each fault, by turns; `ba robustness` takes all rigs and amounts."""
+    """Return fault, rig, amount and seed of each fault, by turns; `ba robustness` takes all rigs and amounts.
+
+    The quick tests do with one fault of six.
+    """
     return [
         pytest.param(
             name,
             fault.rigs[i % len(fault.rigs)],
             fault.amounts[i % len(fault.amounts)],
             100 + number + 50 * i,
+            marks=[pytest.mark.slow] if number % 6 or i != (0 if fault.motion else number) else [],
         )
         for number, (name, fault) in enumerate(FAULTS.items())
         # Of a motion the usual rig, to which it does most harm, and another; of the others one, by turns.
@@ -49,6 +53,7 @@ def test_no_harm_and_the_cause_is_named(
     outcome.tells(*fault.named)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["camera_turned", "depth_in_mm", "extrinsics_inverted"])
 def test_odometry_that_is_better_than_the_tracks_is_kept(name: str, tmp_path: Path, run: Replay) -> None:
     recording = spoiled(name, seed=301, keyframes=60, drift_rotation_deg=0.01, drift_translation=0.001)

@@ -36,6 +36,7 @@ def test_shipped_recordings(name: str, before: float, after: float, run: Replay)
     assert error["refined"] <= TOLERANCE * after, f"{error['refined']:.5f} m, it was {after} m"
 
 
+@pytest.mark.slow
 def test_kitti_stereo(shared_data: Path, run: Replay) -> None:
     outcome = run(shared_data / "kitti-stereo-vo" / "kitti_stereo.mcap")
     is_silent(outcome)
@@ -56,6 +57,7 @@ def test_ladybug(shared_data: Path, tmp_path: Path, run: Replay) -> None:
     assert median["refined"] <= TOLERANCE * 0.307, median
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", ["none", "plumb_bob", "equidistant"])
 @pytest.mark.parametrize("rig", RIGS)
 def test_drives_of_every_rig_and_lens(rig: str, lens: str, tmp_path: Path, run: Replay) -> None:
@@ -65,6 +67,7 @@ def test_drives_of_every_rig_and_lens(rig: str, lens: str, tmp_path: Path, run: 
     harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("motion", "amount", "seed"), [("stands_still", 35.0, 39), ("hardly_moves", 1.0, 37)])
 def test_depths_tell_where_keyframes_are_not_apart(
     motion: str, amount: float, seed: int, tmp_path: Path, run: Replay

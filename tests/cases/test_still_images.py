@@ -28,6 +28,7 @@ def frozen(recording: Recording, cameras: set[int], first: int, last: int) -> Re
     return recording.changed(FeatureTracks, change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rig", "cameras", "first", "last"),
     [("stereo", {0, 1}, 15, 25), ("mono", {0}, 15, 25), ("stereo", {1}, 0, 40), ("rgbd", {0}, 28, 40)],

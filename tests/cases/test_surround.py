@@ -53,6 +53,7 @@ def swapped(a: int, b: int) -> Edit:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [901, 902])
 def test_sound_rig_is_refined(seed: int, tmp_path: Path, run: Replay) -> None:
     recording = drive(seed)

@@ -58,6 +58,7 @@ def test_one_factor_is_named(mode: str, factor: float, words: str) -> None:
     assert re.search(words, found.causes()), found.causes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["stereo", "rgbd"])
 def test_noise_is_no_factor(mode: str) -> None:
     """A factor below that of good rigs and wheels, and the spread of the steps, say nothing."""
@@ -104,6 +105,7 @@ def test_less_is_doubted_at_the_end_alone() -> None:
     assert said >= 3, f"{said} of 20 are doubted"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["mono", "stereo"])
 def test_noise_is_no_side(mode: str) -> None:
     """A camera that is mounted to half a degree is as good as most; a roll along the way turns no step."""

@@ -83,13 +83,15 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "stamps in us": (("mono",), "stamps in another unit.*microseconds"),
     "stamps in ms": (("mono",), "stamps in another unit.*milliseconds"),
 }
-# Told by adjustments of seconds, in which all cameras change alike: the quick tests do with one rig, and with one
-# amount and one lens of what is adjusted alike.
+# The quick tests do with one rig. These are told by adjustments of seconds, in which all cameras change alike: with one
+# camera, and with one amount and one lens of what is adjusted alike.
 ADJUSTED = ("focal 0.8", "focal 0.5", "fx alone", "binning", "not rectified", "rectified", "fisheye given")
 ALIKE = ("focal 0.5", "fisheye given")
 CASES = [
     pytest.param(
-        wrong, mode, marks=[pytest.mark.slow] if wrong in ALIKE or (wrong in ADJUSTED and mode != "mono") else []
+        wrong,
+        mode,
+        marks=[pytest.mark.slow] if wrong in ALIKE or mode != ("mono" if wrong in ADJUSTED else modes[0]) else [],
     )
     for wrong, (modes, _) in NAMED.items()
     for mode in modes
@@ -185,6 +187,7 @@ def test_silent_on_every_seed(seed: int, mode: str) -> None:
             assert not found.findings, f"{path}, {keyframes} keyframes: {found.summary()}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keyframes", [25, 40, 60])
 def test_a_wall_beside_the_way_is_no_contradiction(keyframes: int) -> None:
     """Two relations explain the images of a plane; the steps of one of them are 50 degrees off."""
@@ -193,6 +196,7 @@ def test_a_wall_beside_the_way_is_no_contradiction(keyframes: int) -> None:
     assert not examine(seen(data, keyframes)).findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "keyframes", "options"),
     [
@@ -218,6 +222,7 @@ def over_a_floor(_world: World, path: Path) -> tuple[World, Path]:
     return World(points, np.tile([0.0, 0.0, 1.0], (n, 1)), np.full((1, 2, 3), -1e4)), path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keyframes", [25, 40, 60])
 def test_a_floor_does_not_tell_a_wrong_baseline(keyframes: int) -> None:
     """By the wrong one of two relations the baseline seemed to be 1.4 times what the steps tell."""
@@ -229,6 +234,7 @@ def test_a_floor_does_not_tell_a_wrong_baseline(keyframes: int) -> None:
     assert not found.findings, found.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "options"),
     [
@@ -253,6 +259,7 @@ def test_observations_outside_the_image_are_named() -> None:
     assert re.search(r"\d+% of its observations lie outside 480 x 640 px", found.summary())
 
 
+@pytest.mark.slow
 def test_same_tracks_give_the_same_numbers() -> None:
     tracks = seen(recording(wrong="turned 1 about y"))
     first, second = (json.dumps(examine(tracks).as_dict()) for _ in range(2))
@@ -275,6 +282,7 @@ def test_json_holds_no_nan() -> None:
     json.loads(text, parse_constant=refuse)
 
 
+@pytest.mark.slow
 def test_tracks_without_rays_are_left_out() -> None:
     tracks = seen(recording(distortion="equidistant", fov_deg=150.0), keyframes=5)
     assert isinstance(tracks, Tracks)
@@ -283,6 +291,7 @@ def test_tracks_without_rays_are_left_out() -> None:
         assert (np.diff(tracks.track[rows]) > 0).all()
 
 
+@pytest.mark.slow
 def test_what_is_given_counts_where_consensus_finds_nothing_better() -> None:
     """Where points are far, samples of five tracks may miss the relation of two cameras."""
     scene = Scene(Config().scene)
@@ -295,6 +304,7 @@ def test_what_is_given_counts_where_consensus_finds_nothing_better() -> None:
     assert "camera 1 is where the rig says" in found.sound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])
 def test_focal_length_that_is_a_tenth_short_is_named(rig: str) -> None:
     scene = Scene(Config().scene)
@@ -305,6 +315,7 @@ def test_focal_length_that_is_a_tenth_short_is_named(rig: str) -> None:
     assert re.search(r"focal length off by a factor of about 0\.(8[7-9]|9[0-3])", examine(tracks).causes())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
 def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
     """By 60 and 36 px: steps point 10 degrees beside the front-end's, all to the same side."""
@@ -316,6 +327,7 @@ def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
     assert re.search("region of interest", examine(tracks).summary())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise_px", "seed", "keyframes"), [(1.0, 3, 15), (1.0, 5, 15), (2.0, 2, 40)])
 def test_a_street_seen_low_in_the_image_is_no_region(noise_px: float, seed: int, keyframes: int) -> None:
     """Points lie in the lower half of the image, and too little parallax leaves the poses untold."""
@@ -323,6 +335,7 @@ def test_a_street_seen_low_in_the_image_is_no_region(noise_px: float, seed: int,
     assert not found.harmful, found.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "rig", "share", "seed"),
     [

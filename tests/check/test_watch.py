@@ -67,6 +67,7 @@ def test_wrong_set_up_is_held(wrong: str, mode: str, words: str) -> None:
     same_as_input(last, data)
 
 
+@pytest.mark.slow
 def test_sound_set_up_says_nothing() -> None:
     backend = Backend(Config())
     estimates = play(backend, recording())
@@ -92,6 +93,7 @@ def test_reset_and_sessions_are_checked_anew() -> None:
     assert last.report.status is Status.HELD
 
 
+@pytest.mark.slow
 def test_stands_first() -> None:
     """A robot that stands has nothing to tell; it is checked when it moves."""
     data = recording(mode="mono", wrong="", keyframes=30)
@@ -107,6 +109,7 @@ def test_stands_first() -> None:
     same_as_input(last, wrong)
 
 
+@pytest.mark.slow
 def test_full_solve_is_not_taken() -> None:
     backend = Backend(Config())
     data = recording(wrong="turned 1 about x")
@@ -139,6 +142,7 @@ def test_warnings_that_follow_from_the_set_up_go() -> None:
     assert set(backend.scene.log.warnings) == {"setup"}
 
 
+@pytest.mark.slow
 def test_solutions_that_are_given_up_leave_a_correction() -> None:
     """map -> odom goes on to be published: the identity, as the front-end's poses stand."""
     backend = Backend(Config().with_values({"guard.check_setup": False}))

@@ -43,6 +43,7 @@ def test_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert written == given
 
 
+@pytest.mark.slow
 def test_poses_of_camera_is_a_parameter(tmp_path: Path) -> None:
     bag = tmp_path / "camera.mcap"
     data = recording(wrong="poses of camera", keyframes=20, length_m=18.0)
@@ -51,6 +52,7 @@ def test_poses_of_camera_is_a_parameter(tmp_path: Path) -> None:
     assert main(["check", str(bag), "--set", "frames.poses_of=camera"]) == 0
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_set_back_parts_the_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     back_ns = 3600 * 10**9
     data = recording(mode="stereo", keyframes=24, length_m=20.0)

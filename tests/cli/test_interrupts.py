@@ -115,6 +115,7 @@ def test_only_the_program_takes_signals_over(monkeypatch: pytest.MonkeyPatch) ->
         assert interrupts.is_program() == expected
 
 
+@pytest.mark.slow
 def test_a_full_disk_names_the_file(bag: Path, tmp_path: Path) -> None:
     """The limit of the size of files stands in for it."""
     out = tmp_path / "out"

@@ -35,6 +35,7 @@ def solved(path: Path, out: Path, *options: str) -> dict[str, Any]:
     return figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras_per_rig", [1, 2])
 @pytest.mark.parametrize("lens", sorted(LENSES))
 def test_a_model_is_solved_as_far_as_colmap_does(lens: str, cameras_per_rig: int, tmp_path: Path) -> None:
@@ -121,6 +122,7 @@ def test_one_scene_in_every_format_has_one_objective(bal_file: Path, tmp_path: P
     assert read_bundler(paths[0]).n_cameras == 4
 
 
+@pytest.mark.slow
 def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(bag), str(tmp_path / "model")]) == 0
     world = pycolmap.Reconstruction(tmp_path / "model")
@@ -146,6 +148,7 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
     np.testing.assert_array_equal(graph.orientation, tum.orientation)
 
 
+@pytest.mark.slow
 def test_a_bundle_problem_of_g2o_is_solved_and_goes_both_ways(bag: Path, tmp_path: Path) -> None:
     model, graph = tmp_path / "model", tmp_path / "scene.g2o"
     for source, target in ((bag, model), (model, graph), (graph, tmp_path / "again.mcap"), (graph, tmp_path / "back")):

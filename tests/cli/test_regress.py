@@ -41,6 +41,7 @@ def test_a_value_is_found_by_its_path() -> None:
     assert found == [2.5, 3, None, None, None, None, None]
 
 
+@pytest.mark.slow
 def test_a_baseline_is_made_held_and_renewed(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copy(bag, tmp_path / "small.mcap")
     baseline, figures = tmp_path / "base.yaml", tmp_path / "now.json"

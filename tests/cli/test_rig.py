@@ -69,6 +69,7 @@ def test_a_recording_has_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "left and right are swapped" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_it_is_published(camchain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ba_msgs")

@@ -49,6 +49,7 @@ def test_each_option_is_declared_exactly_once() -> None:
     assert counted == names
 
 
+@pytest.mark.slow
 def test_nothing_else_repeats_a_default_of_the_solver() -> None:
     options = {option.name: option.default for option in declared(SolverOptions)}
     # A factor has a loss of its own; for PCG itself 0 is the sign that q_eps is not to be used.

@@ -79,6 +79,7 @@ def test_the_jacobian_by_all_of_a_camera_is_that_of_finite_differences(model: Mo
         np.testing.assert_allclose(analytic[:, column], numeric, rtol=1e-4, atol=1e-4, err_msg=str(wanted[column]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", list(Model))
 @pytest.mark.parametrize("linear_solver", ["dense", "sparse"])
 def test_wrong_cameras_are_found_again(model: Model, linear_solver: str) -> None:

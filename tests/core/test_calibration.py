@@ -91,6 +91,7 @@ def spoiled(cameras: Cameras) -> Cameras:
     return dataclasses.replace(cameras, params=params, rotation=rotation, translation=translation)
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_recovered(make_problem: MakeProblem) -> None:
     problem, _, stamp_s = smooth(make_problem, distorted=False)
     rng = np.random.default_rng(3)
@@ -137,6 +138,7 @@ def test_a_late_second_camera_is_found(make_problem: MakeProblem) -> None:
     assert found.time_offset[1] - found.time_offset[0] == pytest.approx(0.02, abs=0.001)
 
 
+@pytest.mark.slow
 def test_sound_cameras_stay_within_what_is_told(make_problem: MakeProblem) -> None:
     problem, _, stamp_s = smooth(make_problem)
     rng = np.random.default_rng(5)

@@ -120,6 +120,7 @@ def local_errors(truth: State, found: State, free: np.ndarray) -> np.ndarray:
     return np.asarray(np.concatenate([turn, moved], axis=1)[free])
 
 
+@pytest.mark.slow
 def test_it_is_what_repeated_measurements_scatter_by(make_problem: MakeProblem) -> None:
     problem, truth = make_problem(noise_px=0.0, start_error=0.0, stereo=True, keyframes=4, points=30)
     rng = np.random.default_rng(1)

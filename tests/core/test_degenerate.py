@@ -108,6 +108,7 @@ def test_no_good_answer(method: str, spoil: str, shape: dict[str, object], make_
         check(solve(problem, dataclasses.replace(methods.options(method), kernels=backend, max_iterations=8)))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     method=st.sampled_from(list(methods.METHODS)),

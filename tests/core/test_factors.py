@@ -169,6 +169,7 @@ def test_a_step_knows_the_objective_where_it_leads(inner_iterations: int, backen
     assert value == pytest.approx(objective.value(iterated), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["local", "global"])
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("auto", marks=built)])
 def test_scipy_finds_the_same_optimum(backend: str, name: str, make_problem: Make) -> None:
@@ -198,6 +199,7 @@ def test_scipy_finds_the_same_optimum(backend: str, name: str, make_problem: Mak
     near(expected.translation, result.state.translation, 1e-6)
 
 
+@pytest.mark.slow
 def test_named_methods_end_where_the_default_ends(make_problem: Make) -> None:
     problem = with_factors(make_problem, points=60)
     problem = dataclasses.replace(problem, factors=problem.factors[2:3])

@@ -56,6 +56,7 @@ def test_rotations_stay_rotations(phi: np.ndarray) -> None:
     np.testing.assert_allclose(np.linalg.det(r), 1.0, atol=1e-14)
 
 
+@pytest.mark.slow
 @given(VECTORS, VECTORS)
 def test_quaternions_and_matrices_are_the_same_rotation(phi: np.ndarray, other: np.ndarray) -> None:
     r = geometry.so3_exp(phi) @ geometry.so3_exp(other)
@@ -75,6 +76,7 @@ def test_half_turns_have_exact_quaternions() -> None:
         np.testing.assert_array_equal(np.abs(geometry.quaternion_from_matrix(r)), expected)
 
 
+@pytest.mark.slow
 @given(VECTORS, VECTORS, VECTORS)
 def test_rigid_transforms_form_a_group(phi: np.ndarray, t: np.ndarray, u: np.ndarray) -> None:
     r, s = geometry.so3_exp(phi), geometry.so3_exp(u)

@@ -93,6 +93,7 @@ def test_cholesky_refuses_an_indefinite_matrix() -> None:
     assert linear.cholesky(np.zeros((2, 2)), np.ones(2)).x is None
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_stops_where_further_steps_add_little(seed: int) -> None:
     """With an ill-conditioned matrix the rule of Nash and Sofer saves most steps and little of the gain."""

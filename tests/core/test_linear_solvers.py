@@ -88,6 +88,7 @@ def test_every_linear_solver_gives_the_dense_step(
         np.testing.assert_allclose(system.product(found), system.rhs, atol=1e-9 * np.abs(system.rhs).max())
 
 
+@pytest.mark.slow
 @built
 @given(seed=st.integers(0, 10_000), keyframes=st.integers(2, 30), share=st.floats(0.02, 1.0), own=st.booleans())
 def test_sparse_solution_for_any_pattern(seed: int, keyframes: int, share: float, own: bool) -> None:

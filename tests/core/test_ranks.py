@@ -107,6 +107,7 @@ def test_what_ranks_cannot_do_is_refused() -> None:
             RankKernels(random_problem(seed=1), options("numpy", **changes), Alone())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernels", ["numpy", "native"])
 def test_ranks_take_the_same_steps_on_two_levels(kernels: str) -> None:
     if kernels == "native" and native.kernels is None:

@@ -61,6 +61,7 @@ def test_what_is_not_found_again_begins_a_session(stereo: list[Images], spoil: s
     assert not len(other.keyframe.covariance), "no step leads to it"
 
 
+@pytest.mark.slow
 def test_an_odometry_that_ends_begins_a_session(truth: list[Transform]) -> None:
     """Images alone have no scale to go on with: they are lost, then a session of its own, until it comes back."""
     rig = world.rig(1)
@@ -80,6 +81,7 @@ def test_an_odometry_that_ends_begins_a_session(truth: list[Transform]) -> None:
     assert np.array_equal(again[-1].pose.translation, truth[-1].translation)
 
 
+@pytest.mark.slow
 def test_long_pause_begins_a_session_only_where_nothing_is_known(stereo: list[Images]) -> None:
     """One stamp after a pause may be wrong: only the next one tells, and decides."""
     front_end = FrontEnd(world.rig(), PLAIN)

@@ -47,6 +47,7 @@ def test_stereo(truth: list[Transform], stereo: list[Images]) -> None:
         assert (left.sigma_px > 0.0).all()
 
 
+@pytest.mark.slow
 def test_observations_fit_the_truth(truth: list[Transform], stereo: list[Images]) -> None:
     """Points triangulated from a track's first view reproject where it is seen later, in both cameras."""
     found = follow(FrontEnd(world.rig(), PLAIN), stereo)
@@ -133,6 +134,7 @@ def test_second_camera_turned_against_the_rig() -> None:
     assert abs(right - 1.0) < 0.012, f"with: {right:.4f}"
 
 
+@pytest.mark.slow
 def test_depth_camera(truth: list[Transform]) -> None:
     rig = world.rig(1)
     frames = [world.images(rig, pose, i, depth=True) for i, pose in enumerate(truth)]
@@ -143,6 +145,7 @@ def test_depth_camera(truth: list[Transform]) -> None:
     assert all(len(one.tracks) == 1 and np.isfinite(one.tracks[0].depth_m).all() for one in found if one.keyframe)
 
 
+@pytest.mark.slow
 def test_depths_in_another_unit(truth: list[Transform]) -> None:
     """5000 is 1 m, and 1000 was taken for it."""
     rig = world.rig(1)
@@ -154,6 +157,7 @@ def test_depths_in_another_unit(truth: list[Transform]) -> None:
     assert scale_and_error(told, truth[:8])[0] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_one_camera_with_odometry(truth: list[Transform]) -> None:
     rig = world.rig(1)
     frames = [world.images(rig, pose, i) for i, pose in enumerate(truth)]
@@ -177,6 +181,7 @@ def test_one_camera_with_odometry(truth: list[Transform]) -> None:
     assert len(shared) > 20
 
 
+@pytest.mark.slow
 def test_one_camera_alone(truth: list[Transform]) -> None:
     rig = world.rig(1)
     frames = [world.images(rig, pose, i) for i, pose in enumerate(truth)]
@@ -193,6 +198,7 @@ def test_one_camera_alone(truth: list[Transform]) -> None:
     assert np.linalg.norm(scale * ours - theirs, axis=1).max() < 0.1 * np.linalg.norm(theirs[-1])
 
 
+@pytest.mark.slow
 def test_stand_still_and_turn_on_the_spot() -> None:
     still = [Transform(np.eye(3), np.zeros(3))] * 4
     turns = [Transform(geometry.so3_exp(np.array([0.0, 0.03 * i, 0.0])), np.zeros(3)) for i in range(1, 9)]

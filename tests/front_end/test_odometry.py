@@ -75,6 +75,7 @@ OPTICAL = Transform(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["mono", "stereo", "rgbd"])
 @pytest.mark.parametrize("name", ["as it is", "noisy", "from elsewhere"])
 def test_a_sound_odometry_is_left_in_peace(mode: str, name: str) -> None:
@@ -112,6 +113,7 @@ FAULTS: dict[str, tuple[Callable[[], Way], str, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["mono", pytest.param("stereo", marks=pytest.mark.slow), "rgbd"])
 @pytest.mark.parametrize("name", FAULTS)
 def test_what_is_wrong_is_named(mode: str, name: str) -> None:

@@ -49,6 +49,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Synthetic
     return path, data
 
 
+@pytest.mark.slow
 def test_wrong_cameras_are_recovered_to_a_fifth(recording: tuple[Path, SyntheticData], tmp_path: Path) -> None:
     path, data = recording
     assert main(["calibrate", str(path), "--out", str(tmp_path / "rig.yaml")]) == 0
@@ -65,6 +66,7 @@ def test_wrong_cameras_are_recovered_to_a_fifth(recording: tuple[Path, Synthetic
     assert "rotation_x" in written[0]["not_told"], "no track tells where the first camera sits on the body"
 
 
+@pytest.mark.slow
 def test_a_replay_refines_cameras_and_tells_covariances(
     recording: tuple[Path, SyntheticData], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

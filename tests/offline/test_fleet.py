@@ -97,6 +97,7 @@ def test_one_process_tells_of_each_recording_as_it_is_done() -> None:
     assert len(begun) == 3
 
 
+@pytest.mark.slow
 def test_results_are_one_table_and_page(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     out = tmp_path / "out"

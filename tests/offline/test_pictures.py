@@ -25,6 +25,7 @@ def comparison(cloud: int = 300) -> Comparison:
     return Comparison("here", data.odometry, data.truth, data.truth, data.landmarks[:cloud], "se3")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cloud", [0, 300])
 def test_writes_a_picture_with_something_on_it(tmp_path: Path, cloud: int) -> None:
     draw_trajectory(tmp_path / "a.png", comparison(cloud))
@@ -34,6 +35,7 @@ def test_writes_a_picture_with_something_on_it(tmp_path: Path, cloud: int) -> No
     assert (image[..., :3] < 0.9).any(axis=2).mean() > 0.01
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         draw_trajectory(tmp_path / name, comparison())
@@ -54,6 +56,7 @@ def test_the_error_is_told_where_there_is_a_reference_of_the_same_time() -> None
         assert [trace["name"] for trace in figures[1].data] == ["moved"]
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_only_to_draw() -> None:
     code = "import sys, ba_node.offline.pictures; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

@@ -89,6 +89,7 @@ def test_a_replay_on_two_processes_ends_where_that_on_one_does(tmp_path: Path) -
     assert not np.array_equal(paths[1], paths[0])  # sums were made otherwise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

@@ -73,6 +73,7 @@ def test_second_replay_gives_the_same_bytes(shipped: Run, tmp_path: Path) -> Non
         assert (tmp_path / name).read_bytes() == (shipped.out / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_every_keyframe_is_refined(shipped: Run) -> None:
     report = shipped.report
     trajectory = read_tum(shipped.out / "trajectory.tum")
@@ -83,6 +84,7 @@ def test_every_keyframe_is_refined(shipped: Run) -> None:
     assert read_tum(shipped.out / "trajectory_input.tum").stamp_ns.tolist() == trajectory.stamp_ns.tolist()
 
 
+@pytest.mark.slow
 def test_report_adds_up(shipped: Run) -> None:
     report = json.loads((shipped.out / "report.json").read_text())
     points, frame_id = read_ply(shipped.out / "points.ply")
@@ -96,6 +98,7 @@ def test_report_adds_up(shipped: Run) -> None:
     assert 0.45 < report["median_px"]["refined"] < 0.62
 
 
+@pytest.mark.slow
 def test_refined_recording_is_what_a_node_publishes(shipped: Run) -> None:
     with BagReader(shipped.out / "refined.mcap") as reader:
         # The last two are there once priors or GNSS tell where the map lies in the world.
@@ -117,6 +120,7 @@ def test_refined_recording_is_what_a_node_publishes(shipped: Run) -> None:
     assert bytes(cloud.data) == points.astype(POINT_DTYPE).tobytes()
 
 
+@pytest.mark.slow
 def test_effective_parameters_are_written(shipped: Run, tmp_path: Path) -> None:
     config = Config().with_values({"window.max_keyframes": 6, "solver.max_iterations": 2})
     report = replay(shipped.bag, tmp_path, config)
@@ -148,6 +152,7 @@ def session(number: int, **options: Any) -> Iterator[tuple[str, int, Measurement
             yield topic, later, measurement
 
 
+@pytest.mark.slow
 def test_older_sessions_go_to_folders_of_their_own(tmp_path: Path) -> None:
     bag = tmp_path / "two.mcap"
     record(bag, [*session(3, seed=1), *session(7, seed=2, keyframes=6)])
@@ -186,6 +191,7 @@ def test_bad_messages_are_told_and_cost_nothing_else(tmp_path: Path) -> None:
         assert (tmp_path / "spoilt" / name).read_bytes() == (tmp_path / "clean" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_truncated_recording_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
     bag = tmp_path / "cut.mcap"
     # Large enough for two chunks, of which the second is cut.
@@ -198,6 +204,7 @@ def test_truncated_recording_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
     assert 10 <= report["keyframes_refined"] == report["keyframes"] < 30
 
 
+@pytest.mark.slow
 def test_forgotten_keyframes_stay_in_the_trajectory(tmp_path: Path) -> None:
     bag = tmp_path / "long.mcap"
     record(bag, generate(small(keyframes=24, length_m=20.0)).timeline())

@@ -71,6 +71,7 @@ def nothing(_info: Any) -> None:
     pass
 
 
+@pytest.mark.slow
 def test_region_and_binning_give_the_same_map(tmp_path: Path) -> None:
     plain = replay(record_with(tmp_path / "plain.mcap", nothing), tmp_path / "plain", Config())
     part = replay(record_with(tmp_path / "part.mcap", sensor_of), tmp_path / "part", Config())

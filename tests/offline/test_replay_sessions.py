@@ -59,6 +59,7 @@ def test_sessions_with_the_same_id_do_not_share_a_folder(tmp_path: Path) -> None
         assert set(read_tum(folder / "trajectory_input.tum").stamp_ns.tolist()) == one
 
 
+@pytest.mark.slow
 def test_a_recording_twice_in_one_file_gives_the_same_twice(tmp_path: Path) -> None:
     rows = timeline(keyframes=12)
     length = rows[-1][1] - rows[0][1] + S
@@ -164,6 +165,7 @@ def test_what_is_worth_nothing_is_refused_by_name(
     assert not (tmp_path / "out" / "refined.mcap").exists()
 
 
+@pytest.mark.slow
 def test_the_lower_session_of_a_front_end_that_restarted_is_written(tmp_path: Path) -> None:
     rows = timeline()
     length = rows[-1][1] - rows[0][1] + S

@@ -66,6 +66,7 @@ def unpacked(page: Path, part: str) -> str:
     return gzip.decompress(base64.b64decode(found[1])).decode()
 
 
+@pytest.mark.slow
 def test_the_page_has_all_figures_and_facts(folder: Path) -> None:
     pytest.importorskip("plotly", reason="needs plotly: pip install ba_node[report]")
     text = (folder / REPORT).read_text()
@@ -80,6 +81,7 @@ def test_the_page_has_all_figures_and_facts(folder: Path) -> None:
     assert "All parameters have their defaults" in text
 
 
+@pytest.mark.slow
 def test_figures_show_what_is_in_the_files(folder: Path) -> None:
     run = read_run(folder)
     shown = {figure.key: figure for figure in figures([run])}
@@ -195,6 +197,7 @@ def test_a_replay_leaves_a_page_and_a_picture_unless_told_not_to(
     assert not {REPORT, "report", "trajectory.png"} & {path.name for path in (tmp_path / "without").iterdir()}
 
 
+@pytest.mark.slow
 def test_without_plotly_the_picture_is_there_and_the_line_says_what_to_install(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,6 +47,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_pictures_become_a_map(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     found = tmp_path / "found.json"
@@ -73,6 +74,7 @@ def test_the_same_pictures_give_the_same_bytes(pictures: Path, tmp_path: Path) -
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_mask_and_odometry_file(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one = tmp_path / "one"
     one.mkdir()
@@ -98,6 +100,7 @@ def test_mask_and_odometry_file(pictures: Path, tmp_path: Path, capsys: pytest.C
     assert "the scale is free" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_odometry_in_millimetres_is_said_last_and_in_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -199,6 +199,7 @@ def test_without_truth_tracks_that_are_held_out_decide(truthless: Path, tmp_path
     assert many["error"] < few["error"]
 
 
+@pytest.mark.slow
 def test_neither_truth_nor_tracks_to_hold_out_is_said(
     truthless: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,6 +213,7 @@ def test_neither_truth_nor_tracks_to_hold_out_is_said(
     assert "no recording to tune on" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_sweep_is_every_combination(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert list(grid({"a": [1, 2], "b": [3, 4]})) == [
         {"a": 1, "b": 3}, {"a": 1, "b": 4}, {"a": 2, "b": 3}, {"a": 2, "b": 4}
@@ -227,6 +229,7 @@ def test_a_sweep_is_every_combination(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "parameter tracks.outlier_px = 'x': expected float" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_recording_that_cannot_be_used_is_left_out_and_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -240,6 +243,7 @@ def test_a_recording_that_cannot_be_used_is_left_out_and_named(
     assert main(["sweep", str(broken), *arguments]) == 2
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_keeps_what_is_through(tmp_path: Path) -> None:
     values = ",".join(str(n) for n in range(4, 40))
     command = [sys.executable, "-m", "ba_node.cli.main", "sweep", str(MONO), "--out", str(tmp_path)]
@@ -255,6 +259,7 @@ def test_an_interrupted_sweep_keeps_what_is_through(tmp_path: Path) -> None:
     assert len(json.loads((tmp_path / "sweep.json").read_text())["combinations"]) in {len(lines) - 1, len(lines)}
 
 
+@pytest.mark.slow
 def test_a_combination_that_gives_nothing_is_named_and_stops_no_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

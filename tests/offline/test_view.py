@@ -60,6 +60,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "in.mcap", folder / "out"
 
 
+@pytest.mark.slow
 def test_a_client_of_foxglove_gets_the_messages_with_their_definitions(results: tuple[Path, Path]) -> None:
     addresses: list[str] = []
     ready = threading.Event()

@@ -65,6 +65,7 @@ def _connected(make_peer: MakePeer, namespace: str = "") -> Any:
     return peer
 
 
+@pytest.mark.slow
 def test_publisher_and_subscriber_that_do_not_match_are_named(start_node: StartNode, make_peer: MakePeer) -> None:
     node, peer = start_node(), make_peer()
     peer.node.create_publisher(message_class(INPUT_TYPES["keyframes"]), "keyframes", BEST_EFFORT)
@@ -79,6 +80,7 @@ def test_publisher_and_subscriber_that_do_not_match_are_named(start_node: StartN
     assert "subscriber /peer: incompatible DURABILITY" in node.err
 
 
+@pytest.mark.slow
 def test_a_camera_driver_that_does_not_latch_is_nothing_to_warn_about(
     start_node: StartNode, make_peer: MakePeer
 ) -> None:
@@ -111,6 +113,7 @@ def test_an_override_of_no_topic_is_an_error(start_node: StartNode, make_peer: M
     assert node.alive
 
 
+@pytest.mark.slow
 def test_silence_names_topics_and_publishers(start_node: StartNode, make_peer: MakePeer, scene: SyntheticData) -> None:
     node = start_node("--ros-args", "-r", "__ns:=/car", "-r", "keyframes:=front/kf", "-p", "node.silence_s:=1.0")
     peer = make_peer(namespace="car")
@@ -128,6 +131,7 @@ def test_silence_names_topics_and_publishers(start_node: StartNode, make_peer: M
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sim_time", [False, True], ids=["wall time", "use_sim_time"])
 def test_a_bag_that_plays_again_begins_a_new_session(
     sim_time: bool, start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
@@ -155,6 +159,7 @@ def test_a_bag_that_plays_again_begins_a_new_session(
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_keyframes_out_of_order_are_sorted_by_their_stamps(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
@@ -210,6 +215,7 @@ def _stamps(peer: Any) -> set[int]:
     return {int(stamp) for message in peer.received["refined_keyframes"] for stamp in message.stamp_ns}
 
 
+@pytest.mark.slow
 def test_two_nodes_in_two_namespaces_do_not_disturb_each_other(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
@@ -232,6 +238,7 @@ def lose_patience() -> None:
     vars(silence)["_CLOCK_PATIENCE_S"] = 0.6
 
 
+@pytest.mark.slow
 def test_simulated_time_without_a_clock_is_told(start_node: StartNode, make_peer: MakePeer) -> None:
     """By name, in the log and on /diagnostics; a clock that comes, or another parameter, ends it."""
     node = start_node("--ros-args", "-p", "use_sim_time:=true", prepare=lose_patience)

@@ -80,6 +80,7 @@ def test_the_walk_finds_nothing_else(source: str) -> None:
     assert not changing_sites(source)
 
 
+@pytest.mark.slow
 def test_no_source_has_such_a_site() -> None:
     paths = [path for folder in ("ba_node", "launch", "experiments") for path in sorted((ROOT / folder).rglob("*.py"))]
     assert len(paths) > 150

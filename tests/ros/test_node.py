@@ -176,6 +176,7 @@ class TestPlayed:
         assert node.out == f"stopped: {KEYFRAMES} keyframes refined\n"
 
 
+@pytest.mark.slow
 def test_bad_input_is_counted_and_nothing_is_lost(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
@@ -228,6 +229,7 @@ def test_bad_input_is_counted_and_nothing_is_lost(
         assert words in node.err, node.err
 
 
+@pytest.mark.slow
 def test_an_unknown_distortion_model_is_named(start_node: StartNode, make_peer: MakePeer, scene: SyntheticData) -> None:
     node, peer = start_node(), make_peer()
     peer.advertise()
@@ -271,6 +273,7 @@ def _set(peer: Any, name: str, value: Any) -> Any:
     return peer.call(SetParameters, "ba_node/set_parameters", request).results[0]
 
 
+@pytest.mark.slow
 def test_parameters_over_services(start_node: StartNode, make_peer: MakePeer, scene: SyntheticData) -> None:
     start_node()
     peer = make_peer()
@@ -299,6 +302,7 @@ def test_parameters_over_services(start_node: StartNode, make_peer: MakePeer, sc
     assert _in_solve(peer) == 3, "the window has the size that was set"
 
 
+@pytest.mark.slow
 def test_starts_with_a_file_and_a_namespace(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, tmp_path: Any
 ) -> None:
@@ -328,6 +332,7 @@ def test_starts_with_a_file_and_a_namespace(
     assert node.stop(signal.SIGTERM) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_during_a_solve(start_node: StartNode, make_peer: MakePeer, number: int) -> None:
     node, peer = start_node(prepare=solve_until_stopped), make_peer()
@@ -354,6 +359,7 @@ def fail_in_the_second_solve() -> None:
     backend.solve = sometimes
 
 
+@pytest.mark.slow
 def test_a_fault_in_a_solve_does_not_end_the_node(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:

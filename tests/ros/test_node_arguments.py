@@ -35,6 +35,7 @@ def test_wrong_arguments_end_with_one_line(start_node: StartNode, arguments: tup
     assert "Traceback" not in node.err
 
 
+@pytest.mark.slow
 def test_help_is_given_and_a_file_for_another_node_is_told(start_node: StartNode, tmp_path: Any) -> None:
     node = start_node("--help")
     assert node.wait() == 0, node.err

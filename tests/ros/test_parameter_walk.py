@@ -49,6 +49,7 @@ def _consistent(changes: dict[str, Any]) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_walk(start_node: Callable[..., Any], make_peer: Callable[..., Any]) -> None:
     node, peer = start_node(), make_peer()
     names = [parameter.name for parameter in declarations()]

@@ -30,6 +30,7 @@ def _allowed(kind: str, how: str, node: str = "ba_node") -> set[str]:
     return {name.replace("~", f"/{node}") if name[0] in "~/" else f"/{name}" for name in found}
 
 
+@pytest.mark.slow
 def test_the_policy_allows_what_the_node_has_and_no_more(
     start_node: Callable[..., Any], make_peer: Callable[..., Any]
 ) -> None:
@@ -65,6 +66,7 @@ def test_the_policy_allows_what_the_node_has_and_no_more(
     assert served() == actions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("node", "program", "arguments", "topics"),
     [

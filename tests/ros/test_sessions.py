@@ -71,6 +71,7 @@ def finding(peer: Any, subject: str) -> Any:
     return next((one for one in arrays[-1].status if one.name.endswith(f": {subject}")), None) if arrays else None
 
 
+@pytest.mark.slow
 def test_transforms_go_on_with_the_stamps_of_a_clock_that_was_set_back(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -94,6 +95,7 @@ def test_transforms_go_on_with_the_stamps_of_a_clock_that_was_set_back(
     assert node.stop() == 0, node.err
 
 
+@pytest.mark.slow
 def test_one_absurd_stamp_is_turned_away_by_name_and_the_map_goes_on(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -115,6 +117,7 @@ def test_one_absurd_stamp_is_turned_away_by_name_and_the_map_goes_on(
     assert node.stop() == 0, node.err
 
 
+@pytest.mark.slow
 def test_a_restart_with_a_lower_session_is_said_at_once_and_taken_in_soon(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -143,6 +146,7 @@ def test_a_restart_with_a_lower_session_is_said_at_once_and_taken_in_soon(
     assert node.stop() == 0, node.err
 
 
+@pytest.mark.slow
 def test_messages_of_no_use_do_not_end_the_map(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
     node, peer = start_node(), listening(make_peer)
     peer.publish(data.rig)

@@ -52,6 +52,7 @@ def street() -> SyntheticData:
     return street_data()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
@@ -78,6 +79,7 @@ def test_fixes_that_are_a_kilometre_off_move_nothing(
     assert len(backend.report.warnings) == len(told) == said, backend.report.warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("off_m", "jumped"),
     [
@@ -105,6 +107,7 @@ def test_a_stretch_of_fixes_that_jumped_is_left_out_and_said(
         assert abs(count - len(jumped)) <= 2, line
 
 
+@pytest.mark.slow
 def test_a_front_end_that_jumps_takes_no_fixes_out(street: SyntheticData) -> None:
     """Its poses go on 10 m beside from the fortieth keyframe on, and images say that the body did not jump."""
     far = np.array([6.0, -8.0, 0.0])
@@ -115,6 +118,7 @@ def test_a_front_end_that_jumps_takes_no_fixes_out(street: SyntheticData) -> Non
     assert backend.scene.constraints.left_out == []
 
 
+@pytest.mark.slow
 def test_fixes_count_by_how_they_scatter_where_their_covariance_is_far_too_small(street: SyntheticData) -> None:
     """A receiver of 1 m that states 1 mm is taken for what it is, and it is said."""
     right, steps = fixes(street, 0.0), wheels(street)
@@ -176,6 +180,7 @@ def test_measurements_in_a_row_on_one_side_of_the_map_tell_together() -> None:
     assert not contradicted._astray_together(shifted[60:69], sigma[60:69], 0.3).any(), "too few to tell"
 
 
+@pytest.mark.slow
 def test_a_receiver_without_a_place_yet_begins_no_frame(street: SyntheticData) -> None:
     nowhere = GlobalFix(0, "gps", np.zeros(3), np.eye(3).ravel(), is_fix=True)
     backend, _, _ = played(first(street, 5), lambda k, _: [nowhere] if k == 0 else [])
@@ -183,6 +188,7 @@ def test_a_receiver_without_a_place_yet_begins_no_frame(street: SyntheticData) -
     assert backend.scene.constraints.origin is None
 
 
+@pytest.mark.slow
 def test_priors_of_which_no_two_agree_leave_the_map_where_it_is(street: SyntheticData) -> None:
     data, rng = first(street, 50), np.random.default_rng(0)
     rotation = geometry.matrix_from_quaternion(street.truth.orientation)
@@ -225,6 +231,7 @@ def test_a_prior_moves_the_map_only_if_a_second_one_agrees(
     assert any(re.match(said, line) for line in backend.report.warnings) == bool(said), backend.report.warnings
 
 
+@pytest.mark.slow
 def test_a_measurement_that_says_nothing_takes_no_place(street: SyntheticData) -> None:
     """A covariance of ten kilometres leaves the front-end's steps in; places of tracks that never come are counted."""
     data = first(street, 12)

@@ -52,6 +52,7 @@ def street() -> SyntheticData:
     return street_data()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outliers", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_wheels_and_gnss_bound_the_drift(street: SyntheticData, outliers: float) -> None:
     """The map ends where the world has it; fixes that are 1 km off are outvoted, and one origin is published."""
@@ -204,6 +205,7 @@ def test_what_cannot_be_is_counted(street: SyntheticData) -> None:
     np.testing.assert_allclose(estimate.trajectory.position, plain.trajectory.position, atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_counts(street: SyntheticData) -> None:
     """The code in docs/factors.md, as it stands there: heights that wander come back to one."""
     page = (Path(__file__).parents[2] / "docs" / "factors.md").read_text(encoding="utf-8")
@@ -221,6 +223,7 @@ def test_the_example_of_the_page_counts(street: SyntheticData) -> None:
     assert spread[1] < 0.3 * spread[0]
 
 
+@pytest.mark.slow
 def test_a_saved_map_keeps_its_place_in_the_world(street: SyntheticData) -> None:
     backend, _ = replayed(first(street, 40), fixes(street, 0.0), **(ANTENNA | {"factors.align_m": 1.0}))
     known = backend.scene.constraints
@@ -244,6 +247,7 @@ def test_a_saved_map_keeps_its_place_in_the_world(street: SyntheticData) -> None
             unpack(broken, Config().scene)
 
 
+@pytest.mark.slow
 def test_gravity_holds_the_tilt(street: SyntheticData) -> None:
     """A front-end that tells which way is down keeps the map level, however few tracks there are."""
     short = first(street, 60)
@@ -271,6 +275,7 @@ def test_priors_without_keyframes_or_a_path_to_align_by_are_said(street: Synthet
     assert text.startswith("3 priors in frame 'enu' were not used: the path is too short")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off_m", "closes"), [(0.0, True), (300.0, False)])
 def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None:
     """A relative pose of the first and last keyframe; one that is 300 m off leaves the map as it is, and is said."""
@@ -289,6 +294,7 @@ def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None
         assert any("the map stays as it is" in text for text in backend.report.warnings)
 
 
+@pytest.mark.slow
 def test_a_loop_is_closed_while_windows_go_on() -> None:
     """The solve of everything runs elsewhere; keyframes that come meanwhile are solved, and follow."""
     data = first(round_trip(0.5), 46)
@@ -313,6 +319,7 @@ def test_a_loop_is_closed_while_windows_go_on() -> None:
     assert backend.take_work(handed[0]) is None, "it is taken in once"
 
 
+@pytest.mark.slow
 def test_gaps_that_were_closed_are_kept_where_poses_explain_the_tracks_better() -> None:
     data = first(round_trip(0.5), 46)
     backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
@@ -334,6 +341,7 @@ def test_gaps_that_were_closed_are_kept_where_poses_explain_the_tracks_better() 
     assert not adjustment._explains_better(copy, taken, (rotation, position), config), "as well is not better"
 
 
+@pytest.mark.slow
 def test_why_no_solve_of_everything_begins_is_said() -> None:
     """Points have a place, and no keyframe sees enough of them: the map is not bent behind their back."""
     data = first(round_trip(0.5), 40)

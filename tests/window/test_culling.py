@@ -37,6 +37,7 @@ def error_m(estimate: Estimate, data: SyntheticData, among: np.ndarray) -> float
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
+@pytest.mark.slow
 def test_a_third_fewer_keyframes_cost_a_few_percent(data: SyntheticData) -> None:
     _, whole = replayed(data, **WINDOW)
     backend, culled = replayed(data, **CHOSEN)
@@ -50,6 +51,7 @@ def test_a_third_fewer_keyframes_cost_a_few_percent(data: SyntheticData) -> None
     check_links(backend.scene)
 
 
+@pytest.mark.slow
 def test_what_is_named_stays_and_steps_lead_over_the_others(data: SyntheticData) -> None:
     """Keyframe 20 is an end of a relative pose, 22 has gravity; every step has a covariance."""
     ids = data.truth.keyframe_id.tolist()

@@ -78,6 +78,7 @@ def whole(data: SyntheticData) -> Estimate:
     return replayed(m for _, _, m in data.timeline())[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("merged", [False, True])
 def test_sessions_that_tracks_connect_are_one_map(data: SyntheticData, whole: Estimate, merged: bool) -> None:
     backend, joined = replayed(two_sessions(data, merged=merged), **{"scene.join_sessions": True})
@@ -91,6 +92,7 @@ def test_sessions_that_tracks_connect_are_one_map(data: SyntheticData, whole: Es
     np.testing.assert_array_equal(loaded.sessions_of(loaded.order), np.arange(N) >= CUT)
 
 
+@pytest.mark.slow
 def test_why_sessions_cannot_be_one_map_is_said(data: SyntheticData) -> None:
     """The second front-end counts its keyframes from the first one's numbers on."""
 
@@ -107,6 +109,7 @@ def test_why_sessions_cannot_be_one_map_is_said(data: SyntheticData) -> None:
     assert text.startswith("session 0 is not joined with this one: keyframe 0 is in both")
 
 
+@pytest.mark.slow
 def test_sessions_that_nothing_connects_are_counted(data: SyntheticData) -> None:
     def apart() -> Iterator[Measurement]:
         for one in two_sessions(data, merged=True):

@@ -64,6 +64,7 @@ def test_on_a_gentle_way_the_offset_is_recovered_to_a_fifth(late_s: float) -> No
     assert abs(clock.change - late_s) < 2.5 * clock.sigma < 0.02
 
 
+@pytest.mark.slow
 def test_where_keyframes_do_not_tell_how_velocities_change_it_is_held() -> None:
     clock = clock_of(recording(LATE_S, gentle=False, n=40))
     assert not clock.told and clock.change == 0.0

@@ -156,6 +156,7 @@ def test_a_third_of_the_tracks_may_move(rig: str, odometry: str, seed: int) -> N
         assert "move against the rest" in backend.scene.log.warnings["moving"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "seed", "limit"), [("mono", 1528, 0.07), ("mono", 0, 0.07), ("stereo", 1, 0.04)])
 def test_the_front_ends_steps_hold_where_much_moves(rig: str, seed: int, limit: float) -> None:
     """Inputs of 0.029, 0.036 and 0.088 m became 0.22, 0.24 and 0.082 m: the map followed what moved unnoticed."""
@@ -171,6 +172,7 @@ def test_much_moves_if_a_tenth_of_what_is_seen_does() -> None:
     assert much(problem, share < 0.12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 4, 6])
 def test_a_young_map_does_not_take_what_stands_for_moving(seed: int) -> None:
     """The front-end drifts and few tracks are seen: poses are off at first, and nothing moves."""

@@ -143,6 +143,7 @@ def test_fixed_keyframes_are_not_tied_to_each_other() -> None:
     assert odometry.factors(scene, Config().odometry, held, selection.keyframes) == ()
 
 
+@pytest.mark.slow
 def test_bad_odometry_counts_less_once_images_tell() -> None:
     """Where steps are off by 5 % of their length the standard deviation of 1 % grows about fivefold."""
     found = []
@@ -182,6 +183,7 @@ def test_few_observations_do_no_harm(baseline_m: float, seed: int) -> None:
     assert after <= before, f"{before:.4f} -> {after:.4f} m"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("points", "seed"),
     [(8.0, 2), pytest.param(8.0, 1, marks=pytest.mark.slow), pytest.param(12.0, 2, marks=pytest.mark.slow)],

@@ -62,6 +62,7 @@ def test_marginalised_keyframes_leave_a_prior_and_take_no_part() -> None:
     assert 0.05 < off @ np.linalg.solve(last.covariance[-1][:3, :3], off) < 13.0
 
 
+@pytest.mark.slow
 def test_the_choice_decides_what_is_fixed() -> None:
     shares = {}
     for choice in ("fix", "drop"):
@@ -84,6 +85,7 @@ def test_the_prior_is_given_up_where_the_map_has_moved(moved_by: str) -> None:
     assert selection.problem.fixed.any()
 
 
+@pytest.mark.slow
 def test_the_memory_does_not_grow() -> None:
     """A long way in which nothing is seen again: what is kept is what the window may still see."""
     backend, _, _ = slid("marginalise", keyframes=40, length_m=30.0, landmarks=1200)
@@ -92,6 +94,7 @@ def test_the_memory_does_not_grow() -> None:
     assert len(memory.left) <= N and len(memory.tracks) < 400 and len(memory.keyframe_id) < N
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("baseline_m", "most"), [(0.2, 1.5), pytest.param(0.0, 2.2, marks=pytest.mark.slow)])
 def test_tracks_that_last_do_not_unglue_the_window(baseline_m: float, most: float) -> None:
     """Every keyframe that leaves sees tracks that go on alone: what it told of them is not lost."""

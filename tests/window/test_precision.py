@@ -45,6 +45,7 @@ def test_a_front_end_ten_times_as_precise_as_images_is_not_spoilt() -> None:
     assert not backend.report.warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
     [
@@ -61,12 +62,14 @@ def test_so_it_is_where_images_tell_lengths_badly(more: dict[str, Any]) -> None:
     assert found < 1.08 * given, (given, found)
 
 
+@pytest.mark.slow
 def test_steps_that_are_precise_in_their_turns_alone_count_for_these() -> None:
     backend, given, found = replayed(0.01, 0.02, 60, baseline_m=0.0, path="loop", seed=12, noise_px=1.5)
     assert backend.scene.step_shares[0] < 0.1 and backend.scene.step_shares[1] == 1.0, backend.scene.step_shares
     assert found < 0.6 * given, (given, found)
 
 
+@pytest.mark.slow
 def test_steps_as_stated_or_worse_stay_as_they_are() -> None:
     backend, given, found = replayed(0.3, 0.02, 50)
     assert backend.scene.step_shares == (1.0, 1.0)
@@ -74,6 +77,7 @@ def test_steps_as_stated_or_worse_stay_as_they_are() -> None:
     assert found < given
 
 
+@pytest.mark.slow
 def test_windows_go_on_while_it_is_asked_what_steps_are_worth() -> None:
     """One study at a time; what it finds counts once it is taken in, and once."""
     data = generate(SyntheticOptions(seed=3, keyframes=45, length_m=22.0, landmarks=1000, tracks=60, path="line"))

@@ -45,6 +45,7 @@ def replayed(measurements: Iterator[Measurement]) -> Backend:
     return backend
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("baseline_m", [0.12, 0.0])
 def test_slots_do_no_harm_and_are_named(baseline_m: float) -> None:
     options = SyntheticOptions(
@@ -60,6 +61,7 @@ def test_slots_do_no_harm_and_are_named(baseline_m: float) -> None:
     assert "give every track an id of its own" in backend.scene.log.warnings["ids_reused"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("baseline_m", [0.12, 0.0])
 def test_ids_that_are_not_reused_are_left_alone(baseline_m: float) -> None:
     data = generate(SyntheticOptions(keyframes=40, length_m=35.0, baseline_m=baseline_m, outlier_share=0.2))
@@ -68,6 +70,7 @@ def test_ids_that_are_not_reused_are_left_alone(baseline_m: float) -> None:
     assert "ids_reused" not in backend.scene.log.warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outlier_share", [0.05, 0.1])
 def test_a_mismatch_near_an_end_of_a_long_track_is_no_other_point(outlier_share: float) -> None:
     """The views behind it fit the point; they were parted from it, and ids said to be used again."""

@@ -50,6 +50,7 @@ def values(found: Any) -> dict[str, str]:
     return {pair.key: pair.value for pair in found.values}
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_silence_is_stale_and_names_who_is_missing(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
@@ -94,6 +95,7 @@ def fail_from_the_third() -> None:
     vars(solver)["solve"] = failing
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_a_solve_that_fails_is_an_error(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
     start_node(prepare=fail_from_the_third)
@@ -106,6 +108,7 @@ def test_a_solve_that_fails_is_an_error(start_node: StartNode, make_peer: MakePe
     assert status(peer, "solver").message == "the last solve failed: made to fail"
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_thresholds_are_live(start_node: StartNode, make_peer: MakePeer) -> None:
     start_node()
@@ -117,6 +120,7 @@ def test_thresholds_are_live(start_node: StartNode, make_peer: MakePeer) -> None
     peer.until(lambda: level(peer, "memory") == DiagnosticStatus.ERROR, "an error")
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_what_is_turned_away_warns(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
     start_node("--ros-args", "-p", "diagnostics.recent_s:=1000.0")

@@ -75,6 +75,7 @@ def assert_leads_to_refined(peer: Any, data: SyntheticData, stamped: Any) -> Non
     np.testing.assert_allclose(map_from_base.rotation, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_map_to_odom_and_odometry_together_are_the_refined_pose(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -97,6 +98,7 @@ def test_map_to_odom_and_odometry_together_are_the_refined_pose(
     assert node.stop() == 0, node.err
 
 
+@pytest.mark.slow
 def test_a_gate_holds_the_transform_but_not_the_map(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -116,6 +118,7 @@ def test_a_gate_holds_the_transform_but_not_the_map(
     assert first - data.keyframes[1].stamp_ns >= S // 2
 
 
+@pytest.mark.slow
 def test_it_can_be_switched_off_and_on_again(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
     node, peer = start_node("--ros-args", "-p", "frames.publish_tf:=false"), listening(make_peer)
     peer.connect()
@@ -126,6 +129,7 @@ def test_it_can_be_switched_off_and_on_again(start_node: StartNode, make_peer: M
     peer.until(lambda: peer.received["/tf"], "a transform")
 
 
+@pytest.mark.slow
 def test_a_front_end_that_calls_its_frame_map_leaves_no_room(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -146,6 +150,7 @@ def forget_tf2_msgs() -> None:
     message_class.cache_clear()
 
 
+@pytest.mark.slow
 def test_without_tf2_msgs_it_runs_and_says_once_what_is_off(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -170,6 +175,7 @@ def static_transform(parent: str, child: str, place: Transform) -> Any:
     return message
 
 
+@pytest.mark.slow
 def test_cameras_sit_where_tf_static_says(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
     node, peer = start_node("--ros-args", "-p", "frames.extrinsics:=tf_static"), listening(make_peer)
     static = peer.node.create_publisher(tf2.TFMessage, "/tf_static", qos.latched())

@@ -75,6 +75,7 @@ def client(peer: Any) -> Iterator[Client]:
     made.close()
 
 
+@pytest.mark.slow
 def test_everything_is_refined_with_feedback(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData
 ) -> None:
@@ -106,6 +107,7 @@ def test_everything_is_refined_with_feedback(
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_one_at_a_time_and_cancel(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any
 ) -> None:
@@ -133,6 +135,7 @@ def test_one_at_a_time_and_cancel(
     assert "goal of ~/optimize rejected: another goal is at work" in node.err + node.out
 
 
+@pytest.mark.slow
 def test_windows_go_on_and_follow(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any
 ) -> None:
@@ -154,6 +157,7 @@ def test_windows_go_on_and_follow(
     assert error < drift / 3, f"{error:.3f} m, the front-end's are {drift:.3f} m off"
 
 
+@pytest.mark.slow
 def test_reset_aborts_it(start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any) -> None:
     start_node(*SMALL_WINDOW, **gates.options)
     peer.connect()
@@ -168,6 +172,7 @@ def test_reset_aborts_it(start_node: StartNode, peer: Any, client: Client, scene
     assert (response.result.success, response.result.reason) == (False, "the map was reset or replaced meanwhile")
 
 
+@pytest.mark.slow
 def test_time_is_up(start_node: StartNode, peer: Any, client: Client, scene: SyntheticData) -> None:
     start_node(*SMALL_WINDOW)
     peer.connect()
@@ -192,6 +197,7 @@ def test_goals_that_make_no_sense(start_node: StartNode, peer: Any, client: Clie
     assert "time_budget_s = -1.0: expected seconds" in node.err + node.out
 
 
+@pytest.mark.slow
 def test_answers_that_warn_and_inform_in_turn(
     start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, tmp_path: Path
 ) -> None:
@@ -218,6 +224,7 @@ def test_answers_that_warn_and_inform_in_turn(
     assert "Traceback" not in text and "severity" not in text, text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["cleanup", "signal"])
 def test_the_node_ends_during_it(
     end: str, start_node: StartNode, peer: Any, client: Client, scene: SyntheticData, gates: Any

@@ -75,6 +75,7 @@ def _load(peer: Any, path: Path | str) -> Any:
     return peer.call(LoadMap, "ba_node/load_map", LoadMap.Request(path=str(path)))
 
 
+@pytest.mark.slow
 def test_reset_forgets_the_map_and_says_so(start_node: StartNode, peer: Any, scene: SyntheticData) -> None:
     node = start_node()
     peer.connect()
@@ -110,6 +111,7 @@ def test_data_is_ignored_and_counted_while_paused(start_node: StartNode, peer: A
     assert {5, 6, 7} <= set(ids)
 
 
+@pytest.mark.slow
 def test_a_saved_map_goes_on_in_another_node(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path
 ) -> None:
@@ -141,6 +143,7 @@ def test_a_saved_map_goes_on_in_another_node(
     assert second.stop() == 0
 
 
+@pytest.mark.slow
 def test_what_cannot_be_saved_or_loaded_is_told(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path
 ) -> None:
@@ -195,6 +198,7 @@ def test_what_cannot_be_saved_or_loaded_is_told(
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_an_answer_does_not_wait_for_a_solve(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
 ) -> None:
@@ -222,6 +226,7 @@ def test_an_answer_does_not_wait_for_a_solve(
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path) -> None:
     start_node(*INACTIVE)
     names = {f"/ba_node/{name}" for name in SERVICES}
@@ -245,6 +250,7 @@ def test_inactive_or_not_there(start_node: StartNode, peer: Any, scene: Syntheti
     assert peer.offers("ba_node/change_state")
 
 
+@pytest.mark.slow
 def test_who_waits_at_cleanup_is_answered(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
 ) -> None:
@@ -270,6 +276,7 @@ def test_who_waits_at_cleanup_is_answered(
     assert not (tmp_path / "a.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_file_is_written_to_the_end(
     start_node: StartNode, peer: Any, scene: SyntheticData, tmp_path: Path, gates: Any
 ) -> None:
@@ -287,6 +294,7 @@ def test_a_file_is_written_to_the_end(
     assert len(read_map(tmp_path / "a.npz").arrays["keyframes/position"]) == 3
 
 
+@pytest.mark.slow
 def test_a_map_is_saved_at_the_end_and_loaded_at_the_start(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData, tmp_path: Path
 ) -> None:

@@ -25,6 +25,7 @@ def peer(make_peer: Callable[..., Any]) -> Any:
     return made
 
 
+@pytest.mark.slow
 def test_wrong_baseline_is_said_and_held(start_node: Callable[..., Any], peer: Any) -> None:
     start_node()
     peer.connect()

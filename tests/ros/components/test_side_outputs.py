@@ -63,6 +63,7 @@ def watch(peer: Any, topic: str, latched: bool = False) -> Any:
     return peer.node.create_subscription(cls, f"ba_node/{topic}", peer.received[topic].append, profile)
 
 
+@pytest.mark.slow
 def test_nothing_is_worked_out_that_nobody_looks_at(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -106,6 +107,7 @@ def test_nothing_is_worked_out_that_nobody_looks_at(
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_markers_show_the_window_and_begin_anew_with_a_session(
     start_node: StartNode, make_peer: MakePeer, data: SyntheticData
 ) -> None:
@@ -137,6 +139,7 @@ def test_markers_show_the_window_and_begin_anew_with_a_session(
     late.until(lambda: late.received["markers"], "the markers that are kept")
 
 
+@pytest.mark.slow
 def test_odometry_goes_on_in_time(start_node: StartNode, make_peer: MakePeer, data: SyntheticData) -> None:
     """It is the newest keyframe of each solve, once; in a new session stamps may begin anew."""
     node, peer = start_node("--ros-args", "-p", "frames.base_frame:=robot"), make_peer()

@@ -94,6 +94,7 @@ class Asker:
         return {name: [one.result() for one in some] for name, some in futures.items()}
 
 
+@pytest.mark.slow
 def test_the_front_end_answers_while_it_tracks(start_node: StartNode, make_peer: MakePeer) -> None:
     pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
     node, peer = start_node("--ros-args", "-p", "mode:=mono", program="ba_node.ros.front_end.main:main"), make_peer()
@@ -123,6 +124,7 @@ def test_the_front_end_answers_while_it_tracks(start_node: StartNode, make_peer:
     assert node.stop() == 0, node.err
 
 
+@pytest.mark.slow
 def test_the_adapter_answers(start_node: StartNode, make_peer: MakePeer) -> None:
     arguments = ("--from", "vins_mono", "--ros-args", "-r", "feature:=points")
     node, peer = start_node(*arguments, program="ba_node.ros.tools.adapter:main"), make_peer()

@@ -120,6 +120,7 @@ def begin(peer: Any, *names: str, **options: bool) -> Camera:
     return camera
 
 
+@pytest.mark.slow
 def test_wrong_parameters_are_refused_in_a_line(start_node: StartNode) -> None:
     for argument, words in (
         ("mode:=fish", "option mode = 'fish': choose one of auto, stereo, rgbd, mono"),
@@ -180,6 +181,7 @@ def errors(kitti: Kitti, stamps: Any, position: Any) -> Any:
     return np.linalg.norm(position - kitti.truth[(np.asarray(stamps) - BEGIN_NS) // STEP_NS, :, 3], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [12, pytest.param(51, marks=pytest.mark.slow)])
 def test_pairs_at_10_hz_come_back_as_refined_keyframes(
     count: int, start_node: StartNode, make_peer: MakePeer, kitti: Kitti
@@ -208,6 +210,7 @@ def test_pairs_at_10_hz_come_back_as_refined_keyframes(
         assert error.max() < 0.1 + 0.01 * length_m, f"{name}: {error.max():.3f} m on {length_m:.1f} m"
 
 
+@pytest.mark.slow
 def test_a_turned_second_camera_begins_the_map_again(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
     """By 0.1 degree: the first keyframes come again, as another session, and its map is as near to the truth."""
     back_end, node, peer = start_node(), start_node(program=PROGRAM), make_peer()
@@ -245,6 +248,7 @@ def stamp_of(message: Any) -> int:
     return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
 
 
+@pytest.mark.slow
 def test_other_modes_and_compressed_images(start_node: StartNode, make_peer: MakePeer, kitti: Kitti) -> None:
     """One compressed camera under another name, with odometry by TF from a base that /tf_static places."""
     arguments = ("-p", "odometry:=tf", "-p", "base_frame:=base_link", "-r", "image_raw:=cam/image_raw")
@@ -315,6 +319,7 @@ def test_depth_and_masks(start_node: StartNode, make_peer: MakePeer, kitti: Kitt
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_darkness_raises_the_covariance_and_then_the_session(
     start_node: StartNode, make_peer: MakePeer, kitti: Kitti
 ) -> None:

@@ -291,6 +291,7 @@ def start_alone(
     return start
 
 
+@pytest.mark.slow
 def test_the_solvers_thread_dies(start_alone: Callable[..., Client], tmp_path: Path, scene: SyntheticData) -> None:
     """Whoever waits then is answered, and whoever comes later too."""
     alone = start_alone(prepare=put_faults, folder=str(tmp_path))
@@ -308,6 +309,7 @@ def test_the_solvers_thread_dies(start_alone: Callable[..., Client], tmp_path: P
     assert alone.node.stop() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 15])
 def test_who_waits_when_a_signal_comes_is_answered(
     number: int, start_alone: Callable[..., Client], gates: Any, tmp_path: Path

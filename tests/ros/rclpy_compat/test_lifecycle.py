@@ -46,6 +46,7 @@ def _topics(peer: Any) -> set[str]:
     return {name for name, _ in peer.node.get_topic_names_and_types()}
 
 
+@pytest.mark.slow
 def test_starts_active_or_as_told(start_node: StartNode, make_peer: MakePeer) -> None:
     node, peer = start_node(), make_peer()
     peer.until(lambda: _state(peer) == ACTIVE, "autostart")
@@ -57,6 +58,7 @@ def test_starts_active_or_as_told(start_node: StartNode, make_peer: MakePeer) ->
     assert node.out.endswith("stopped: 0 keyframes refined\n")
 
 
+@pytest.mark.slow
 def test_every_transition_from_every_state(start_node: StartNode, make_peer: MakePeer) -> None:
     """Also those that make no sense, by name and by number: refused, and the state stays."""
     node, peer = start_node("--ros-args", "-p", "node.autostart:=false"), make_peer()
@@ -80,6 +82,7 @@ def test_every_transition_from_every_state(start_node: StartNode, make_peer: Mak
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_deactivate_holds_the_map_and_cleanup_drops_it(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:
@@ -154,6 +157,7 @@ def test_cameras_are_taken_while_inactive(start_node: StartNode, make_peer: Make
     peer.until(lambda: peer.received["report"] and peer.received["report"][-1].landmarks > 0, "points")
 
 
+@pytest.mark.slow
 def test_transitions_during_a_solve(start_node: StartNode, make_peer: MakePeer) -> None:
     node, peer = start_node(prepare=solve_until_stopped), make_peer()
     peer.advertise()
@@ -187,6 +191,7 @@ def fail_once() -> None:
     vars_of.__init__, vars_of.activate = fragile_configure, lambda _: once("activate")
 
 
+@pytest.mark.slow
 def test_a_transition_that_fails_is_logged_and_can_be_tried_again(
     start_node: StartNode, make_peer: MakePeer, scene: SyntheticData
 ) -> None:

@@ -42,6 +42,7 @@ def forget_private_parts() -> None:
         vars(module)["part"] = lambda *_: None
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_the_node_works_without_them(start_node: Callable[..., Any], make_peer: Callable[..., Any]) -> None:
     chosen = ("-p", "window.max_keyframes:=7", "-p", "no.such.name:=1")

@@ -45,6 +45,7 @@ def needs_rtabmap_msgs() -> None:
         pytest.skip("another rtabmap_msgs is installed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "expected", "images"),
     [
@@ -82,6 +83,7 @@ def test_what_a_front_end_publishes_comes_back_refined(
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_without_a_front_end_it_is_said_what_is_missing(start_node: StartNode, make_peer: MakePeer) -> None:
     adapter, peer = start_node("--from", "vins_mono", program=PROGRAM), make_peer()
     peer.until(lambda: "nobody publishes" in adapter.err, "the log")

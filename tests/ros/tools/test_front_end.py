@@ -26,6 +26,7 @@ StartNode = Callable[..., Any]
 MakePeer = Callable[..., Any]
 
 
+@pytest.mark.slow
 def test_the_python_example_feeds_the_node(start_node: StartNode) -> None:
     node = start_node()
     command = [sys.executable, str(EXAMPLES / "front_end.py")]
@@ -37,6 +38,7 @@ def test_the_python_example_feeds_the_node(start_node: StartNode) -> None:
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 def test_the_cpp_example_compiles_against_the_messages(tmp_path: Path) -> None:
     """And runs, with a stand-in for rclcpp, which the wheels do not bring."""
     prefix = next((p for p in _prefixes() if (p / "include" / "ba_msgs" / "ba_msgs" / "msg").is_dir()), None)

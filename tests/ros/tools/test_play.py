@@ -177,6 +177,7 @@ def test_senseless_options_are_refused(name: str, value: float, words: str) -> N
         PlayOptions(**options)
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_real_stereo_sequence_through_the_node(
     start_node: Callable[..., Any], make_peer: MakePeer, shared_data: Path
@@ -254,6 +255,7 @@ def test_the_time_goes_with_the_recording(bag: Path, scene: SyntheticData, make_
         assert summary.duration_s >= 2 * (last_ns - start_ns) * 1e-9 / rate
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_a_node_goes_by_that_time(bag: Path, scene: SyntheticData, make_peer: MakePeer, start_node: Any) -> None:
     node, peer = start_node("--ros-args", "-p", "use_sim_time:=true"), make_peer()
@@ -269,6 +271,7 @@ def test_a_node_goes_by_that_time(bag: Path, scene: SyntheticData, make_peer: Ma
     assert node.stop() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_a_loop_goes_on_until_it_is_interrupted(bag: Path, scene: SyntheticData, make_peer: MakePeer) -> None:
     peer = make_peer()

@@ -24,6 +24,7 @@ def recorder(out: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen([*BA, "record", "--out", str(out), *options], stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_what_is_played_is_recorded(tmp_path: Path, domain: int) -> None:  # noqa: ARG001
     bag, out = tmp_path / "scene.mcap", tmp_path / "again.mcap"
     data = generate(SyntheticOptions(seed=5, keyframes=6, length_m=10.0, path="line", tracks=50, guesses=True))
@@ -50,6 +51,7 @@ def test_what_is_played_is_recorded(tmp_path: Path, domain: int) -> None:  # noq
         assert len(list(after.measurements())) == len(list(before.measurements()))
 
 
+@pytest.mark.slow
 def test_nothing_to_record_is_said(tmp_path: Path, domain: int) -> None:  # noqa: ARG001
     process = recorder(tmp_path / "none.mcap", "--duration", "1")
     _, error = process.communicate(timeout=60)
@@ -64,6 +66,7 @@ def test_nothing_to_record_is_said(tmp_path: Path, domain: int) -> None:  # noqa
     assert (tmp_path / "mine.mcap").read_bytes() == b"mine"
 
 
+@pytest.mark.slow
 def test_what_a_back_end_publishes_is_left_out(tmp_path: Path, domain: int) -> None:  # noqa: ARG001
     given, kind = "/robot/ba_node/pose_with_covariance", "geometry_msgs/msg/PoseWithCovarianceStamped"
     program = f"""

@@ -18,6 +18,7 @@ from ba_node.offline.tuning_page import write_parameters
 pytestmark = pytest.mark.dds
 
 
+@pytest.mark.slow
 def test_what_was_found_is_set_on_a_running_node(
     start_node: Callable[..., Any], make_peer: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
