@@ -40,6 +40,7 @@ def test_flake8() -> None:
     assert run.returncode == 0, run.stdout + run.stderr
 
 
+@pytest.mark.slow
 def test_pep257(capfd: pytest.CaptureFixture[str]) -> None:
     """Docstrings as Google writes them; tests say by their names what they do."""
     linter = pytest.importorskip("ament_pep257.main", reason="ament_pep257 is not installed")

@@ -367,6 +367,7 @@ def test_a_solve_of_everything_is_judged_too(kind: str) -> None:
     assert not backend.refusal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["stereo_baseline_sign", "extrinsics_inverted", "depth_in_mm", "extrinsics_1_degree"],

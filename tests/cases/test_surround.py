@@ -75,6 +75,7 @@ def test_cameras_that_look_at_the_same_may_be_tracked_one_by_one(path: str, tmp_
     harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "options", "looks", "named"),
     [

@@ -86,7 +86,7 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
 # The quick tests do with one rig. These are told by adjustments of seconds, in which all cameras change alike: with one
 # camera, and with one amount and one lens of what is adjusted alike.
 ADJUSTED = ("focal 0.8", "focal 0.5", "fx alone", "binning", "not rectified", "rectified", "fisheye given")
-ALIKE = ("focal 0.5", "fisheye given")
+ALIKE = ("focal 0.5", "fisheye given", "principal point of camera 1, u")
 CASES = [
     pytest.param(
         wrong,

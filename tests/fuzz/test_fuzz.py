@@ -20,6 +20,7 @@ def _peak_kb() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", targets.NAMES)
 def test_no_bytes_break_it(name: str) -> None:
     before = _peak_kb()

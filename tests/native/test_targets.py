@@ -179,6 +179,7 @@ def test_a_target_that_the_processor_lacks_is_said(monkeypatch: pytest.MonkeyPat
     assert Old.used == ["avx2"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("objdump") is None, reason="no objdump")
 def test_wide_instructions_stay_in_the_functions_of_their_target() -> None:
     # Names of template arguments count: a function of the standard library for a type of a target is that target's. So

@@ -38,6 +38,7 @@ def test_the_version_says_so(tree: Path) -> None:
     assert "(kernels: numpy)" in run(tree, "--version").stdout
 
 
+@pytest.mark.slow
 def test_a_recording_is_refined_as_well(tree: Path, tmp_path: Path) -> None:
     done = run(tree, "replay", str(BAG), "--out", str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr

@@ -105,6 +105,7 @@ def test_a_browser_draws_every_figure_and_reports_no_error(folder: Path) -> None
     assert all(counts.values()), counts
 
 
+@pytest.mark.slow
 def test_each_figure_is_a_picture_too(folder: Path) -> None:
     pictures = sorted((folder / "report").iterdir())
     assert [picture.stem for picture in pictures] == sorted(KEYS)
@@ -185,6 +186,7 @@ def test_several_runs_stand_side_by_side(folder: Path, tmp_path: Path) -> None:
     assert {"mono: after", "other: after"} <= names
 
 
+@pytest.mark.slow
 def test_a_replay_leaves_a_page_and_a_picture_unless_told_not_to(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

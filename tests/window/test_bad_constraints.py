@@ -139,6 +139,7 @@ def test_fixes_count_by_how_they_scatter_where_their_covariance_is_far_too_small
     assert 0.5 < float(found[1]) < 1.5 and 500 < int(found[2]) < 1500, lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("steps_told", "drift_m"),
     [("relative", 10.0), pytest.param("covariance", 10.0, marks=pytest.mark.slow), ("relative", 0.0)],
@@ -204,6 +205,7 @@ def test_priors_of_which_no_two_agree_leave_the_map_where_it_is(street: Syntheti
     assert any("of 50 recent priors in frame 'map' no two agree" in line for line in backend.report.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("right", "wrong", "moves_m", "said"),
     [

@@ -109,6 +109,7 @@ def test_known_points_hold_the_map(street: SyntheticData) -> None:
     assert errors[1] < 0.25 * errors[0]
 
 
+@pytest.mark.slow
 def test_a_loop_closes_and_the_odometry_frame_stays() -> None:
     data = round_trip(0.5)
     pairs = merges(data)

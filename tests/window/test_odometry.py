@@ -161,6 +161,7 @@ def test_bad_odometry_counts_less_once_images_tell() -> None:
     assert 2.5 < found[0] < 7.0 and found[1] <= 1.0, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["mono", "stereo"])
 @pytest.mark.parametrize("fault", ["stands_still", "stops_midway"])
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])

@@ -31,6 +31,7 @@ def test_a_choice_of_names() -> None:
         runs.tasks(1, ["far"])
 
 
+@pytest.mark.slow
 def test_sound_recording() -> None:
     row = runs.run(Task(FAULT_TABLE, SOUND, RGBD, 0.0, 0))
     assert row["key"] == "faults/sound/rgbd/0/0"
@@ -38,6 +39,7 @@ def test_sound_recording() -> None:
     assert row["published_m"] < 0.5 * row["input_m"] < 0.03
 
 
+@pytest.mark.slow
 def test_outliers_are_compared_with_none() -> None:
     row = runs.run(Task(OUTLIER_TABLE, "outliers_uniform", RGBD, 0.1, 0))
     assert row["optimum_m"] < 0.1 * row["input_m"]

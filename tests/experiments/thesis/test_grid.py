@@ -42,6 +42,7 @@ def sphere(size: str) -> Problem:
     return to_problem(start_of(generate_sphere(PRESETS[size])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "method"), GRID)
 def test_method_on_sphere(size: str, method: str) -> None:
     settings = [f"max_iterations={ITERATIONS[size]}", *(["cap=5"] if size in LARGE else [])]

@@ -144,6 +144,7 @@ def test_keys_do_not_depend_on_the_machine() -> None:
     assert key(task, Library(Path())) != key(Measure("10-289", "taylor"), Library(Path()))
 
 
+@pytest.mark.slow
 def test_the_page_holds_everything(tiny: Experiment, tmp_path: Path) -> None:
     made = repetition(tiny, tmp_path)
     page = made.write(made.run(clock)).read_text()

@@ -38,6 +38,7 @@ def distances(path: Path, seen: list[Seen]) -> Any:
     return np.linalg.norm(told.position - np.array([seen[row].true[1] for row in rows]), axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", LEAST)
 def test_a_recording_is_read_and_every_keyframe_refined(
     source: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
