@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
+from ba_node.config import SolverOptions
 from ba_node.core import columns
 from ba_node.core.objective import Objective, PointRows
 from ba_node.core.problem import State
@@ -31,8 +32,9 @@ _MIN_DIAGONAL = 1e-6
 # A point that gains less than this share has arrived.
 _MIN_GAIN = 1e-4
 # One that its model promises less than this share does not step at all. With 1e-4 the last 1e-6 of the objective of a
-# loop of 1000 cameras took 57 iterations in place of 21; with 1e-8 windows and Ladybug end as if all stepped.
-_MIN_PROMISE = 1e-8
+# loop of 1000 cameras took 57 iterations in place of 21; with 1e-8 windows and Ladybug end as if all stepped. Where the
+# solve ends for little, a point steps for no less than this share of that.
+_MIN_PROMISE, _OF_TOLERANCE = 1e-8, 1e-2
 # With an observation outside of Huber's loss: the share that has arrived; that which IRLS must promise less than; and
 # how much of the curvature along the residual is taken away.
 _MIN_GAIN_OUTLIER, _CLOSE, _RADIAL = 1e-6, 1e-3, 0.9
@@ -46,6 +48,11 @@ class InnerIterations:
     before: float  # the objective at the start
     after: float  # the objective of ``state``
     rows: PointRows  # of all observations at ``state``
+
+
+def least_promise(options: SolverOptions) -> float:
+    """Return the share of its own cost that a point's step has to promise."""
+    return max(_MIN_PROMISE, _OF_TOLERANCE * options.function_tolerance)
 
 
 def iterate_points(objective: Objective, structure: Structure, state: State, steps: int) -> InnerIterations:
@@ -84,7 +91,7 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
                 c[close] -= flat[close]
                 inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
                 scaled = columns.times(inverse, gradient)
-        active &= np.sum(scaled * scaled, axis=1) > _MIN_PROMISE * cost
+        active &= np.sum(scaled * scaled, axis=1) > least_promise(objective.options) * cost
         if not active.any():
             break
         points = best.copy()

@@ -17,6 +17,7 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
 from ba_node.core.factors import FactorSum, FactorTerms, Known, Pairs, RelativePoses
+from ba_node.core.inner_iterations import least_promise
 from ba_node.core.kernels import DENSE_LIMIT, Kernels, LinearSolver, StepResult, System
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
@@ -91,7 +92,7 @@ class NativeKernels:
         self._factors = NativeFactorSum(problem.factors, problem.fixed) if problem.factors else None
         pairs = _NO_PAIRS if self._factors is None else (self._factors.rows, self._factors.columns)
         threads = options.threads or len(os.sched_getaffinity(0))
-        cost = (options.loss, options.loss_scale_px, options.cheirality)
+        cost = (options.loss, options.loss_scale_px, options.cheirality, least_promise(options))
         self._kernel: Kernel = native.kernels.Kernel(problem, cost, pairs, threads)
         self.n_free: int = self._kernel.n_free
         self.gradient_norm = np.inf

@@ -302,7 +302,7 @@ def _lenses(problem: Problem, used: IntArray) -> tuple[NDArray[np.uint8], FloatA
 
 def reprojection_errors(problem: Problem, state: State) -> FloatArray:
     """Return predicted minus measured, (n_obs, 2) px, NaN for points that their camera cannot see."""
-    return Objective(problem, SolverOptions()).errors(state)
+    return Objective(replace(problem, factors=()), SolverOptions()).errors(state)
 
 
 def squared_errors(problem: Problem, state: State) -> FloatArray:

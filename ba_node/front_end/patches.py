@@ -31,8 +31,8 @@ from ba_node.arrays import FloatArray
 from ba_node.front_end.opencv import cv2
 
 Floats = NDArray[np.float32]
-# Steps shorter than this end an alignment, and none is longer, px.
-_STEP_PX, _FARTHEST_PX = 0.01, 3.0
+# Steps shorter than the first end an alignment, and none is longer than the second, px.
+_STEP_PX, _FARTHEST_PX = 0.03, 3.0
 _LEAST_STD = 0.5
 _LEAST_HESSIAN = 1e-6
 _STRIDE = 2

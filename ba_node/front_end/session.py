@@ -101,9 +101,8 @@ class Session:
             return None
         self.lost = 0
         moved, shift = self.tracker.moved()
-        share = len(self.tracker.rows) / max(self.tracker.shared, 1)
         o = self.options
-        still = moved < o.keyframe_parallax_px and share >= o.keyframe_min_shared and not self.unseen
+        still = moved < o.keyframe_parallax_px and self.tracker.share >= o.keyframe_min_shared and not self.unseen
         if still or not sure:
             state = State.STANDING if shift < _STANDS_PX else State.TRACKING
             return self.told(state, images, found, odometry)

@@ -73,7 +73,8 @@ class Streams:
 
     def __init__(self, names: tuple[str, ...], optional: frozenset[str], depth: int, patience: int = 3) -> None:
         self.counted: Counter[str] = Counter()  # images left out, by reason
-        self.apart_ns: dict[str, int] = {}  # by how much the nearest image of a stream was off when one was left out
+        # By how much the nearest image of a stream was off when one was left out; 0 where there was none.
+        self.apart_ns: dict[str, int] = {}
         self._first, *self._others = names
         self._optional, self._patience = optional, patience
         self._waiting: dict[str, deque[tuple[int, Any]]] = {name: deque(maxlen=depth) for name in names}
@@ -116,7 +117,7 @@ class Streams:
             apart_ns = MAX_APART_NS + 1 if nearest is None else nearest[0] - stamp_ns
             if abs(apart_ns) > MAX_APART_NS:
                 self.counted[f"no {name}"] += 1
-                self.apart_ns[name] = apart_ns
+                self.apart_ns[name] = 0 if nearest is None else apart_ns
                 if name not in self._optional:
                     return None
                 continue

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track points from image to image, estimate the camera's pose by them, and measure them anew at keyframes.
 
-Between keyframes features are followed from image to image, which is quick. At a keyframe each is aligned with the
+Between keyframes features are followed from image to image, which is quick; where depths are measured some lead, and
+the others are where the pose has them, as far off as they were. At a keyframe each is aligned with the
 patch that it was first seen as, warped to how it should look from here, so that no error is handed on; points of the
 map that were lost and should be in view are looked for in the same way, and come back under their old ids.
 """
@@ -40,6 +41,8 @@ _EPIPOLAR_PX = 1.0
 _ZOOM = 1.5
 # Lost points that are looked for at once, newest first.
 _LOOKED_FOR = 160
+# Points of known depth that are followed from image to image, whose pose tells where the others are.
+_LEADERS = 200
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
 
 
@@ -79,7 +82,8 @@ class Tracker:
         self.sigma = np.empty(0)  # their standard deviations at the last keyframe, px
         self.given = False  # True where poses come from an odometry
         self.lengths = Lengths()  # of its steps
-        self.shared = 0  # features of the last keyframe
+        self.leaders: IntArray = np.empty(0, np.intp)  # points of the last keyframe that are followed themselves
+        self._behind = self.rows, self.uv  # the others, and how far they were from where the pose had them, px
         self.seen_step: Step | None = None  # to it, as one camera sees it without the odometry
 
     @property
@@ -88,24 +92,28 @@ class Tracker:
         w = self.map.inverse_depth[self.rows[self.map.known[self.rows]]]
         return float(np.median(w)) if len(w) else 0.0
 
-    def follow(self, frame: Frame, expected: Transform | None) -> BoolArray:
-        """Follow features to a new image; return which of them were found, and keep those alone.
+    def follow(self, frame: Frame, expected: Transform | None) -> None:
+        """Follow features to a new image, and keep those that are found.
 
-        ``expected`` is camera from map, as foretold; None if nobody knows.
+        ``expected`` is camera from map, as foretold; None if nobody knows, and then all are followed. Otherwise it is
+        the leaders, after whom :meth:`locate` brings the others.
         """
         assert self.frame is not None
-        first = None
+        rows, uv, first = self.rows, self.uv, None
+        self._behind = rows[:0], uv[:0]
         if expected is not None:
-            first = self.map.seen_at(self.rows, expected, self.scene_inverse_depth)
-            before = self.map.seen_at(self.rows, self.pose, self.scene_inverse_depth)
-            first = self.uv + np.nan_to_num(first - before)
-        uv, found = features.follow(self.frame.grey, frame.grey, self.uv, first)
+            before = self.map.seen_at(rows, self.pose, self.scene_inverse_depth)
+            first = uv + np.nan_to_num(self.map.seen_at(rows, expected, self.scene_inverse_depth) - before)
+            leads = np.isin(rows, self.leaders)
+            self._behind = rows[~leads], (uv - before)[~leads]
+            rows, uv, first = rows[leads], uv[leads], first[leads]
+        uv, found = features.follow(self.frame.grey, frame.grey, uv, first)
         found &= inside(frame.allowed, uv)
-        self.rows, self.uv, self.frame = self.rows[found], uv[found], frame
-        return found
+        self.rows, self.uv, self.frame = rows[found], uv[found], frame
 
     def locate(self) -> Found | None:
         """Find the pose by the features that are followed now, and let go those that do not agree with it."""
+        assert self.frame is not None
         known = self.map.known[self.rows]
         seen = self._seen(self.rows[known], self.uv[known], np.full(int(known.sum()), 0.5))
         found = pose.consensus(self.rig, seen, self.options.max_error_px)
@@ -117,9 +125,13 @@ class Tracker:
         keep[known] = self._agreeing(seen, refined)
         if keep[known].sum() < self.options.min_points:
             return None
-        self.rows, self.uv = self.rows[keep], self.uv[keep]
+        rows, off = self._behind
+        uv = off + self.map.seen_at(rows, refined)
+        there = inside(self.frame.allowed, uv)
+        self.rows = np.concatenate([self.rows[keep], rows[there]])
+        self.uv = np.concatenate([self.uv[keep], uv[there]])
         self.pose = refined
-        return Found(refined, covariance, int(keep[known[: len(keep)]].sum()))
+        return Found(refined, covariance, int(keep[known].sum()))
 
     def _seen(self, rows: IntArray, uv: FloatArray, sigma: FloatArray) -> pose.Seen:
         points, along = self.map.points(rows)
@@ -129,13 +141,13 @@ class Tracker:
         return pose.errors(self.rig, seen, camera_from_map) < self.options.max_error_px / 0.5
 
     def moved(self) -> tuple[float, float]:
-        """Return how far features have moved since the last keyframe (median), px: turning left out, and in all."""
-        last = self.keyframe_pose
+        """Return how far leaders have moved since the last keyframe (median), px: turning left out, and in all."""
+        leads = np.isin(self.rows, self.leaders)
+        rows, uv = self.rows[leads], self.uv[leads]
         turned = Transform(self.pose.rotation, self.pose.rotation @ -self.map.position[-1])
         w = self.scene_inverse_depth
-        before = self.map.seen_at(self.rows, last, w)
-        moved = np.linalg.norm(self.uv - self.map.seen_at(self.rows, turned, w), axis=1)
-        shift = np.linalg.norm(self.uv - before, axis=1)
+        moved = np.linalg.norm(uv - self.map.seen_at(rows, turned, w), axis=1)
+        shift = np.linalg.norm(uv - self.map.seen_at(rows, self.keyframe_pose, w), axis=1)
         ok = np.isfinite(moved) & np.isfinite(shift)
         return (float(np.median(moved[ok])), float(np.median(shift[ok]))) if ok.any() else (0.0, 0.0)
 
@@ -237,7 +249,7 @@ class Tracker:
         fresh = np.arange(len(rows)) >= old
         self._renew(frame, place, rows, uv, depths, fresh)
         self.map.last_seen[rows] = place
-        self.rows, self.uv, self.shared = rows, uv, len(rows)
+        self.rows, self.uv = rows, uv
         added = self.alignment.disparity(uv)
         told = np.maximum(sigma, _TOLD_PX) if self.given else sigma
         content = Content(self.map.track_id[rows], uv, told, depths, added)
@@ -246,7 +258,15 @@ class Tracker:
         self.last = content, self.pose
         new = self.map.forget()
         self.rows = new[self.rows]
+        known = self.map.known[self.rows] if depths.measures else np.zeros(len(self.rows), bool)
+        spread = np.cumsum(known) % max(1, int(known.sum()) // _LEADERS) == 0
+        self.leaders = self.rows[~known | spread]
         return content, found
+
+    @property
+    def share(self) -> float:
+        """Return which share of the features of the last keyframe is still followed."""
+        return float(np.isin(self.leaders, self.rows).mean()) if len(self.leaders) else 0.0
 
     def _learn(self, content: Content) -> None:
         """Learn from the last two keyframes how the second camera is turned, and put the map right by that."""

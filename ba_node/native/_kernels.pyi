@@ -67,10 +67,10 @@ class Rays(Protocol):
     def distance_sigma_m(self) -> Doubles: ...
 
 class Kernel:
-    """One problem; the arrays are copied. cost: loss, its scale and cheirality."""
+    """One problem; the arrays are copied. cost: loss, its scale, cheirality, the least promise of a point's step."""
 
     def __init__(
-        self, problem: Problem, cost: tuple[str, float, str], factor_pairs: tuple[Ints, Ints], threads: int
+        self, problem: Problem, cost: tuple[str, float, str, float], factor_pairs: tuple[Ints, Ints], threads: int
     ) -> None: ...
     @property
     def n_free(self) -> int: ...

@@ -247,7 +247,8 @@ def _paired(
         yield from _read(source, frame, poses)
     source.counted.update(streams.counted)
     for name, apart_ns in streams.apart_ns.items():
-        source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+        if apart_ns:
+            source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
     first, *others = came
     for name in others:
         alone, nearest_ns = _alone(came[first], came[name])

@@ -19,7 +19,7 @@ import numpy as np
 from ba_node import native
 from ba_node.arrays import FloatArray, IdArray, IntArray, ranges
 from ba_node.core import native_kernels, triangulation
-from ba_node.core.problem import Observations, Problem, State
+from ba_node.core.problem import Problem, State
 
 # One track in so many may sit a solve out: more would be missed by a small window.
 _SHARE = 128
@@ -118,37 +118,40 @@ def _explained(
     none = np.empty(0)
     seen = replace(problem.observations.take(rows[good]), point=track[good], depth_m=none, depth_sigma_m=none)
     held_out, mean = np.zeros(2), np.full((2, 1 + n_cam), np.nan)
-    of_all = [_Fit(problem, seen, n_tried, of) for of in poses]
-    noise_rad = 1.0 / median(of_all[0].rays.px_per_rad) if len(seen) else 0.0
-    # One camera is both: all, and alone.
-    for kind in range(1 + n_cam if n_cam > 1 else 1):
-        own = seen.take(np.flatnonzero(seen.camera == kind - 1)) if kind else seen
-        fits = [_Fit(problem, own, n_tried, of) for of in poses] if kind else of_all
+    # Views of all cameras, and of each alone; one camera is both. All go at once, by either poses: each such part has
+    # points of its own, and the poses have keyframes of their own.
+    kinds = [np.arange(len(seen)), *(np.flatnonzero(seen.camera == c) for c in range(n_cam if n_cam > 1 else 0))]
+    parts, n_kinds = [*kinds, *kinds], len(kinds)
+    every, part = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(own) for own in parts])
+    at = replace(
+        seen.take(every),
+        point=seen.point[every] + n_tried * part,
+        keyframe=seen.keyframe[every] + problem.n_keyframes * (part // n_kinds),
+    )
+    rotation, translation = (np.concatenate(of_both) for of_both in zip(*poses, strict=True))
+    state = State(rotation, translation, np.zeros((n_tried * len(parts), 3)), np.empty((0, 3)))
+    fit = Problem(state, np.zeros(len(rotation), bool), problem.cameras, at)
+    rays = triangulation.rays_of(fit, "numpy")
+    found = triangulation.triangulate(rays, fit.n_points, "numpy")
+    state = replace(state, points=np.nan_to_num(found.points))
+    norms = np.split(native_kernels.residual_norms(fit, state, "numpy"), np.cumsum([len(own) for own in parts[:-1]]))
+    parallax_rad = found.parallax_rad.reshape(2, n_kinds, n_tried)
+    noise_rad = 1.0 / median(rays.px_per_rad[: len(seen)]) if len(seen) else 0.0
+    for kind, own in enumerate(kinds):
+        point = seen.point[own]
         # Views by different keyframes; a track of fewer is explained by any poses.
-        by_keyframe = np.unique(own.point * problem.n_keyframes + own.keyframe)
+        by_keyframe = np.unique(point * problem.n_keyframes + seen.keyframe[own])
         counts = np.bincount(by_keyframe // problem.n_keyframes, minlength=n_tried) >= _MIN_VIEWS
-        for fit in fits:  # rays that are parallel by either set meet anywhere
-            counts &= fit.found.parallax_rad > MIN_PARALLAX * noise_rad
-        counted, is_out = counts[own.point], own.point < n_out
-        for i, fit in enumerate(fits):
+        # Rays that are parallel by either set meet anywhere.
+        counts &= (parallax_rad[:, kind] > MIN_PARALLAX * noise_rad).all(axis=0)
+        counted, is_out = counts[point], point < n_out
+        for i, of_views in enumerate(norms[kind::n_kinds]):
             if np.count_nonzero(counted) >= _MIN_RESIDUALS:
-                mean[i, kind] = np.minimum(fit.norms[counted], _BOUND).mean()
+                mean[i, kind] = np.minimum(of_views[counted], _BOUND).mean()
             if kind == 0 and (counted & is_out).any():
-                held_out[i] = min(median(fit.norms[counted & is_out]), _BEHIND)
-    found = of_all[1].found
-    return Explained(held_out, mean, median(found.parallax_rad) if n_tried else 0.0, found.points[:n_out])
-
-
-class _Fit:
-    """Points of some observations as one set of poses sees them, and the residuals of these (n_obs,), sigmas."""
-
-    def __init__(self, problem: Problem, seen: Observations, n_points: int, poses: Poses) -> None:
-        state = State(*poses, np.zeros((n_points, 3)), np.empty((0, 3)))
-        tried = Problem(state, np.zeros(len(poses[0]), bool), problem.cameras, seen)
-        self.rays = triangulation.rays_of(tried, "numpy")
-        self.found = triangulation.triangulate(self.rays, n_points, "numpy")
-        state = replace(state, points=np.nan_to_num(self.found.points))
-        self.norms = native_kernels.residual_norms(tried, state, "numpy")
+                held_out[i] = min(median(of_views[counted & is_out]), _BEHIND)
+    points = found.points[n_kinds * n_tried :][:n_out]
+    return Explained(held_out, mean, median(parallax_rad[1, 0]) if n_tried else 0.0, points)
 
 
 def median(values: FloatArray) -> float:

@@ -110,6 +110,29 @@ def test_inner_iterations_move_points_only_and_never_make_one_worse(backend: str
     np.testing.assert_array_equal(state.rotation, problem.start.rotation)
 
 
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("native", marks=built)])
+def test_points_step_for_no_less_than_the_solve_ends_for(backend: str, make_problem: Make) -> None:
+    """What a point's step promises is told by the gain of an exact one; near the end it is that, to a tenth or so."""
+    problem, _ = make_problem(start_error=0.002)
+    of_point, options = problem.observations.point, SolverOptions(kernels=backend, function_tolerance=0.0)
+    start = native_kernels.make(problem, options).iterate_points(problem.start, 1)[1]
+    problem = dataclasses.replace(problem, start=start)
+    exact, hasty = (
+        native_kernels.make(problem, dataclasses.replace(options, function_tolerance=tolerance))
+        .iterate_points(start, 1)[1]
+        .points
+        for tolerance in (0.0, 1e-2)
+    )
+    before, after = (
+        np.bincount(of_point, Objective(problem, options).point_rows(s).cost)
+        for s in (start, dataclasses.replace(start, points=exact))
+    )
+    promise, moved = (before - after) / before, np.any(hasty != start.points, axis=1)
+    assert moved[promise > 2e-4].all() and not moved[promise < 5e-5].any()
+    assert 0 < np.count_nonzero(moved) < np.count_nonzero(np.any(exact != start.points, axis=1))
+    np.testing.assert_array_equal(hasty[moved], exact[moved])
+
+
 @pytest.mark.parametrize("shape", [{}, {"stereo": True, "depth": True}, {"free_intrinsics": True}])
 @pytest.mark.parametrize("steps", [1, 3])
 def test_rows_kept_by_inner_iterations_are_those_of_the_state(

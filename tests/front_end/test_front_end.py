@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from ba_node.core import cameras, geometry
 from ba_node.estimate import Cloud, Poses, Transform
-from ba_node.front_end import FrontEnd, Images, State, Tracked
+from ba_node.front_end import FrontEnd, Images, State, Tracked, features, tracking
 from ba_node.measurements import Keyframe
 from tests.front_end import world
 from tests.front_end.following import OPTIONS, PLAIN, follow
@@ -69,6 +70,30 @@ def test_observations_fit_the_truth(truth: list[Transform], stereo: list[Images]
             errors.append(np.linalg.norm(world.FOCAL * x[:2] / x[2] + rig.intrinsics[0, 2:] - uv))
     assert np.median(errors) < 0.1
     assert np.mean(np.array(errors) > 2.0) < 0.03
+
+
+def test_the_others_are_where_they_would_have_been_followed_to(
+    stereo: list[Images], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few points lead; the pose that they tell brings the others to where Lucas-Kanade finds them."""
+    monkeypatch.setattr(tracking, "_LEADERS", 40)
+    front_end = FrontEnd(world.rig(), dataclasses.replace(PLAIN, keyframe_parallax_px=1000.0))
+    follow(front_end, stereo[:1])
+    assert front_end._session is not None
+    tracker = front_end._session.tracker
+    rows, uv, leaders = tracker.rows.copy(), tracker.uv.copy(), tracker.leaders
+    assert 40 <= len(leaders) < 0.5 * len(rows)
+    followed = features.follow
+    spied = Mock(side_effect=followed)
+    monkeypatch.setattr(features, "follow", spied)
+    assert [one.state for one in follow(front_end, stereo[1:2])] == [State.TRACKING]
+    assert [len(call.args[2]) for call in spied.call_args_list] == [len(leaders)]
+    there, found = followed(stereo[0].grey[0], stereo[1].grey[0], uv, None)
+    brought = found & np.isin(rows, tracker.rows) & ~np.isin(rows, leaders)
+    at = dict(zip(tracker.rows.tolist(), tracker.uv, strict=True))
+    off = [np.linalg.norm(at[row] - place) for row, place in zip(rows[brought].tolist(), there[brought], strict=True)]
+    assert len(off) > 0.4 * len(rows)
+    assert np.median(off) < 0.3 and np.mean(np.array(off) > 1.0) < 0.1
 
 
 def test_the_same_images_give_the_same_tracks(stereo: list[Images]) -> None:

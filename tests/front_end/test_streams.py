@@ -49,6 +49,7 @@ def test_a_partner_that_never_comes_is_counted_and_nothing_grows() -> None:
     streams = pair(depth=5)
     assert fed(streams, *(("left", 100.0 * i) for i in range(50))) == []
     assert streams.counted["no right"] >= 44
+    assert streams.apart_ns["right"] == 0, "nothing can be near"
     # And it goes on when it comes.
     assert len(fed(streams, ("right", 4900.0))) == 1
 

@@ -116,6 +116,7 @@ class FrontEndNode(ManagedNode):
         self._mode = "" if options.mode == "auto" else options.mode
         self._streams: Streams | None = None
         self._subscribed: dict[str, str] = {}  # topic by stream
+        self._came: set[str] = set()  # streams that images came of since the last report
         self._numbers: dict[str, int | None] = {}  # of the last image, as its publisher counts
         self._infos: dict[str, Any] = {}
         self._tree, self._odometry = StaticTree(), OdometryBuffer()
@@ -123,7 +124,7 @@ class FrontEndNode(ManagedNode):
         self._frames: list[Frame] = []
         self._unsent: deque[tuple[str, Any]] = deque(maxlen=_MAX_UNSENT)
         self._state: State | None = None
-        self._late_s, self._said, self._summary = 0.0, "", ""
+        self._late_s, self._said = 0.0, ""
         kinds = {name: INPUT_TYPES[name] for name in PUBLISHED}
         self._out = {name: self._own("publisher", message_class(kind), name, qos.profile(TOPICS[name]))
                      for name, kind in kinds.items()}  # fmt: skip
@@ -193,6 +194,7 @@ class FrontEndNode(ManagedNode):
             profile.reliability = ReliabilityPolicy.BEST_EFFORT
         self._listen(kind, topic, functools.partial(self._on_image, name), profile)
         self._subscribed[name] = topic
+        self._came.add(name)  # it had no time yet
         self._log(Severity.INFO, f"{topic} ({kind}) is taken as {name}, mode {self._mode}")
         if self._rig is None and name in cameras_of(self._mode):
             info, take = name.replace("image_raw", "camera_info"), functools.partial(self._on_info, name)
@@ -234,6 +236,7 @@ class FrontEndNode(ManagedNode):
         self._go_on()
 
     def _on_image(self, name: str, message: Any, info: Mapping[str, Any]) -> None:
+        self._came.add(name)
         self._notice_losses(name, info["publication_sequence_number"])
         received_ns = info["received_timestamp"]  # 0 where the middleware does not tell
         self._late_s = (time.time_ns() - received_ns) / 1e9 if received_ns else 0.0
@@ -357,16 +360,19 @@ class FrontEndNode(ManagedNode):
 
     def _report(self) -> None:
         """Log what has become of the images, and what is missing."""
-        wanted = [name for name in MODES.get(self._mode, MODES["stereo"]) if name not in self._subscribed]
+        names = MODES.get(self._mode, MODES["stereo"])
+        wanted = [name for name in names if name not in self._subscribed and not self._published(name)]
+        silent = [topic for name, topic in self._subscribed.items() if name not in self._came]
         words = summary = self.summary()
         if wanted:
             words += f"; nobody publishes {' and '.join(map(self.resolve_topic_name, wanted))}"
             words += "" if self._mode else ", nor the images of another mode"
-        elif summary == self._summary and self._active:
-            words += f"; no image came for {_LOG_S:g} s"
+        elif silent and self._active:
+            words += f"; no image came for {_LOG_S:g} s of {' and '.join(silent)}"
         if self._late_s > _LATE_S:
             words += f"; images wait {self._late_s:.1f} s before they are tracked: lower max_features, or their rate"
-        self._late_s, self._summary = 0.0, summary
+        self._late_s = 0.0
+        self._came.clear()
         if words != self._said:
             self._log(Severity.INFO if words == summary else Severity.WARNING, words)
             self._said = words

@@ -370,3 +370,44 @@ def test_a_restart_of_the_node_is_another_session(start_node: StartNode, make_pe
         pass
     peer.until(lambda: sent[-1].session_id > sent[0].session_id, "another session")
     assert node.stop() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("announced", [False, True])
+def test_a_right_camera_that_starts_late(
+    announced: bool, start_node: StartNode, make_peer: MakePeer, kitti: Kitti
+) -> None:
+    """Left images alone for seconds, which is said; then pairs, as mosaics in yellow light, and steps of true scale."""
+    node, peer = start_node(program=PROGRAM), make_peer()
+    sent = peer.received["keyframes"]
+    as_back_end(peer)
+    tint = np.tile([[1.0, 0.8], [0.8, 0.4]], np.array(kitti.image("left", 0).shape) // 2 + 1)
+    camera = Camera(peer, *(("left", "right") if announced else ("left",)))
+
+    def publish(side: str, number: int) -> None:
+        image = kitti.image(side, max(number, 0))
+        mosaic = (image * tint[: image.shape[0], : image.shape[1]]).astype(np.uint8)
+        camera.publish(side, BEGIN_NS + number * STEP_NS, mosaic, kitti.p[side == "right"], "bayer_rggb8")
+
+    words = "no image came for 5 s of /right/image_raw" if announced else "nobody publishes /right/image_raw"
+    if announced:
+        camera.connect()
+    early = -200
+    while words not in node.err and early < 0:
+        publish("left", early)
+        early, next_s = early + 1, time.monotonic() + STEP_NS / 1e9
+        peer.until(lambda until_s=next_s: time.monotonic() > until_s, "the next one")
+    assert words in node.err, node.err
+    assert not sent
+    if not announced:
+        Camera(peer, "right")
+        camera.connect()
+    for i in range(12):
+        for side in ("left", "right"):
+            publish(side, i)
+    peer.until(lambda: sent and stamp_of(sent[-1]) >= BEGIN_NS + 9 * STEP_NS, "keyframes")
+    assert stamp_of(sent[0]) == BEGIN_NS
+    at = sent[-1].pose.pose.position
+    assert errors(kitti, [stamp_of(sent[-1])], np.array([[at.x, at.y, at.z]])).max() < 0.25
+    assert node.stop() == 0
+    assert "mosaic of colours" not in node.err and "ms off" not in node.err, node.err

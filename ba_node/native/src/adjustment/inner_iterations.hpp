@@ -12,7 +12,7 @@
 
 namespace ba::BA_TARGET {
 
-constexpr double kFirstDamping = 1e-4, kMinGain = 1e-4, kMinPromise = 1e-8;
+constexpr double kFirstDamping = 1e-4, kMinGain = 1e-4;
 constexpr double kMinGainOutlier = 1e-6, kClose = 1e-3, kRadial = 0.9;
 
 // What Huber's loss takes from the curvature of the points of a batch: of an observation outside of it, what a step
@@ -93,7 +93,7 @@ inline void iterate_batch(const Rows& rows, std::int64_t first, std::int64_t end
     }
     upper_times(li, y, move);
     // What the model promises is known before the step.
-    active &= ~(promise <= kMinPromise * sums.cost);
+    active &= ~(promise <= rows.least_promise() * sums.cost);
     if (!any(active)) break;
     for (int i = 0; i < 3; ++i) x[i] = select(active, best[i] - move[i], best[i]);
     mu *= 0.1;

@@ -88,6 +88,7 @@ class Rows {
 
   // The scale of Huber's loss, 0 for another.
   double huber() const { return cost_.loss == Loss::kHuber ? cost_.scale : 0.0; }
+  double least_promise() const { return cost_.least_promise; }
 
   // Call f(lens, depth) with the lens that the problem needs and whether it measures depth, both as types. Where
   // keyframes have intrinsics of their own (D = 9) the lens is radial at least.

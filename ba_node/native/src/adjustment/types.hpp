@@ -42,6 +42,7 @@ struct CostModel {
   Loss loss = Loss::kSquared;
   double scale = 1.0;
   Cheirality cheirality = Cheirality::kKeep;
+  double least_promise = 1e-8;  // share of its cost below which a point takes no step of its own
 };
 
 // Pairs (i, j > i) of free keyframes, sorted, that factors couple.

@@ -136,14 +136,14 @@ py::tuple consensus(const py::object& rays, py::ssize_t n_points, double gate) {
   return py::make_tuple(points, parallax, measured, agrees);
 }
 
-// cost: loss, its scale and cheirality.
-Kernel* make_kernel(const py::object& problem, const std::tuple<std::string, double, std::string>& cost,
+// cost: loss, its scale, cheirality and the least promise of a point's own step.
+Kernel* make_kernel(const py::object& problem, const std::tuple<std::string, double, std::string, double>& cost,
                     const std::tuple<Ints, Ints>& factor_pairs, int threads) {
   const ProblemArrays arrays(problem);
-  const auto& [loss, scale, cheirality] = cost;
+  const auto& [loss, scale, cheirality, least_promise] = cost;
   KernelArguments arguments;
   arguments.problem = arrays.view();
-  arguments.cost = {loss_named(loss), scale, cheirality_named(cheirality)};
+  arguments.cost = {loss_named(loss), scale, cheirality_named(cheirality), least_promise};
   arguments.start = arrays.start.view();
   const auto& [row, column] = factor_pairs;
   arguments.factors.row.assign(row.data(), row.data() + row.size());

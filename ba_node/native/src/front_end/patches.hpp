@@ -10,6 +10,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "front_end/types.hpp"
@@ -21,12 +22,17 @@ namespace ba::BA_TARGET {
 // columns at least.
 class Sampler {
  public:
-  Sampler(const ImageView& image, std::int64_t n) : image_(image), n_(n), x_(n), y_(n), column_(n), row_(n) {}
+  Sampler(const ImageView& image, std::int64_t n)
+      : image_(image), n_(n), x_(n), y_(n), above_(2 * n), below_(2 * n), column_(n), row_(n) {}
 
   float* x() { return x_.data(); }
   float* y() { return y_.data(); }
 
   void sample(float* out) {
+    if (lies_inside()) {
+      sample_inside(out);
+      return;
+    }
     split(x_.data(), image_.width, column_.data());
     split(y_.data(), image_.height, row_.data());
     const float *right = x_.data(), *down = y_.data();
@@ -40,6 +46,38 @@ class Sampler {
   }
 
  private:
+  // False if a coordinate is not a number.
+  bool lies_inside() const {
+    const auto right = static_cast<float>(image_.width - 1), bottom = static_cast<float>(image_.height - 1);
+    int outside = 0;
+    for (std::int64_t j = 0; j < n_; ++j)
+      outside |= !(x_[j] >= 0.0F) | !(x_[j] < right) | !(y_[j] >= 0.0F) | !(y_[j] < bottom);
+    return outside == 0;
+  }
+
+  // Neighbours in a row are fetched together, and all blended afterwards, many at once.
+  void sample_inside(float* out) {
+    const auto width = static_cast<std::int32_t>(image_.width);
+    float *right = x_.data(), *down = y_.data();
+    std::int32_t* pixel = column_.data();
+    for (std::int64_t j = 0; j < n_; ++j) {
+      const auto column = static_cast<std::int32_t>(right[j]), row = static_cast<std::int32_t>(down[j]);
+      right[j] -= static_cast<float>(column);
+      down[j] -= static_cast<float>(row);
+      pixel[j] = row * width + column;
+    }
+    float *above = above_.data(), *below = below_.data();
+    for (std::int64_t j = 0; j < n_; ++j) {
+      std::memcpy(above + 2 * j, image_.at + pixel[j], 2 * sizeof(float));
+      std::memcpy(below + 2 * j, image_.at + pixel[j] + width, 2 * sizeof(float));
+    }
+    for (std::int64_t j = 0; j < n_; ++j) {
+      const float first = above[2 * j] + down[j] * (below[2 * j] - above[2 * j]);
+      const float second = above[2 * j + 1] + down[j] * (below[2 * j + 1] - above[2 * j + 1]);
+      out[j] = first + right[j] * (second - first);
+    }
+  }
+
   // Takes coordinates apart into a pixel that has a neighbour and the way from it, which stays in their place.
   void split(float* at, std::int64_t size, std::int32_t* pixel) const {
     const auto last = static_cast<float>(size - 1), last_but_one = static_cast<float>(size - 2);
@@ -53,7 +91,7 @@ class Sampler {
 
   ImageView image_;
   std::int64_t n_;
-  std::vector<float> x_, y_;
+  std::vector<float> x_, y_, above_, below_;
   std::vector<std::int32_t> column_, row_;
 };
 
@@ -117,19 +155,23 @@ class Aligner {
       : sampler_(image, templates.pixels),
         templates_(templates),
         limits_(limits),
-        seen_(static_cast<std::size_t>(templates.pixels)) {}
+        seen_(static_cast<std::size_t>(templates.pixels)),
+        grid_(2 * static_cast<std::size_t>(templates.pixels)) {
+    for (std::int64_t j = 0; j < templates.pixels; ++j) {
+      grid_[j] = templates.grid[2 * j];
+      grid_[templates.pixels + j] = templates.grid[2 * j + 1];
+    }
+  }
 
   void align(std::int64_t i, const double* bend, const PlacesSpan& to) {
     const std::int64_t k = templates_.movements;
     double *place = to.place + 2 * i, *affine = to.affine + 4 * i;
     const double std = templates_.std[i];
     for (int step = 0; step < limits_.iterations; ++step) {
-      const float spread = look(place, affine, bend == nullptr ? nullptr : bend + 2 * i);
-      const double agree =
-          product(templates_.weighted + i * templates_.pixels) / spread / std::max(templates_.std[i], 1e-6F);
+      const Look seen = look(i, place, affine, bend == nullptr ? nullptr : bend + 2 * i);
+      const double spread = seen.spread, agree = seen.alike[0] / spread / std::max(templates_.std[i], 1e-6F);
       std::array<double, 3> right{}, move{};
-      for (std::int64_t r = 0; r < k; ++r)
-        right[r] = product(templates_.jacobian + (i * k + r) * templates_.pixels) * (std / spread);
+      for (std::int64_t r = 0; r < k; ++r) right[r] = seen.alike[1 + r] * (std / spread);
       for (std::int64_t r = 0; r < k; ++r)
         for (std::int64_t c = 0; c < k; ++c) move[r] += templates_.inverse[(i * k + r) * k + c] * right[c];
       to.correlation[i] = agree;
@@ -151,45 +193,57 @@ class Aligner {
   }
 
  private:
-  // Looks at the image where a template is, as differences from the mean; returns how far they spread.
-  float look(const double* place, const double* affine, const double* bend) {
-    const std::int64_t n = templates_.pixels;
+  // What an image shows where a template is: how far it spreads, and its products with the template and what it changes
+  // by.
+  struct Look {
+    double spread;
+    std::array<float, 4> alike;
+  };
+
+  Look look(std::int64_t i, const double* place, const double* affine, const double* bend) {
+    const std::int64_t n = templates_.pixels, k = templates_.movements;
     const auto u = static_cast<float>(place[0]), v = static_cast<float>(place[1]);
     const auto xx = static_cast<float>(affine[0]), xy = static_cast<float>(affine[1]);
     const auto yx = static_cast<float>(affine[2]), yy = static_cast<float>(affine[3]);
     const float gx = bend == nullptr ? 0.0F : static_cast<float>(bend[0]);
     const float gy = bend == nullptr ? 0.0F : static_cast<float>(bend[1]);
-    const float *p = templates_.grid, *w = templates_.window;
+    const float *px = grid_.data(), *py = px + n;
     float *s = seen_.data(), *to_x = sampler_.x(), *to_y = sampler_.y();
     for (std::int64_t j = 0; j < n; ++j) {
-      const float x = p[2 * j], y = p[2 * j + 1], depth = 1.0F / (1.0F + gx * x + gy * y);
-      to_x[j] = u + (xx * x + xy * y) * depth;
-      to_y[j] = v + (yx * x + yy * y) * depth;
+      const float depth = 1.0F / (1.0F + gx * px[j] + gy * py[j]);
+      to_x[j] = u + (xx * px[j] + xy * py[j]) * depth;
+      to_y[j] = v + (yx * px[j] + yy * py[j]) * depth;
     }
     sampler_.sample(s);
-    const float mean = product(w);
+    const float mean = product(templates_.window);
     for (std::int64_t j = 0; j < n; ++j) s[j] -= mean;
-    std::array<float, 4> sums{};
-    for (std::int64_t j = 0; j < n; ++j) sums[j % 4] += s[j] * s[j] * w[j];
-    const float square = (sums[0] + sums[1]) + (sums[2] + sums[3]);
-    return std::sqrt(std::max(square, 1e-6F));
+    Look result{0.0, {product(templates_.weighted + i * n)}};
+    for (std::int64_t r = 0; r < k; ++r) result.alike[1 + r] = product(templates_.jacobian + (i * k + r) * n);
+    for (std::int64_t j = 0; j < n; ++j) s[j] *= s[j];
+    result.spread = std::sqrt(std::max(product(templates_.window), 1e-6F));
+    return result;
   }
 
-  // In four sums, so that none waits for another.
+  // In eight sums, so that none waits for another.
   float product(const float* a) const {
+    using Lanes = float __attribute__((vector_size(8 * sizeof(float))));
     const float* s = seen_.data();
-    std::array<float, 4> sums{};
+    Lanes sums{}, one, other;
     std::int64_t j = 0;
-    for (; j + 4 <= templates_.pixels; j += 4)
-      for (std::int64_t lane = 0; lane < 4; ++lane) sums[lane] += a[j + lane] * s[j + lane];
-    for (; j < templates_.pixels; ++j) sums[0] += a[j] * s[j];
-    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+    for (; j + 8 <= templates_.pixels; j += 8) {
+      std::memcpy(&one, a + j, sizeof(one));
+      std::memcpy(&other, s + j, sizeof(other));
+      sums += one * other;
+    }
+    float rest = 0.0F;
+    for (; j < templates_.pixels; ++j) rest += a[j] * s[j];
+    return rest + ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
   }
 
   Sampler sampler_;
   TemplatesView templates_;
   AlignLimits limits_;
-  std::vector<float> seen_;
+  std::vector<float> seen_, grid_;  // the grid as x, then y
 };
 
 inline void align_patches(const ImageView& image, const TemplatesView& templates, const AlignLimits& limits,
