@@ -226,7 +226,7 @@ class Backend:
         self._adjusting = None
         why, merged = done.why, None
         if not why and done.taken is not None:
-            merged = self.merge(done.taken, done.put)
+            merged = self.merge(done.taken, done.put, grown=done.due.grown)
             why = self.refusal or ("" if merged else "nothing came of a solve of everything")
         elif not why:
             done.put()
@@ -301,11 +301,12 @@ class Backend:
         return optimization.scene is self.scene
 
     def merge(
-        self, optimization: full.Optimization, first: Callable[[], None] = lambda: None
+        self, optimization: full.Optimization, first: Callable[[], None] = lambda: None, *, grown: bool = False
     ) -> tuple[Estimate, int] | None:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
 
-        ``first`` is done to the map before, once it is known that the result is taken.
+        ``first`` is done to the map before, once it is known that the result is taken. ``grown``: the map has grown, no
+        more: nothing is said if it is not taken, and what shows at a map's end is not asked.
 
         Returns:
             What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
@@ -317,8 +318,9 @@ class Backend:
         verdict = guard.decide(self.config, taken.selection, found)
         wrong = self.setup.reason(self.scene) if self.config.checks_setup else ""
         self.refusal = wrong or ("" if verdict.odd else verdict.reason)
-        if self.refusal:
+        if self.refusal and not grown:
             self.map.hold(f"a solve of everything: {self.refusal}")
+        if self.refusal:
             return None
         assert found.state is not None
         first()
@@ -332,7 +334,7 @@ class Backend:
         statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
-        undone = self.take_check(wrong_at_the_end(self.scene, self.config))
+        undone = None if grown else self.take_check(wrong_at_the_end(self.scene, self.config))
         return undone or self.map.with_covariances(self.estimate(), taken), followed
 
     def reset(self) -> None:

@@ -176,7 +176,9 @@ class FactorsConfig:
         within=(0, 10_000_000),
     )
     adjust_m: float = option(
-        0.3, "A loop or priors that move a keyframe further begin a solve of everything; 0: never.", within=(0.0, 1e6)
+        0.3,
+        "A loop or priors that move a keyframe further begin a solve of everything; 0: never, nor as a map grows.",
+        within=(0.0, 1e6),
     )
 
 

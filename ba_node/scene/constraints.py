@@ -83,6 +83,7 @@ class Constraints:
         steps_precise: the front-end's steps turned out to be more precise than stated; the map is still to follow.
         adjusted_at: how many keyframes there were when the map was last bent.
         asked_at: and when it was last asked whether the map has left the world.
+        grown_at: and when all of it was last refined as it had grown.
         judged_at: and when what is absolute was last judged, see window/receiver.py.
         scatter: what that found, how many times as much as stated by source.
         left_out: likewise, stretches that jumped: source, first and last stamp (ns).
@@ -106,6 +107,7 @@ class Constraints:
         self.steps_precise = False
         self.adjusted_at = 0
         self.asked_at = 0
+        self.grown_at = 0
         self.judged_at = 0
         self.scatter: dict[int, float] = {}
         self.left_out: list[tuple[int, int, int]] = []

@@ -53,6 +53,7 @@ NOTICES: dict[str, str] = {
     "adjusted_camera": "A camera whose k was taken from the whole sensor to the image (region of interest, binning).",
     "empty_tracks": "A tracks message without rows.",
     "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
+    "not_refined": "A solve of everything, as the map has grown, that was not taken: what windows found stays.",
     "redundant": "A keyframe that was taken out of the map as others see its points (scene.redundant_share).",
     "apart": "A session before that no tracks connect with the last one, where scene.join_sessions asks for one map.",
 }

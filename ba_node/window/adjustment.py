@@ -7,6 +7,8 @@ there from so far, and would take what is right for outliers. So the keyframes a
 each step between consecutive keyframes is as the map has it, to a third of what a step of the front-end is worth, and
 what is measured beside pixels pulls. Points follow the keyframe that saw them first.
 
+A map that grows is refined as a whole from time to time without being bent.
+
 All this is done to a copy of the map, on any thread, while windows go on being solved; the map then follows it.
 """
 
@@ -43,6 +45,8 @@ _CONFIRMED = 2
 _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
+# A map of at most so many keyframes is refined as a whole each time that it is so many times as large.
+_YOUNG, _AGAIN = 320, 1.4
 _ITERATIONS = 30
 _NOTHING_CAME = "nothing came of a solve of everything"
 # Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
@@ -67,7 +71,7 @@ class Adjustment:
 
     def run(self) -> None:
         """Bend and refine the copy, on any thread."""
-        self.why = bend(self._copy, self.config, self.due) or self._refine()
+        self.why = (not self.due.grown and bend(self._copy, self.config, self.due)) or self._refine()
 
     def _refine(self) -> str:
         """Refine all of the copy if that can be; return why the map is to stay as it is."""
@@ -87,9 +91,11 @@ class Adjustment:
 
     def _solved(self, scene: Scene, config: Config) -> full.Optimization | str:
         """Return a solve of everything in a copy, or why there is none, in words."""
-        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=True)
+        begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=not self.due.grown)
         if isinstance(begun, str):
             return f"no solve of everything can begin: {begun}"
+        if self.due.grown and begun.selection.much_moves:
+            return "much of what is seen moves"
         begun.solve(self.config.solver)
         result = begun.result
         usable = result.status.usable and result.state.is_finite()
@@ -131,6 +137,10 @@ class Adjustment:
     def end(self, why: str) -> None:
         """Take note that it is over, and why the map stays as it was, in words; empty if it does not."""
         known = self.scene.constraints
+        if self.due.grown:
+            if why:
+                self.scene.log.notice("not_refined")
+            return
         known.adjusted_at = len(self.scene.keyframes)
         if not why:
             contradicted.say_contradicted(self.scene, self.config.factors)
@@ -183,7 +193,27 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
     if known.steps_precise and not found:
         known.steps_precise = False
         found = loops.Due("the front-end's steps are more precise than was stated")
-    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final))
+    return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final) or _grown(scene, config))
+
+
+def _grown(scene: Scene, config: Config) -> loops.Due | None:
+    """Return whether a young map has grown by so much that all of it is to be refined again.
+
+    Windows hold what is older as it was found when less was known. Not where images show no lengths, where more than
+    pixels and steps places the map, where a keyframe is not refined, or where anything was found to be odd.
+    """
+    known, n, window = scene.constraints, len(scene.keyframes), config.window
+    if not max(window.max_keyframes + 1, _AGAIN * known.grown_at) <= n <= _YOUNG or scene.log.warnings:
+        return None
+    if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0 or not retriangulation.has_scale(scene):
+        return None
+    looped = known.renamed or any(one.is_loop for one in known.relative.values())
+    if known.absolute or known.landmarks or known.seams or looped:
+        return None
+    if not scene.keyframes.refined[scene.order].all():
+        return None
+    known.grown_at = n
+    return loops.Due("the map has grown", grown=True)
 
 
 def bend(scene: Scene, config: Config, what: loops.Due) -> str:

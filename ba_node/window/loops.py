@@ -35,6 +35,7 @@ class Due:
     loops: tuple[RelativePoses, ...] = ()  # by rows of the scene
     joined: tuple[tuple[int, int], ...] = ()  # tracks that go on under the id of another
     key: tuple[int, int] | None = None  # keyframes of the relative pose that the map does not meet
+    grown: bool = False  # nothing but that the map has grown
 
 
 def measured(scene: Scene, config: Config) -> Due | None:

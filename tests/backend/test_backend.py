@@ -301,7 +301,9 @@ def test_another_rig_is_used_from_the_next_session_on() -> None:
 def test_parameters_take_effect_at_the_next_solve() -> None:
     backend = Backend(Config())
     replay(backend, messages())
-    backend.configure(Config().with_values({"window.max_keyframes": 3, "solver.max_iterations": 1}))
+    backend.configure(
+        Config().with_values({"window.max_keyframes": 3, "solver.max_iterations": 1, "factors.adjust_m": 0.0})
+    )
     estimate = backend.solve()
     assert estimate is not None
     assert estimate.report.keyframes == 3

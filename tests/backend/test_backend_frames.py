@@ -131,7 +131,7 @@ def test_a_rig_that_cannot_be_used_is_counted_also_with_poses_of_the_camera() ->
 @pytest.mark.slow
 @pytest.mark.parametrize("baseline_m", [0.2, 0.0], ids=["stereo", "one camera"])
 def test_extras_are_worked_out_only_when_asked_for(baseline_m: float) -> None:
-    backend = Backend(Config().with_values({"window.max_keyframes": 5}))
+    backend = Backend(Config().with_values({"window.max_keyframes": 5, "factors.adjust_m": 0.0}))
     plain = run(backend, stream_of(data_of(baseline_m=baseline_m)))
     assert all(estimate.covariance is None and estimate.view is None for estimate in plain)
 

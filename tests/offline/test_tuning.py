@@ -83,7 +83,7 @@ def test_tracks_held_out_tell_bad_parameters_from_good_ones(bag: Path) -> None:
     assert bad.error > 1.03 * good.error
     by_truth = measured(bag, "truth", {})
     assert (by_truth.unit, by_truth.held) == ("m", 0)
-    assert by_truth.error == pytest.approx({MONO: 0.0122, STEREO: 0.0054}[bag], rel=0.05)
+    assert by_truth.error == pytest.approx({MONO: 0.0122, STEREO: 0.0053}[bag], rel=0.05)
 
 
 def test_tracks_are_held_out_by_their_ids_and_never_seen() -> None:
@@ -219,6 +219,7 @@ def test_a_sweep_is_every_combination(tmp_path: Path, capsys: pytest.CaptureFixt
         {"a": 1, "b": 3}, {"a": 1, "b": 4}, {"a": 2, "b": 3}, {"a": 2, "b": 4}
     ]  # fmt: skip
     arguments = ["sweep", str(MONO), "--out", str(tmp_path), "--values", "window.max_keyframes=5,20"]
+    arguments += ["--set", "factors.adjust_m=0"]  # windows alone differ more
     assert main([*arguments, "--values", "tracks.outlier_px=6"]) == 0
     lines = (tmp_path / "sweep.csv").read_text().splitlines()
     assert lines[0] == "window.max_keyframes,tracks.outlier_px,mono_loop [m],solve p95 [ms]"

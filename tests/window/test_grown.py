@@ -1,0 +1,89 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""Check that a young map is refined as a whole as it grows, and where it is not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ba_node.backend import Backend
+from ba_node.config import Config
+from ba_node.estimate import Estimate
+from ba_node.window import guard
+from ba_node.window.merging import Merged
+from ba_node.window.selection import Selection
+from ba_node.window.trust import Trust
+from experiments.synthetic import SyntheticData, SyntheticOptions, generate
+from tests.window.street import aligned_rms
+
+
+def recording(seed: int, **changes: Any) -> SyntheticData:
+    """Return a drive of 27 m with two cameras whose front-end drifts."""
+    options: dict[str, Any] = {
+        "keyframes": 40, "length_m": 27.0, "path": "line", "baseline_m": 0.12, "landmarks": 1500, "tracks": 100,
+        "noise_px": 0.5, "outlier_share": 0.0, "drift_rotation_deg": 0.5, "drift_translation": 0.02,
+    }  # fmt: skip
+    return generate(SyntheticOptions(seed=seed, **(options | changes)))
+
+
+def replayed(data: SyntheticData, **values: object) -> tuple[Backend, float]:
+    """Return a back-end that has seen a recording, and the error of its path, m."""
+    backend = Backend(Config().with_values({"guard.check_setup": False} | values))
+    last = [event for event in backend.replay(m for _, _, m in data.timeline()) if isinstance(event, Estimate)][-1]
+    return backend, aligned_rms(last.trajectory.position, data.truth.position)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [61, 66])
+def test_a_map_that_has_grown_is_near_the_optimum_of_everything(seed: int) -> None:
+    data = recording(seed, keyframes=42, length_m=28.0)
+    backend, _ = replayed(data)
+    assert backend.map.adjustments == 3  # at 21, 30 and 42 keyframes
+    windows, _ = replayed(data, **{"factors.adjust_m": 0.0})
+    found, alone = (one.estimate().trajectory.position for one in (backend, windows))
+    best = windows.optimize()
+    assert best is not None
+    assert aligned_rms(found, best.trajectory.position) < 0.3 * aligned_rms(alone, best.trajectory.position)
+
+
+def test_a_map_within_one_window_is_left_to_it() -> None:
+    assert replayed(recording(51, keyframes=20, length_m=13.0))[0].map.adjustments == 0
+
+
+def test_a_replay_gives_the_same_twice() -> None:
+    data = recording(51, keyframes=24, length_m=16.0, landmarks=800, tracks=60)
+    first, second = (replayed(data)[0] for _ in range(2))
+    assert first.map.adjustments == 1
+    assert first.scene.keyframes.position.tobytes() == second.scene.keyframes.position.tobytes()
+
+
+@pytest.mark.parametrize("values", [{"factors.adjust_m": 0.0}, {"window.old_keyframes": "marginalise"}])
+def test_it_is_left_out_where_that_is_asked_for(values: dict[str, object]) -> None:
+    data = recording(51, keyframes=24, length_m=16.0, landmarks=800, tracks=60)
+    assert replayed(data, **values)[0].map.adjustments == 0
+
+
+def test_maps_without_lengths_and_those_of_which_something_was_said_are_left_to_their_windows() -> None:
+    few = {"keyframes": 24, "length_m": 16.0, "landmarks": 800, "tracks": 60}
+    assert replayed(recording(51, **few | {"baseline_m": 0.0}))[0].map.adjustments == 0
+    backend = Backend(Config().with_values({"guard.check_setup": False}))
+    for _ in backend.replay(m for _, _, m in recording(51, **few).timeline()):
+        backend.scene.log.warn("held", "a solution was held")
+    assert backend.map.adjustments == 0
+
+
+def test_one_that_is_refused_leaves_what_windows_found_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = recording(51, keyframes=24, length_m=16.0, landmarks=800, tracks=60)
+    alone, _ = replayed(data, **{"factors.adjust_m": 0.0})
+    decide = guard.decide
+
+    def refuses(config: Config, selection: Selection, found: Merged, trust: Trust | None = None) -> guard.Verdict:
+        return guard.Verdict("no") if trust is None else decide(config, selection, found, trust)
+
+    monkeypatch.setattr(guard, "decide", refuses)
+    backend, _ = replayed(data)
+    assert backend.map.summary().notices == {"not_refined": 1} and not backend.map.warnings
+    np.testing.assert_array_equal(backend.scene.keyframes.position, alone.scene.keyframes.position)
