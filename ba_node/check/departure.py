@@ -24,7 +24,7 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.check.diagnosis import Diagnosis, Finding, angle
-from ba_node.check.watch import Check
+from ba_node.check.watch import NEWEST, Check
 from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
 from ba_node.scene.scene import Scene
@@ -49,8 +49,6 @@ _ONE_CAMERA = 1.5
 _STEPS, _STEPS_BEFORE, _YOUNG = 7, 15, 120
 # It is asked once in so many keyframes, and at the end.
 _EVERY = 5
-# The newest steps that are asked by themselves.
-NEWEST = 20
 # Shorter steps are noise, as those of a robot that stands or turns on the spot, m.
 _LEAST_M = 0.02
 # Share of the usual step below which one tells nothing; share that is left out at either end of their ratios.

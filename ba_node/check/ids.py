@@ -9,7 +9,7 @@ import numpy as np
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
 from ba_node.check.relations import AGREED, relate, spread
-from ba_node.check.tracks import Image, Tracks
+from ba_node.check.tracks import Tracks
 
 # Images that far apart, in keyframes, share tracks; where ids are used again, fewer of them are the same point.
 _FAR = 4
@@ -25,8 +25,8 @@ _DISTANT = 5
 _OTHER_POINTS = 0.6
 # Different points agree by chance to less than this share.
 _CHANCE = 0.3
-# Keyframes across which rays jump farthest are those from which ids may stand for other points. Fewer keyframes with
-# wrong ids than the last number are left out by solves.
+# Keyframes across which rays jump farthest are those from which ids may stand for other points; so many beside agree.
+# Fewer keyframes with wrong ids are left out by solves.
 _TRIED = 4
 _LASTING = 6
 # As many ids in all as one image has tracks, but for this factor, are numbers of rows or places.
@@ -101,17 +101,17 @@ def _others_since(tracks: Tracks) -> int | None:
             off = np.linalg.norm(tracks.ray[rows[0]] - tracks.ray[rows[1]], axis=1)
             jumps.append((float(np.median(off)), k, camera))
 
-    def disagree(before: Image, after: Image) -> bool:
-        rows = tracks.match(before, after)
+    def agree(k: int, camera: int) -> float:
+        rows = tracks.match((k - 1, camera), (k, camera))
         if len(rows[0]) < two_view.MIN_PAIRS:
-            return False
-        pair = relate(tracks, before, after, rows)
-        return pair is None or pair.share < _CHANCE
+            return 0.0
+        pair = relate(tracks, (k - 1, camera), (k, camera), rows)
+        return 0.0 if pair is None else pair.share
 
     for _, k, camera in sorted(jumps, reverse=True)[:_TRIED]:
-        across = ((k - 1, k), *((k - 1 - i, k - 1 - i + _LASTING) for i in range(_LASTING)))
-        if all(disagree((before, camera), (after, camera)) for before, after in across):
-            return k
+        beside = [one for one in range(max(1, k - _LASTING), min(len(tracks), k + _LASTING + 1)) if one != k]
+        if agree(k, camera) < _CHANCE and all(agree(one, camera) >= _CHANCE for one in beside):
+            return k if k <= len(tracks) - _LASTING else None
     return None
 
 

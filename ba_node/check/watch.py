@@ -31,8 +31,8 @@ _FEW = 10
 _ONCE = frozenset({"pixels", "stamps"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
-# The newest of them are looked at.
-_NEWEST = 60
+# The newest of them are looked at; and fewer by themselves, where what was right at first may have changed.
+_NEWEST, NEWEST = 60, 20
 # So many keyframes after solves have first said such a thing, those since then (0) or so many are checked.
 _SINCE = ((5, 0), (8, _NEWEST), (12, 0), (24, 0))
 # Steps deviate some keyframes after what has changed.
@@ -55,6 +55,17 @@ class Check:
         return self
 
 
+def of_all(scene: Scene) -> Diagnosis | None:
+    """Return what all tracks tell, or the newest alone where these contradict the set-up; None if there are none."""
+    tracks = tracks_of(scene)
+    found = None if tracks is None else examine(tracks)
+    if found is None or found.harmful or len(scene.keyframes) <= NEWEST:
+        return found
+    newest = tracks_of(scene, NEWEST)
+    changed = None if newest is None else examine(newest, _ONCE)
+    return changed if changed is not None and changed.harmful else found
+
+
 def of_few_keyframes(scene: Scene) -> Check | None:
     """Return the check of a session that ends with so few keyframes that it was hardly looked at; None for others."""
     tracks = tracks_of(scene) if _AT[0] < len(scene.keyframes) < _FEW and scene.keyframes.refined.any() else None
@@ -64,11 +75,11 @@ def of_few_keyframes(scene: Scene) -> Check | None:
     return _done(scene, found) if found.harmful else None
 
 
-def of_the_newest(scene: Scene, newest: int, deviates: bool) -> Check | None:
+def of_the_newest(scene: Scene, deviates: bool) -> Check | None:
     """Return the check of the newest keyframes alone, at the end, if solves or their steps give a reason; or None."""
     if len(scene.keyframes) < _FEW or not (deviates or _doubtful(scene)) or not two_view.available():
         return None
-    for some in (newest, _NEWEST):
+    for some in (NEWEST, _NEWEST):
         tracks = tracks_of(scene, some)
         found = None if tracks is None else examine(tracks, _ONCE)
         if found is not None and found.harmful:

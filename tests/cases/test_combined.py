@@ -121,6 +121,7 @@ CASES = (
     Combined((("zoomed_midway", 1.1),), "stereo", 7501, LOOP, "focal length"),
     Combined((("zoomed_midway", 1.2),), "mono", 7502, {}, "focal length"),
     Combined((("ids_midway", 1.0),), "stereo", 7503, {}, r"track ids stand for other points|\bids?\b"),
+    Combined((("ids_midway", 1.0),), "mono", 7603, {**LOOP, "keyframes": 50}, "track ids stand for other points"),
     Combined((("index_midway", None),), "stereo", 7504, {}, "camera 1 come as"),
     # The odometry of seed 0 is better than most.
     Combined((("few_points", 12.0),), "mono", 0, {}, ""),
