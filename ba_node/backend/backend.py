@@ -33,7 +33,7 @@ from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.summary import MapEnded
 from ba_node.backend.worse import wrong_at_the_end
-from ba_node.check.departure import departed
+from ba_node.check.departure import departed, deviates
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
 from ba_node.core.problem import Cameras
@@ -177,7 +177,7 @@ class Backend:
         """
         if len(self.scene.keyframes) == 0:
             return None
-        wrong = self.setup.look(self.scene) if self.config.checks_setup else ""
+        wrong = self.setup.look(self.scene, deviates(self.scene)) if self.config.checks_setup else ""
         self.solve_count += 1
 
         asked: list[Check | None] = []

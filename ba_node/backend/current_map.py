@@ -17,8 +17,7 @@ from ba_node.backend.summary import MapSummary, summary_of
 from ba_node.backend.whole_map import MapCloud, MapPoses, poses_of
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis
-from ba_node.check.examine import examine
-from ba_node.check.tracks import tracks_of
+from ba_node.check.watch import of_all
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.calibration import Calibration
@@ -177,8 +176,7 @@ class CurrentMap:
         Raises:
             ImportError: OpenCV is missing.
         """
-        tracks = tracks_of(self.scene)
-        return None if tracks is None else examine(tracks)
+        return of_all(self.scene)
 
     def due(self) -> IntArray:
         """Return the rows of complete keyframes that were not solved and that the next solve refines, oldest first."""

@@ -14,6 +14,8 @@ on the body turns its steps: so their directions, in the body, are compared in t
 Which of the two is right cannot be told from here, so what came in stands and both are named. Nothing is asked where
 something absolute places the map, and of a map that is no longer young; of lengths nothing where images have no scale
 of their own (one camera, no depths).
+
+What changes on the way, as when a lens is zoomed, shows in the newest steps alone: they are asked by themselves.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.check.diagnosis import Diagnosis, Finding, angle
-from ba_node.check.watch import Check
+from ba_node.check.watch import NEWEST, Check
 from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
 from ba_node.scene.scene import Scene
@@ -34,6 +36,8 @@ _FACTORS: Limits = ((1.015, 4.5), (1.012, 8.0))
 # At the end, when it is asked but once, this many standard errors are a warning: 2 or 3 in 10 000 sound drives have as
 # much by chance, in lengths or along an axis, too many to give up what was refined.
 DOUBTED: Limits = ((1.012, 3.6),)
+# With as much the set-up may have changed: the newest keyframes are worth a look with all tests.
+_WORTH_A_LOOK: Limits = ((1.012, 2.4),)
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
 # Student's distribution asks for.
 _FEW = 8.0
@@ -69,10 +73,30 @@ def departed(scene: Scene, *, final: bool = False, limits: Limits = _FACTORS) ->
     finding = _by_a_factor(scene, refined, given, limits) if _has_scale(scene) else None
     if final:
         finding = finding or _aside(scene, refined, given, limits)
+    finding = finding or (_of_the_newest(scene, _FACTORS) if final and limits is _FACTORS else None)
     if finding is None:
         return None
     found = Diagnosis([finding])
     return Check(scene, lambda: found, found)
+
+
+def deviates(scene: Scene, *, final: bool = False) -> bool:
+    """Return True if the newest refined steps are so far off the front-end's that the set-up is worth a look."""
+    if len(scene.keyframes) % _EVERY and not final:
+        return False
+    return _of_the_newest(scene, _WORTH_A_LOOK) is not None
+
+
+def _of_the_newest(scene: Scene, limits: Limits) -> Finding | None:
+    if scene.cameras is None or scene.constraints.absolute or scene.constraints.landmarks:
+        return None
+    refined, given = _steps(scene, NEWEST)
+    if len(refined) <= _STEPS:
+        return None
+    by_a_factor = limits is _WORTH_A_LOOK or _has_scale(scene)
+    return (_by_a_factor(scene, refined, given, limits) if by_a_factor else None) or _aside(
+        scene, refined, given, limits
+    )
 
 
 def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
@@ -132,9 +156,9 @@ def _measures_depths(scene: Scene) -> bool:
     return bool(np.isfinite(scene.observations.depth_m[:1000]).any())
 
 
-def _steps(scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Return refined and given steps, (n, 3) m in the body, of those that are long enough to tell."""
-    table, order = scene.keyframes, scene.order
+def _steps(scene: Scene, newest: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Return refined and given steps, (n, 3) m in the body, of those long enough to tell; of all or the newest."""
+    table, order = scene.keyframes, scene.order[-newest - 1 if newest else 0 :]
     both = table.refined[order[1:]] & table.refined[order[:-1]]
     first, second = order[:-1][both], order[1:][both]
     _, refined = geometry.steps_between(table.rotation, table.position, first, second)

@@ -44,6 +44,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "stamps": lambda: units.check_stamps(tracks),
         "sigma": lambda: units.check_sigma(tracks),
         "ids": lambda: ids.check_ids(tracks),
+        "silent": lambda: placement.check_silent(tracks),
         "cameras": lambda: placement.check_cameras(tracks, related),
         "poses": lambda: _poses(tracks, related()),
         "depth": lambda: units.check_depth(tracks, related()),

@@ -25,6 +25,10 @@ _DISTANT = 5
 _OTHER_POINTS = 0.6
 # Different points agree by chance to less than this share.
 _CHANCE = 0.3
+# Keyframes across which rays jump farthest are those from which ids may stand for other points; so many beside agree.
+# Fewer keyframes with wrong ids are left out by solves.
+_TRIED = 4
+_LASTING = 6
 # As many ids in all as one image has tracks, but for this factor, are numbers of rows or places.
 _PLACES = 1.5
 
@@ -55,6 +59,12 @@ def check_ids(tracks: Tracks) -> Diagnosis:
         return Diagnosis(untold=["too few long tracks to judge ids"])
     if near < AGREED:
         return Diagnosis(untold=["too many outliers to judge ids"], rows=rows)
+    since = _others_since(tracks)
+    if since is not None:
+        evidence = f"{near:.0%} of the tracks agree from one keyframe to the next, next to none across that one"
+        cause = f"track ids stand for other points from stamp {tracks.stamp_ns[since] * 1e-9:.3f} s on"
+        change = "track_id in the feature_tracks: a tracker that begins anew counts on, or raises session_id"
+        return Diagnosis([Finding((cause,), evidence, (change,), usual=True)], rows=rows)
     if again < _OTHER_POINTS * near or (far < _LOST * near and persist >= _PERSIST):
         evidence = (
             f"{near:.0%} of the tracks agree from one keyframe to the next, {far:.0%} over {_FAR},"
@@ -79,6 +89,30 @@ def _along(tracks: Tracks) -> tuple[float, float]:
             near.append(pairs[0].share)
             far.append(0.0 if pairs[1] is None else pairs[1].share)
     return (float(np.median(near)), float(np.median(far))) if len(near) >= 3 else (float("nan"), float("nan"))
+
+
+def _others_since(tracks: Tracks) -> int | None:
+    """Return the keyframe from which on all ids stand for other points than before; None if there is none."""
+    jumps: list[tuple[float, int, int]] = []
+    for k in range(1, len(tracks)):
+        camera = tracks.main_camera(k)
+        rows = tracks.match((k - 1, camera or 0), (k, camera or 0))
+        if camera is not None and len(rows[0]) >= two_view.MIN_PAIRS:
+            off = np.linalg.norm(tracks.ray[rows[0]] - tracks.ray[rows[1]], axis=1)
+            jumps.append((float(np.median(off)), k, camera))
+
+    def agree(k: int, camera: int) -> float:
+        rows = tracks.match((k - 1, camera), (k, camera))
+        if len(rows[0]) < two_view.MIN_PAIRS:
+            return 0.0
+        pair = relate(tracks, (k - 1, camera), (k, camera), rows)
+        return 0.0 if pair is None else pair.share
+
+    for _, k, camera in sorted(jumps, reverse=True)[:_TRIED]:
+        beside = [one for one in range(max(1, k - _LASTING), min(len(tracks), k + _LASTING + 1)) if one != k]
+        if agree(k, camera) < _CHANCE and all(agree(one, camera) >= _CHANCE for one in beside):
+            return k if k <= len(tracks) - _LASTING else None
+    return None
 
 
 def _distant(tracks: Tracks) -> float:

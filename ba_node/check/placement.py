@@ -16,7 +16,7 @@ import numpy as np
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding
-from ba_node.check.motion import check_motion, contradicts
+from ba_node.check.motion import check_motion, compare, compare_steps, contradicts
 from ba_node.check.relations import AGREED, Relation, in_motion, of_cameras, relate, shared_views, spread
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
@@ -44,6 +44,9 @@ _ZOOMS = tuple(float(factor) for factor in np.geomspace(0.5, 2.0, 41))
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
+# Keyframes for which a camera has to be silent, and those just before and after that tell whose tracks go on.
+_SILENT = 5
+_NEXT = 3
 # Two cameras that see so much of the same have tracks in common.
 _SEE_THE_SAME = 0.5
 # Outliers keep it from being measured unless the given relation explains less than this share of what the best does.
@@ -69,6 +72,38 @@ def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diag
         if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
             found = Diagnosis(untold=[f"{why} to measure how camera {camera} is off its place"], rows=found.rows)
         outcome.add(found)
+    return outcome
+
+
+def check_silent(tracks: Tracks) -> Diagnosis:
+    """Look whether the tracks of a camera that fell silent go on under the index of another one."""
+    outcome, n_cam = Diagnosis(), len(tracks.cameras.model)
+    for camera in range(min(n_cam, 1 + _MAX_CAMERAS)):
+        seen = [k for k, of in tracks.images if of == camera]
+        since = max(seen, default=len(tracks)) + 1
+        if len(seen) < _SILENT or since > len(tracks) - _SILENT:
+            continue
+        for other in range(min(n_cam, 1 + _MAX_CAMERAS)):
+            pairs = [
+                ((k, other), (after, other))
+                for k in range(since - _NEXT, since)
+                for after in range(since, since + _NEXT)
+            ]
+            matches = [(a, b, rows) for a, b in pairs if len((rows := tracks.match(a, b))[0]) >= two_view.MIN_PAIRS]
+            related = [one for match in matches if (one := relate(tracks, *match)) is not None and one.has_direction]
+            if other == camera or len(related) < _PAIRS_NEEDED:
+                continue
+            given = compare(tracks, related)
+            meant = compare_steps([tracks.between_images(one.a, (one.b[0], camera)) for one in related], related)
+            if given.loses_to(meant):
+                cause = f"tracks of camera {camera} come as those of camera {other}"
+                cause += f" from stamp {tracks.stamp_ns[since] * 1e-9:.3f} s on"
+                evidence = (
+                    f"steps are {np.median(given.off):.0f} degrees off, {np.median(meant.off):.0f} with that undone"
+                )
+                outcome.add(
+                    Diagnosis([Finding((cause,), evidence, ("camera_index in the feature_tracks",), usual=True)])
+                )
     return outcome
 
 

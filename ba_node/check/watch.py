@@ -7,7 +7,8 @@ focal length needs turns. So the check runs at numbers of keyframes that double,
 still open, until all have told or the last of these numbers is reached.
 
 What was right at first may change on the way: cameras exchanged, images of another size. So some keyframes after solves
-have first said that tracks contradict them, those since then are checked by themselves, with all tests.
+have first said that tracks contradict them, those since then are checked by themselves, with all tests. So are the
+newest where their refined steps deviate from the front-end's or a camera fell silent, and once more at the end.
 """
 
 from __future__ import annotations
@@ -30,10 +31,14 @@ _FEW = 10
 _ONCE = frozenset({"pixels", "stamps"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
-# The newest of them are looked at.
-_NEWEST = 60
-# So many keyframes after solves have first said such a thing, those since then are checked by themselves.
-_SINCE = (5, 12, 24)
+# The newest of them are looked at; and fewer by themselves, where what was right at first may have changed.
+_NEWEST, NEWEST = 60, 20
+# So many keyframes after solves have first said such a thing, those since then (0) or so many are checked.
+_SINCE = ((5, 0), (8, _NEWEST), (12, 0), (24, 0))
+# Steps deviate some keyframes after what has changed.
+_BEFORE = 10
+# A camera is silent that delivered for the first and for none of so many of the newest keyframes.
+_SILENT = 5
 
 
 @dataclass
@@ -50,13 +55,49 @@ class Check:
         return self
 
 
+def of_all(scene: Scene) -> Diagnosis | None:
+    """Return what all tracks tell, or the newest alone where these contradict the set-up; None if there are none."""
+    tracks = tracks_of(scene)
+    found = None if tracks is None else examine(tracks)
+    if found is None or found.harmful or len(scene.keyframes) <= NEWEST:
+        return found
+    newest = tracks_of(scene, NEWEST)
+    changed = None if newest is None else examine(newest, _ONCE)
+    return changed if changed is not None and changed.harmful else found
+
+
 def of_few_keyframes(scene: Scene) -> Check | None:
     """Return the check of a session that ends with so few keyframes that it was hardly looked at; None for others."""
     tracks = tracks_of(scene) if _AT[0] < len(scene.keyframes) < _FEW and scene.keyframes.refined.any() else None
     if tracks is None or not two_view.available():
         return None
     found = examine(tracks)
-    return Check(scene, lambda: found, found) if found.harmful else None
+    return _done(scene, found) if found.harmful else None
+
+
+def of_the_newest(scene: Scene, deviates: bool) -> Check | None:
+    """Return the check of the newest keyframes alone, at the end, if solves or their steps give a reason; or None."""
+    if len(scene.keyframes) < _FEW or not (deviates or _doubtful(scene)) or not two_view.available():
+        return None
+    for some in (NEWEST, _NEWEST):
+        tracks = tracks_of(scene, some)
+        found = None if tracks is None else examine(tracks, _ONCE)
+        if found is not None and found.harmful:
+            return _done(scene, found)
+    return None
+
+
+def _done(scene: Scene, found: Diagnosis) -> Check:
+    return Check(scene, lambda: found, found)
+
+
+def _doubtful(scene: Scene) -> bool:
+    if not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES):
+        return True
+    first, newest = (
+        set().union(*map(scene.cameras_of, rows.tolist())) for rows in (scene.order[:_SILENT], scene.order[-_SILENT:])
+    )
+    return not first <= newest
 
 
 class SetUpWatch:
@@ -70,26 +111,32 @@ class SetUpWatch:
         self._told: frozenset[str] = frozenset()
         self._next = 0
         self._busy = False
-        self._doubted = 0  # keyframes when solves first said that tracks contradict them
+        self._doubted = 0  # keyframes that came before solves, or their steps, gave a reason to look again
         self._looked = 0  # how many of _SINCE are done
 
-    def look(self, scene: Scene) -> str:
-        """Check a scene if it has come to a number of keyframes at which that is due; return why to hold its solves."""
+    def look(self, scene: Scene, deviates: bool = False) -> str:
+        """Check a scene if it has come to a number of keyframes at which that is due; return why to hold its solves.
+
+        ``deviates``: the newest refined steps are off the front-end's.
+        """
         if scene is not self._scene:
             self._scene, self._told, self._next, self._busy, self._reason = scene, frozenset(), 0, False, ""
             self._doubted = self._looked = 0
         count = len(scene.keyframes)
-        if not self._doubted and not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES):
+        if not self._doubted and _doubtful(scene):
             self._doubted = count
+        elif deviates and count >= 2 * self._doubted and (not self._doubted or self._looked == len(_SINCE)):
+            self._doubted, self._looked = max(1, count - _BEFORE), 0
         if self._reason or self._busy:
             return self._reason
         if self._next < len(_AT) and count >= _AT[self._next]:
             again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
             self._check(scene, self._told & _ONCE if again else self._told, _NEWEST)
-        elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked]:
+        elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked][0]:
+            newest = _SINCE[self._looked][1] or count - self._doubted
             self._looked += 1
-            self._check(scene, _ONCE, count - self._doubted)
+            self._check(scene, _ONCE, newest)
         return self._reason
 
     def reason(self, scene: Scene) -> str:

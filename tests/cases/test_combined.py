@@ -117,13 +117,19 @@ CASES = (
     Combined((("few_points", 5.0),), "rgbd", 903, {"outlier_share": 0.1, **LOOP}, ""),
     Combined((("wrong_ids", 8.0),), "mono", 903, {"ids": "random64"}, ""),
     Combined((("stands_still", 35.0),), "mono", 902, {"keyframes": 60, "path": "loop", "length_m": 30.0}, ""),
+    Combined((("region_midway", 40.0),), "mono", 7500, {}, "region|camera 0 does not fit"),
+    Combined((("zoomed_midway", 1.1),), "stereo", 7501, LOOP, "focal length"),
+    Combined((("zoomed_midway", 1.2),), "mono", 7502, {}, "focal length"),
+    Combined((("ids_midway", 1.0),), "stereo", 7503, {}, r"track ids stand for other points|\bids?\b"),
+    Combined((("ids_midway", 1.0),), "mono", 7603, {**LOOP, "keyframes": 50}, "track ids stand for other points"),
+    Combined((("index_midway", None),), "stereo", 7504, {}, "camera 1 come as"),
     # The odometry of seed 0 is better than most.
     Combined((("few_points", 12.0),), "mono", 0, {}, ""),
     Combined((("few_points", 20.0),), "mono", 1, {"drift_rotation_deg": 1.5, "drift_translation": 0.06}, ""),
     Combined((("focal_slightly_off", 0.9),), "mono", 2, {}, "focal"),
 )
 # A few of them run in the quick tests.
-QUICK = {803, 805, 833, 842}
+QUICK = {803, 805, 833, 842, 7504}
 
 
 def _cases() -> list[Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from ba_node.core import geometry
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from experiments.robustness.faults import setup
-from experiments.robustness.faults.recording import Entry, Recording
+from experiments.robustness.faults.recording import Entry, Recording, rows_of
 
 Edit = Callable[[Recording, float, np.random.Generator], Recording]
 # Keyframes that a new id is given to lie so far behind those of the sound recording.
@@ -38,6 +38,38 @@ def from_midway(edit: Edit) -> Edit:
 def smaller(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
     """Track in images that are smaller by a factor."""
     return recording.changed(FeatureTracks, lambda image: dataclasses.replace(image, uv=image.uv / amount))
+
+
+def zoomed(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Multiply the focal length of the images, not that of the rig; what falls outside is not tracked."""
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        last = recording.sound.rig.image_size[image.camera_index] - 1.0
+        uv = 0.5 * last + amount * (image.uv - 0.5 * last)
+        return rows_of(dataclasses.replace(image, uv=uv), ((uv >= 0.0) & (uv <= last)).all(axis=1))
+
+    return recording.changed(FeatureTracks, change)
+
+
+def ids_shifted(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Count track ids from another number on, so that those of before stand for other points."""
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        return dataclasses.replace(image, track_id=image.track_id + np.uint64(amount))
+
+    return recording.changed(FeatureTracks, change)
+
+
+def other_index(recording: Recording, _amount: float, _rng: np.random.Generator) -> Recording:
+    """Lose the tracks of camera 0 in the middle, and send those of camera 1 in their place."""
+    half = len(recording.keyframes) // 2
+
+    def change(image: FeatureTracks) -> FeatureTracks | None:
+        if recording.number(image.keyframe_id) < half:
+            return image
+        return dataclasses.replace(image, camera_index=0) if image.camera_index == 1 else None
+
+    return recording.changed(FeatureTracks, change)
 
 
 def rig_changes(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
