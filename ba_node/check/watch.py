@@ -37,8 +37,8 @@ _NEWEST, NEWEST = 60, 20
 _SINCE = ((5, 0), (8, _NEWEST), (12, 0), (24, 0))
 # Steps deviate some keyframes after what has changed.
 _BEFORE = 10
-# A camera is silent that delivered for the first and for none of so many of the newest keyframes.
-_SILENT = 5
+# A camera is silent that delivered for the first and for none of so many of the newest keyframes; said after more.
+_SILENT, _SAID = 5, 10
 
 
 @dataclass
@@ -57,6 +57,7 @@ class Check:
 
 def of_all(scene: Scene) -> Diagnosis | None:
     """Return what all tracks tell, or the newest alone where these contradict the set-up; None if there are none."""
+    _fell_silent(scene)
     tracks = tracks_of(scene)
     found = None if tracks is None else examine(tracks)
     if found is None or found.harmful or len(scene.keyframes) <= NEWEST:
@@ -92,11 +93,28 @@ def _done(scene: Scene, found: Diagnosis) -> Check:
 
 
 def _doubtful(scene: Scene) -> bool:
-    if not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES):
-        return True
-    first, newest = (
-        set().union(*map(scene.cameras_of, rows.tolist())) for rows in (scene.order[:_SILENT], scene.order[-_SILENT:])
+    return _fell_silent(scene) or not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES)
+
+
+def _fell_silent(scene: Scene) -> bool:
+    """Return True if a camera that delivered at first does no more; warn of it where others go on."""
+    order = scene.order
+    first, newest, said = (
+        set().union(*map(scene.cameras_of, rows.tolist()))
+        for rows in (order[:_SILENT], order[-_SILENT:], order[-_SAID:])
     )
+    silent, known = sorted(first - said) if newest else [], scene.log.warnings.get("silent_camera", "")
+    if not all(f"camera {camera} after" in known for camera in silent):
+        found: list[str] = []
+        for camera in silent:
+            last = next(row for row in order[::-1].tolist() if camera in scene.cameras_of(row))
+            stamp_s = scene.keyframes.stamp_ns[last] * 1e-9
+            found.append(f"camera {camera} after keyframe {scene.keyframes.keyframe_id[last]} ({stamp_s:.3f} s)")
+        where = " and ".join(found)
+        scene.log.warn(
+            "silent_camera",
+            f"no tracks came of {where}, while others go on: look whether it delivers, and under which camera_index",
+        )
     return not first <= newest
 
 
@@ -123,7 +141,8 @@ class SetUpWatch:
             self._scene, self._told, self._next, self._busy, self._reason = scene, frozenset(), 0, False, ""
             self._doubted = self._looked = 0
         count = len(scene.keyframes)
-        if not self._doubted and _doubtful(scene):
+        doubtful = _doubtful(scene)
+        if not self._doubted and doubtful:
             self._doubted = count
         elif deviates and count >= 2 * self._doubted and (not self._doubted or self._looked == len(_SINCE)):
             self._doubted, self._looked = max(1, count - _BEFORE), 0

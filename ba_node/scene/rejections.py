@@ -72,6 +72,7 @@ WARNINGS: dict[str, str] = {
     "distortion_folds": "A camera whose distortion folds over inside its image.",
     "clock_jump": "The stamps went far back, or a recording plays again: a new session began.",
     "clock_step": "The stamps jump while keyframes go on coming: the clock was set.",
+    "silent_camera": "A camera that delivered tracks at first and does no more, while others go on.",
     "lower_session": "Keyframes came of a lower session only: it began anew.",
     "frame_changed": "The frame of the keyframes changed: a new session began.",
     "bad_stamp": "A keyframe was turned away for its stamp.",

@@ -123,13 +123,13 @@ CASES = (
     Combined((("ids_midway", 1.0),), "stereo", 7503, {}, r"track ids stand for other points|\bids?\b"),
     Combined((("ids_midway", 1.0),), "mono", 7603, {**LOOP, "keyframes": 50}, "track ids stand for other points"),
     Combined((("index_midway", None),), "stereo", 7504, {}, "camera 1 come as"),
+    Combined((("falls_silent", 1.0),), "stereo", 7505, {}, "no tracks came of camera 1 after"),
+    Combined((("falls_silent", 0.0),), "stereo", 7506, LOOP, "no tracks came of camera 0 after"),
     # The odometry of seed 0 is better than most.
     Combined((("few_points", 12.0),), "mono", 0, {}, ""),
     Combined((("few_points", 20.0),), "mono", 1, {"drift_rotation_deg": 1.5, "drift_translation": 0.06}, ""),
     Combined((("focal_slightly_off", 0.9),), "mono", 2, {}, "focal"),
 )
-# A few of them run in the quick tests.
-QUICK = {803, 805, 833, 842, 7504}
 
 
 def _cases() -> list[Any]:
@@ -138,7 +138,7 @@ def _cases() -> list[Any]:
         pytest.param(
             case,
             id=f"{case.seed}-{'-'.join(name for name, _ in case.faults)}-{case.rig}",
-            marks=[pending] * case.pending + [pytest.mark.slow] * (case.seed not in QUICK),
+            marks=[pending] * case.pending,
         )
         for case in CASES
     ]

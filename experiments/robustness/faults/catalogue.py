@@ -308,6 +308,14 @@ FAULTS: dict[str, Fault] = {
         named=("camera 1 come as",),
         codes=_LOOK,
     ),
+    "falls_silent": Fault(
+        "camera that falls silent midway",
+        midway.falls_silent,
+        amounts=(1.0, 0.0),
+        rigs=_TWO,
+        named=("no tracks came of camera",),
+        codes=_LOOK,
+    ),
     "rig_changes": Fault(
         "focal length of a second rig, times",
         midway.rig_changes,

@@ -72,6 +72,17 @@ def other_index(recording: Recording, _amount: float, _rng: np.random.Generator)
     return recording.changed(FeatureTracks, change)
 
 
+def falls_silent(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
+    """Lose the tracks of a camera from the middle on."""
+    half = len(recording.keyframes) // 2
+
+    def change(image: FeatureTracks) -> FeatureTracks | None:
+        lost = image.camera_index == int(amount) and recording.number(image.keyframe_id) >= half
+        return None if lost else image
+
+    return recording.changed(FeatureTracks, change)
+
+
 def rig_changes(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
     """Send another rig in the middle, whose focal lengths are others; the images stay."""
     half = len(recording.keyframes) // 2
