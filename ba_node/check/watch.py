@@ -37,7 +37,7 @@ _NEWEST, NEWEST = 60, 20
 _SINCE = ((5, 0), (8, _NEWEST), (12, 0), (24, 0))
 # Steps deviate some keyframes after what has changed.
 _BEFORE = 10
-# A camera is silent that delivered for the first and for none of so many of the newest keyframes; said after more.
+# A camera is silent that delivered for each of the first and none of so many of the newest keyframes; said after more.
 _SILENT, _SAID = 5, 10
 
 
@@ -82,7 +82,7 @@ def of_the_newest(scene: Scene, deviates: bool) -> Check | None:
         return None
     for some in (NEWEST, _NEWEST):
         tracks = tracks_of(scene, some)
-        found = None if tracks is None else examine(tracks, _ONCE)
+        found = None if tracks is None else examine(tracks, _said(scene))
         if found is not None and found.harmful:
             return _done(scene, found)
     return None
@@ -90,6 +90,11 @@ def of_the_newest(scene: Scene, deviates: bool) -> Check | None:
 
 def _done(scene: Scene, found: Diagnosis) -> Check:
     return Check(scene, lambda: found, found)
+
+
+def _said(scene: Scene) -> frozenset[str]:
+    """Return the tests that need not be made again; depths that contradict images are left out as it is."""
+    return _ONCE | ({"depth"} if "depths" in scene.log.warnings else set())
 
 
 def _doubtful(scene: Scene) -> bool:
@@ -100,10 +105,10 @@ def _fell_silent(scene: Scene) -> bool:
     """Return True if a camera that delivered at first does no more; warn of it where others go on."""
     order = scene.order
     first, newest, said = (
-        set().union(*map(scene.cameras_of, rows.tolist()))
-        for rows in (order[:_SILENT], order[-_SILENT:], order[-_SAID:])
+        [scene.cameras_of(row) for row in rows.tolist()] for rows in (order[:_SILENT], order[-_SILENT:], order[-_SAID:])
     )
-    silent, known = sorted(first - said) if newest else [], scene.log.warnings.get("silent_camera", "")
+    regular, now = set.intersection(*first), set.union(*newest)
+    silent, known = sorted(regular.difference(*said)) if now else [], scene.log.warnings.get("silent_camera", "")
     if not all(f"camera {camera} after" in known for camera in silent):
         found: list[str] = []
         for camera in silent:
@@ -115,7 +120,7 @@ def _fell_silent(scene: Scene) -> bool:
             "silent_camera",
             f"no tracks came of {where}, while others go on: look whether it delivers, and under which camera_index",
         )
-    return not first <= newest
+    return not regular <= now
 
 
 class SetUpWatch:
@@ -155,7 +160,7 @@ class SetUpWatch:
         elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked][0]:
             newest = _SINCE[self._looked][1] or count - self._doubted
             self._looked += 1
-            self._check(scene, _ONCE, newest)
+            self._check(scene, _said(scene), newest)
         return self._reason
 
     def reason(self, scene: Scene) -> str:

@@ -118,6 +118,8 @@ CASES = (
     Combined((("wrong_ids", 8.0),), "mono", 903, {"ids": "random64"}, ""),
     Combined((("stands_still", 35.0),), "mono", 902, {"keyframes": 60, "path": "loop", "length_m": 30.0}, ""),
     Combined((("region_midway", 40.0),), "mono", 7500, {}, "region|camera 0 does not fit"),
+    # Of a camera with depths on a short straight way it is not told.
+    Combined((("region_midway", 40.0),), "rgbd", 2803, {}, ""),
     Combined((("zoomed_midway", 1.1),), "stereo", 7501, LOOP, "focal length"),
     Combined((("zoomed_midway", 1.2),), "mono", 7502, {}, "focal length"),
     Combined((("ids_midway", 1.0),), "stereo", 7503, {}, r"track ids stand for other points|\bids?\b"),

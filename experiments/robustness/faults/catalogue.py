@@ -282,7 +282,7 @@ FAULTS: dict[str, Fault] = {
         "region of interest not said from midway on, px",
         midway.from_midway(setup.roi_ignored),
         amounts=(80.0, 40.0),
-        rigs=_ALL,
+        rigs=(MONO, STEREO),
         named=("region|camera 0 does not fit",),
         codes=_LOOK,
     ),
