@@ -27,7 +27,7 @@ from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import constraints, contradicted, full, loops, receiver, retriangulation, trial
+from ba_node.window import constraints, contradicted, full, loops, odometry, receiver, retriangulation, trial
 
 # What a step of the map is worth, by what one of the front-end's is; how far (rms, in sigmas) steps may be bent.
 _WORTH, _BENT = 1.0 / 3.0, 10.0
@@ -94,8 +94,6 @@ class Adjustment:
         begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=not self.due.grown)
         if isinstance(begun, str):
             return f"no solve of everything can begin: {begun}"
-        if self.due.grown and begun.selection.much_moves:
-            return "much of what is seen moves"
         begun.solve(self.config.solver)
         result = begun.result
         usable = result.status.usable and result.state.is_finite()
@@ -200,10 +198,12 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
     """Return whether a young map has grown by so much that all of it is to be refined again.
 
     Windows hold what is older as it was found when less was known. Not where images show no lengths, where more than
-    pixels and steps places the map, where a keyframe is not refined, or where anything was found to be odd.
+    pixels and steps places the map, where a keyframe is not refined, anything was found to be odd, little is seen, or
+    the front-end is far worse than stated.
     """
     known, n, window = scene.constraints, len(scene.keyframes), config.window
-    if not max(window.max_keyframes + 1, _AGAIN * known.grown_at) <= n <= _YOUNG or scene.log.warnings:
+    odd = scene.log.warnings.keys() - {"moving"}
+    if not max(window.max_keyframes + 1, _AGAIN * known.grown_at) <= n <= _YOUNG or odd:
         return None
     if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0 or not retriangulation.has_scale(scene):
         return None
@@ -213,7 +213,7 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
     if not scene.keyframes.refined[scene.order].all():
         return None
     known.grown_at = n
-    return loops.Due("the map has grown", grown=True)
+    return loops.Due("the map has grown", grown=True) if odometry.as_stated(scene, config.odometry) else None
 
 
 def bend(scene: Scene, config: Config, what: loops.Due) -> str:

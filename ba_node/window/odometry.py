@@ -51,6 +51,8 @@ _MAX_GAP = 100
 # Refined steps tell how good the front-end's are if there are so many, of keyframes with so many observations.
 _LEAST_STEPS = 8
 MANY_OBSERVATIONS = 50
+# Steps that are off by so many times what is stated are far worse than it.
+_FAR_WORSE = 8.0
 # Turns are not taken for more precise than this share of what is stated.
 _LEAST_SHARE = 0.2
 # What refined steps are off by counts so many times where keyframes see little.
@@ -152,6 +154,17 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
 def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> Steps:
     """Return the front-end's steps between keyframes of a problem that are tied, as the parameters have them."""
     return _front_end(scene, config, keyframes, np.flatnonzero(ties(scene, config, keyframes)))
+
+
+def as_stated(scene: Scene, config: OdometryConfig) -> bool:
+    """Return True if many points are seen, and the front-end's steps are not far worse than is stated."""
+    order, table = scene.order, scene.keyframes
+    if len(scene.observations) < MANY_OBSERVATIONS * len(order):
+        return False
+    steps = stated(scene, config, order)
+    refined = geometry.steps_between(table.rotation, table.position, order[steps.first], order[steps.first + 1])
+    off = _medians_off(refined, (steps.rotation, steps.translation), (steps.sigma_rad, steps.sigma_m))
+    return bool((off < _FAR_WORSE * _MEDIAN_NORM).all())
 
 
 def _as_learned(

@@ -122,7 +122,7 @@ def test_refined_recording_is_what_a_node_publishes(shipped: Run) -> None:
 
 @pytest.mark.slow
 def test_effective_parameters_are_written(shipped: Run, tmp_path: Path) -> None:
-    config = Config().with_values({"window.max_keyframes": 6, "solver.max_iterations": 2})
+    config = Config().with_values({"window.max_keyframes": 6, "solver.max_iterations": 2, "factors.adjust_m": 0.0})
     report = replay(shipped.bag, tmp_path, config)
     tree = yaml.safe_load((tmp_path / "effective.yaml").read_text())["/**"]["ros__parameters"]
     assert tree["window"]["max_keyframes"] == 6

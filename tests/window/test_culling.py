@@ -19,7 +19,8 @@ from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 from tests.scene.small import check_links
 from tests.window.street import first, replayed
 
-WINDOW: dict[str, Any] = {"window.max_keyframes": 10}
+# By windows alone: how often a map is refined as a whole depends on how many keyframes it has.
+WINDOW: dict[str, Any] = {"window.max_keyframes": 10, "factors.adjust_m": 0.0}
 CHOSEN = WINDOW | {"scene.redundant_share": 0.7}
 N = 60
 
