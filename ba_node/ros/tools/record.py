@@ -27,6 +27,8 @@ from ba_node.ros.tools.node import node_apart
 _POLL_S, _LOOK_S = 0.05, 0.5
 _WANTED = frozenset(INPUT_TYPES.values())
 _OUTPUTS = frozenset((*OUTPUT_TYPES, *ON_DEMAND))
+# The name that ROS gives the node of a publisher before it knows it.
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
 # Messages that wait while one is written; cameras and static transforms come once from each publisher.
 _DEPTH, _LATCHED_DEPTH = 2000, 100
 
@@ -125,10 +127,14 @@ class Recorder:
 
 
 def _is_output(topic: str, publishers: Collection[Any]) -> bool:
-    """Return True if a back-end publishes it: of a type that is taken too, but what it works out is no input."""
-    nodes = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in publishers}
+    """Return True if a back-end publishes it: of a type that is taken too, but what it works out is no input.
+
+    Who publishes may become known later than that somebody does.
+    """
+    known = [info for info in publishers if info.node_name != _UNKNOWN]
+    nodes = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known}
     node, _, name = topic.rpartition("/")
-    return name in _OUTPUTS and nodes == {node}
+    return name in _OUTPUTS and nodes <= {node}
 
 
 def _profile(publishers: Collection[Any], latched: bool) -> Any:

@@ -101,6 +101,7 @@ class Worker:
         self._has_news = False
         self._settled = True
         self._behind = False
+        self._at_hand = 0  # keyframes that were fetched and are not in the map yet
         self._failures: Counter[str] = Counter()
         self._has_left = True
         self._resting = threading.Event()  # set while there is nothing to do
@@ -188,7 +189,9 @@ class Worker:
 
     def step(self, arrivals: list[Arrival]) -> None:
         """Take in what arrived (nothing means silence, unless there is more to solve), and solve if there is need."""
+        self._at_hand = sum(isinstance(arrival.content, Keyframe) for arrival in arrivals)
         for arrival in arrivals:
+            self._at_hand -= isinstance(arrival.content, Keyframe)
             self._guard(self._take, arrival)
         self._settled = not arrivals and not self._behind
         if self._settled:
@@ -276,7 +279,7 @@ class Worker:
             solved=keyframes.solved,
             dropped_keyframes=inbox.dropped + keyframes.forgotten,
             rejected_keyframes=keyframes.rejected,
-            waiting=inbox.waiting + keyframes.waiting,
+            waiting=inbox.waiting + self._at_hand + keyframes.waiting,
             rejected=dict(self._failures),
             warnings=self._lag.warnings,
         )

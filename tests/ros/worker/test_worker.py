@@ -114,6 +114,16 @@ def test_commands_reach_the_backend_between_measurements() -> None:
     assert seen == [1]
 
 
+def test_a_report_between_measurements_counts_what_is_behind_it() -> None:
+    rig = Rig()
+    rig.keyframe(1)
+    rig.inbox.post(lambda backend: backend.solve(lambda _: True, lambda _: None))
+    rig.keyframe(2)
+    first, last = reports(rig.step())
+    assert (first.received, first.solved, first.waiting) == (2, 1, 1)
+    assert (last.received, last.solved, last.waiting) == (2, 2, 0)
+
+
 @pytest.mark.parametrize("solves_end", [True, False])
 def test_a_check_gives_way_to_solves_wherever_it_is(solves_end: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where none ends it goes on all the same."""
