@@ -48,6 +48,8 @@ _GROWN, _FEW = 0.05, 10
 # A map of at most so many keyframes is refined as a whole each time that it is so many times as large.
 _YOUNG, _AGAIN = 320, 1.4
 _ITERATIONS = 30
+# Poses that explain tracks better by less than this share do so by rounding.
+_ROUNDED = 1e-9
 _NOTHING_CAME = "nothing came of a solve of everything"
 # Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
 _BESIDE, _CONTRADICTING = 10.0, 0.6
@@ -160,7 +162,7 @@ def _explains_better(
     before = geometry.inverse(poses[0][rows], poses[1][rows] - taken.selection.origin)
     tried, _ = trial.choose(taken.track_id, whole.observations.point, len(taken.track_id))
     found = trial.explained(whole, (tried, 0), before, (state.rotation, state.translation), config.solver.kernels)
-    return bool(found.mean[1, 0] < found.mean[0, 0])
+    return bool(found.mean[1, 0] < (1.0 - _ROUNDED) * found.mean[0, 0])
 
 
 def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | None:

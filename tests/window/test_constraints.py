@@ -299,8 +299,8 @@ def test_a_loop_by_pose_closes_or_is_refused(off_m: float, closes: bool) -> None
 def test_a_loop_is_closed_while_windows_go_on() -> None:
     """The solve of everything runs elsewhere; keyframes that come meanwhile are solved, and follow."""
     data = first(round_trip(0.5), 46)
-    backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
-    backend.elsewhere = lambda work: handed.append(work) if isinstance(work, Adjustment) else None
+    backend = Backend(Config().with_values({"factors.adjust_m": 0.05}))
+    handed = handed_over(backend)
     for _ in backend.replay(stream(data, lambda k, _: [loop_of(data, 40)] if k == 39 else [])):
         if handed and len(backend.scene.keyframes) == 44:
             break
@@ -320,20 +320,35 @@ def test_a_loop_is_closed_while_windows_go_on() -> None:
     assert backend.take_work(handed[0]) is None, "it is taken in once"
 
 
+def handed_over(backend: Backend) -> list[Adjustment]:
+    """Have loops and what is absolute handed over in a list, and other work done at once; return the list."""
+    handed: list[Adjustment] = []
+
+    def elsewhere(work: Work) -> None:
+        if isinstance(work, Adjustment) and not work.due.grown:
+            handed.append(work)
+            return
+        work.run()
+        backend.take_work(work)
+
+    backend.elsewhere = elsewhere
+    return handed
+
+
 @pytest.mark.slow
 def test_gaps_that_were_closed_are_kept_where_poses_explain_the_tracks_better() -> None:
     data = first(round_trip(0.5), 46)
-    backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
-    backend.elsewhere = lambda work: handed.append(work) if isinstance(work, Adjustment) else None
+    backend = Backend(Config().with_values({"factors.adjust_m": 0.05}))
+    handed = handed_over(backend)
     list(backend.replay(stream(data, lambda k, _: [loop_of(data, 40)] if k == 39 else [])))
     handed[0].run()
     taken, copy, config = handed[0].taken, handed[0]._copy, handed[0].config
     assert taken is not None
     state, rows = taken.result.state, copy.find_keyframes(taken.keyframe_id)
     off = np.random.default_rng(0).normal(0.0, 0.05, state.translation.shape)
-    rotation, position = (np.empty_like(values) for values in (copy.keyframes.rotation, copy.keyframes.position))
+    rotation, position = copy.keyframes.rotation.copy(), copy.keyframes.position.copy()
     rotation[rows], position[rows] = geometry.inverse(state.rotation, state.translation)
-    position += taken.selection.origin
+    position[rows] += taken.selection.origin
     worse = taken.with_result(state=dataclasses.replace(state, translation=state.translation + off))
     spoilt = position.copy()
     spoilt[rows] += off
@@ -346,16 +361,8 @@ def test_gaps_that_were_closed_are_kept_where_poses_explain_the_tracks_better() 
 def test_why_no_solve_of_everything_begins_is_said() -> None:
     """Points have a place, and no keyframe sees enough of them: the map is not bent behind their back."""
     data = first(round_trip(0.5), 40)
-    backend, handed = Backend(Config().with_values({"factors.adjust_m": 0.05})), list[Adjustment]()
-
-    def elsewhere(work: Work) -> None:
-        if isinstance(work, Adjustment) and not work.due.grown:
-            handed.append(work)
-            return
-        work.run()
-        backend.take_work(work)
-
-    backend.elsewhere = elsewhere
+    backend = Backend(Config().with_values({"factors.adjust_m": 0.05}))
+    handed = handed_over(backend)
     list(backend.replay(stream(data, lambda k, _: [loop_of(data, 36)] if k == 35 else [])))
     copy = handed[0]._copy
     handed[0].config = handed[0].config.with_values({"guard.min_points": 1000})
