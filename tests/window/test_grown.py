@@ -66,6 +66,12 @@ def test_it_is_left_out_where_that_is_asked_for(values: dict[str, object]) -> No
     assert replayed(data, **values)[0].map.adjustments == 0
 
 
+@pytest.mark.parametrize("changes", [{"tracks": 20}, {"drift_rotation_deg": 3.0}])
+def test_it_is_left_out_where_little_is_seen_or_the_front_end_is_far_worse_than_stated(changes: dict[str, Any]) -> None:
+    few = {"keyframes": 24, "length_m": 16.0, "landmarks": 800, "tracks": 60}
+    assert replayed(recording(51, **few | changes))[0].map.adjustments == 0
+
+
 def test_maps_without_lengths_and_those_of_which_something_was_said_are_left_to_their_windows() -> None:
     few = {"keyframes": 24, "length_m": 16.0, "landmarks": 800, "tracks": 60}
     assert replayed(recording(51, **few | {"baseline_m": 0.0}))[0].map.adjustments == 0
