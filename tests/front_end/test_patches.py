@@ -65,10 +65,10 @@ def test_a_moved_picture_is_found(
     at = places()
     if kernels == "numpy":
         without_kernels(monkeypatch)
-    templates = patches.Templates.of(patches.cut(soften(picture), at, SIDE, rows=basis == "row"), basis)
+    cut = patches.cut(soften(picture), at, SIDE, rows=basis == "row")
     start = np.tile(np.eye(2), (COUNT, 1, 1))
     bend = np.full((COUNT, 2), 1e-4) if bent else None
-    found = patches.align(templates, image, at + np.array([0.9, 0.0]), start, bend)
+    found = patches.align(cut, image, at + np.array([0.9, 0.0]), start, bend)
     good = found.correlation > 0.9
     assert good.mean() > 0.9
     off = (found.uv - at - moved)[good]
@@ -80,11 +80,11 @@ def test_a_moved_picture_is_found(
 def test_both_find_the_same(picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     there: Any = cv2.warpAffine(picture, np.array([[1.01, 0.0, 0.3], [0.0, 0.99, -0.4]]), (300, 200))
     cut = patches.cut(soften(picture), places(), SIDE)
-    templates, start = patches.Templates.of(cut, "place"), np.tile(np.eye(2), (COUNT, 1, 1))
+    start = np.tile(np.eye(2), (COUNT, 1, 1))
     first = places() * [1.01, 0.99] + [0.8, 0.1]
-    ours = patches.align(templates, soften(there), first, start)
+    ours = patches.align(cut, soften(there), first, start)
     without_kernels(monkeypatch)
-    theirs = patches.align(templates, soften(there), first, start)
+    theirs = patches.align(cut, soften(there), first, start)
     good = theirs.correlation > 0.9
     assert good.mean() > 0.9
     assert np.abs(ours.uv - theirs.uv)[good].max() < 0.03
@@ -102,9 +102,10 @@ def test_what_has_no_texture_or_lies_nowhere_is_not_found(
     if kernels == "numpy":
         without_kernels(monkeypatch)
     at = np.array([[50.0, 50.0], [np.nan, 20.0], [1e9, -1e9]])
-    plain = patches.Templates.of(np.full((3, SIDE + 2, SIDE + 2), 7.0, np.float32), "place")
+    plain = np.full((3, SIDE + 2, SIDE + 2), 7.0, np.float32)
     found = patches.align(plain, soften(picture), at, np.tile(np.eye(2), (3, 1, 1)))
     assert not (found.correlation > 0.5).any()
-    none = patches.align(patches.Templates.of(np.empty((0, SIDE + 2, SIDE + 2), np.float32), "place"),
-                         soften(picture), np.empty((0, 2)), np.empty((0, 2, 2)))  # fmt: skip
+    none = patches.align(
+        np.empty((0, SIDE + 2, SIDE + 2), np.float32), soften(picture), np.empty((0, 2)), np.empty((0, 2, 2))
+    )
     assert none.uv.shape == (0, 2)
