@@ -331,8 +331,7 @@ class Aligner {
     }
     const float* strip = strip_.data() - strip_begin_;
     for (std::int64_t r = 0, j = 0; r < rows; ++r, strip += kStrip)
-      for (std::int64_t c = 0; c < columns; ++c, ++j)
-        std::memcpy(pairs + 2 * j, strip + column[j], 2 * sizeof(float));
+      for (std::int64_t c = 0; c < columns; ++c, ++j) std::memcpy(pairs + 2 * j, strip + column[j], 2 * sizeof(float));
     for (std::int64_t j = 0; j < n; ++j) s[j] = pairs[2 * j] + right[j] * (pairs[2 * j + 1] - pairs[2 * j]);
     return true;
   }
