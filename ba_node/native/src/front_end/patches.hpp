@@ -304,7 +304,7 @@ class Aligner {
   bool look_along(float u, float v, float xx, float xy) {
     const std::int64_t n = patches_.pixels, rows = patches_.height, columns = n / rows;
     const float *px = grid_.data(), *py = px + size_;
-    const float half = std::abs(px[0]), reach = (std::abs(xx) + std::abs(xy)) * half;
+    const float half = std::abs(px[0]), reach = (std::abs(xx) + std::abs(xy)) * half + 0.01F;  // it may be rounded
     if (!(u - reach >= 0.0F) || !(u + reach < static_cast<float>(image_.width - 1)) || !(v - half >= 0.0F) ||
         !(v + half < static_cast<float>(image_.height - 1)) || !(reach < static_cast<float>(kStrip / 2 - kBeside - 2)))
       return false;
