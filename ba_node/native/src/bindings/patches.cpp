@@ -37,7 +37,7 @@ py::tuple align(const Floats& image, const std::tuple<Floats, Doubles, Floats, F
   std::copy_n(affine.data(), 4 * n, shape.mutable_data());
   std::fill_n(correlation.mutable_data(), n, 0.0);
   std::fill_n(left.mutable_data(), n, std::numeric_limits<double>::infinity());
-  const PatchesView view{n,           values.shape(1), values.shape(2), k,           window.size(), values.data(),
+  const PatchesView view{n,           values.shape(1), values.shape(2), k, window.size(), values.data(),
                          grid.data(), window.data(),   prior.data()};
   const PlacesSpan to{place.mutable_data(), shape.mutable_data(), correlation.mutable_data(), left.mutable_data(),
                       inverse.mutable_data()};

@@ -304,7 +304,7 @@ class Aligner {
   bool look_along(float u, float v, float xx, float xy) {
     const std::int64_t n = patches_.pixels, rows = patches_.height, columns = n / rows;
     const float *px = grid_.data(), *py = px + size_;
-    const float half = std::abs(px[0]), reach = (std::abs(xx) + std::abs(xy)) * half;
+    const float half = std::abs(px[0]), reach = (std::abs(xx) + std::abs(xy)) * half + 0.01F;  // it may be rounded
     if (!(u - reach >= 0.0F) || !(u + reach < static_cast<float>(image_.width - 1)) || !(v - half >= 0.0F) ||
         !(v + half < static_cast<float>(image_.height - 1)) || !(reach < static_cast<float>(kStrip / 2 - kBeside - 2)))
       return false;
@@ -331,8 +331,7 @@ class Aligner {
     }
     const float* strip = strip_.data() - strip_begin_;
     for (std::int64_t r = 0, j = 0; r < rows; ++r, strip += kStrip)
-      for (std::int64_t c = 0; c < columns; ++c, ++j)
-        std::memcpy(pairs + 2 * j, strip + column[j], 2 * sizeof(float));
+      for (std::int64_t c = 0; c < columns; ++c, ++j) std::memcpy(pairs + 2 * j, strip + column[j], 2 * sizeof(float));
     for (std::int64_t j = 0; j < n; ++j) s[j] = pairs[2 * j] + right[j] * (pairs[2 * j + 1] - pairs[2 * j]);
     return true;
   }
