@@ -167,6 +167,12 @@ def as_stated(scene: Scene, config: OdometryConfig) -> bool:
     return bool((off < _FAR_WORSE * _MEDIAN_NORM).all())
 
 
+def tell_scale(scene: Scene, config: OdometryConfig) -> float:
+    """Return the standard deviation, as a share, to which the front-end's steps tell the scale, if as stated."""
+    steps = stated(scene, config, scene.order)
+    return float(1.0 / max(np.linalg.norm(steps.translation / steps.sigma_m[:, None]), _SMALLEST_SIGMA))
+
+
 def _as_learned(
     scene: Scene, config: OdometryConfig, keyframes: IntArray, sources: list[tuple[BoolArray, float]], steps: Steps
 ) -> Steps | None:
