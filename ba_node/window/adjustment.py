@@ -48,8 +48,6 @@ _GROWN, _FEW = 0.05, 10
 # A map of at most so many keyframes is refined as a whole each time that it is so many times as large: with one camera
 # that shows no lengths, whose scale drifts, and with others.
 _YOUNG, _AGAIN = 320, (1.25, 1.4)
-# The first is left to its windows where steps as stated do not tell its scale to this share.
-_SCALE = 0.02
 _ITERATIONS = 30
 # Poses that explain tracks better by less than this share do so by rounding; worse by more than that, worse indeed.
 _ROUNDED, _WORSE = 1e-9, 0.005
@@ -209,7 +207,7 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
 
     Windows hold what is older as it was found when less was known, and with it the scale of one camera. Not where more
     than pixels and steps places the map, where a keyframe is not refined, anything was found to be odd, little is seen,
-    the front-end is far worse than stated, or nothing tells a scale.
+    the front-end is far worse than stated, or, with one camera, it hardly moves for some of the time.
     """
     known, n, window = scene.constraints, len(scene.keyframes), config.window
     odd = scene.log.warnings.keys() - {"moving"}
@@ -226,7 +224,7 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
     if not scene.keyframes.refined[scene.order].all():
         return None
     known.grown_at = n
-    told = scaled or odometry.tell_scale(scene, config.odometry) <= _SCALE
+    told = scaled or odometry.tell_scale(scene, config.odometry)
     sound = told and odometry.as_stated(scene, config.odometry)
     return loops.Due("the map has grown", grown=True) if sound else None
 
