@@ -45,11 +45,12 @@ _CONFIRMED = 2
 _TRY_AGAIN = 0.15
 # And again once the map has grown by this share, and by so many keyframes.
 _GROWN, _FEW = 0.05, 10
-# A map of at most so many keyframes is refined as a whole each time that it is so many times as large.
-_YOUNG, _AGAIN = 320, 1.4
+# A map of at most so many keyframes is refined as a whole each time that it is so many times as large: with one camera
+# that shows no lengths, whose scale drifts, and with others.
+_YOUNG, _AGAIN = 320, (1.25, 1.4)
 _ITERATIONS = 30
-# Poses that explain tracks better by less than this share do so by rounding.
-_ROUNDED = 1e-9
+# Poses that explain tracks better by less than this share do so by rounding; worse by more than that, worse indeed.
+_ROUNDED, _WORSE = 1e-9, 0.005
 _NOTHING_CAME = "nothing came of a solve of everything"
 # Priors lie beside the map at so many standard deviations; where more than this share does they tell nothing.
 _BESIDE, _CONTRADICTING = 10.0, 0.6
@@ -96,9 +97,14 @@ class Adjustment:
         begun = full.take_snapshot(scene, config, self.wanted, self.scene, bent=not self.due.grown)
         if isinstance(begun, str):
             return f"no solve of everything can begin: {begun}"
+        unscaled = self.due.grown and not retriangulation.has_scale(scene)
+        if unscaled and begun.selection.much_moves:
+            return "much of what is seen moves"
         begun.solve(self.config.solver)
         result = begun.result
         usable = result.status.usable and result.state.is_finite()
+        if unscaled and usable and not _explains_better(scene, begun, self._before, config, -_WORSE):
+            return "it explains the tracks worse"
         return begun if usable else f"{_NOTHING_CAME}: {result.reason}"
 
     def _close_gaps(self, begun: full.Optimization, config: Config) -> None:
@@ -152,9 +158,9 @@ class Adjustment:
 
 
 def _explains_better(
-    scene: Scene, taken: full.Optimization, poses: tuple[FloatArray, FloatArray], config: Config
+    scene: Scene, taken: full.Optimization, poses: tuple[FloatArray, FloatArray], config: Config, by: float = _ROUNDED
 ) -> bool:
-    """Return whether a solve explains the tracks better than poses (rotations and positions by row) do."""
+    """Return whether a solve explains the tracks better, by a share, than poses (rotations, positions by row) do."""
     whole, rows = taken.selection.whole, scene.find_keyframes(taken.keyframe_id)
     state = taken.outcome(taken.result.state, config).state
     if state is None:
@@ -162,7 +168,7 @@ def _explains_better(
     before = geometry.inverse(poses[0][rows], poses[1][rows] - taken.selection.origin)
     tried, _ = trial.choose(taken.track_id, whole.observations.point, len(taken.track_id))
     found = trial.explained(whole, (tried, 0), before, (state.rotation, state.translation), config.solver.kernels)
-    return bool(found.mean[1, 0] < (1.0 - _ROUNDED) * found.mean[0, 0])
+    return bool(found.mean[1, 0] < (1.0 - by) * found.mean[0, 0])
 
 
 def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | None:
@@ -199,15 +205,18 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
 def _grown(scene: Scene, config: Config) -> loops.Due | None:
     """Return whether a young map has grown by so much that all of it is to be refined again.
 
-    Windows hold what is older as it was found when less was known. Not where images show no lengths, where more than
-    pixels and steps places the map, where a keyframe is not refined, anything was found to be odd, little is seen, or
-    the front-end is far worse than stated.
+    Windows hold what is older as it was found when less was known, and with it the scale of one camera. Not where more
+    than pixels and steps places the map, where a keyframe is not refined, anything was found to be odd, little is seen,
+    the front-end is far worse than stated, or, with one camera, it hardly moves for some of the time.
     """
     known, n, window = scene.constraints, len(scene.keyframes), config.window
     odd = scene.log.warnings.keys() - {"moving"}
-    if not max(window.max_keyframes + 1, _AGAIN * known.grown_at) <= n <= _YOUNG or odd:
+    if not max(window.max_keyframes + 1, _AGAIN[0] * known.grown_at) <= n <= _YOUNG or odd:
         return None
-    if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0 or not retriangulation.has_scale(scene):
+    if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0:
+        return None
+    scaled = retriangulation.has_scale(scene)
+    if n < _AGAIN[scaled] * known.grown_at:
         return None
     looped = known.renamed or any(one.is_loop for one in known.relative.values())
     if known.absolute or known.landmarks or known.seams or looped:
@@ -215,7 +224,9 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
     if not scene.keyframes.refined[scene.order].all():
         return None
     known.grown_at = n
-    return loops.Due("the map has grown", grown=True) if odometry.as_stated(scene, config.odometry) else None
+    told = scaled or odometry.tell_scale(scene, config.odometry)
+    sound = told and odometry.as_stated(scene, config.odometry)
+    return loops.Due("the map has grown", grown=True) if sound else None
 
 
 def bend(scene: Scene, config: Config, what: loops.Due) -> str:

@@ -53,6 +53,8 @@ _LEAST_STEPS = 8
 MANY_OBSERVATIONS = 50
 # Steps that are off by so many times what is stated are far worse than it.
 _FAR_WORSE = 8.0
+# Steps of so many standard deviations tell a length; so large a share of them is nearly all.
+_TELLING, _NEARLY_ALL = 10.0, 0.9
 # Turns are not taken for more precise than this share of what is stated.
 _LEAST_SHARE = 0.2
 # What refined steps are off by counts so many times where keyframes see little.
@@ -165,6 +167,13 @@ def as_stated(scene: Scene, config: OdometryConfig) -> bool:
     refined = geometry.steps_between(table.rotation, table.position, order[steps.first], order[steps.first + 1])
     off = _medians_off(refined, (steps.rotation, steps.translation), (steps.sigma_rad, steps.sigma_m))
     return bool((off < _FAR_WORSE * _MEDIAN_NORM).all())
+
+
+def tell_scale(scene: Scene, config: OdometryConfig) -> bool:
+    """Return True if nearly all of the front-end's steps tell a length, if they are as stated."""
+    steps = stated(scene, config, scene.order)
+    told = np.linalg.norm(steps.translation, axis=1) >= _TELLING * steps.sigma_m
+    return bool(np.count_nonzero(told) >= _NEARLY_ALL * len(told))
 
 
 def _as_learned(

@@ -12,7 +12,7 @@ import pytest
 from ba_node.backend import Backend
 from ba_node.config import Config
 from ba_node.estimate import Estimate
-from ba_node.window import guard
+from ba_node.window import adjustment, guard
 from ba_node.window.merging import Merged
 from ba_node.window.selection import Selection
 from ba_node.window.trust import Trust
@@ -36,12 +36,21 @@ def replayed(data: SyntheticData, **values: object) -> tuple[Backend, float]:
     return backend, aligned_rms(last.trajectory.position, data.truth.position)
 
 
+ONE_CAMERA = {"baseline_m": 0.0, "landmarks": 2500, "tracks": 120}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [61, 66])
-def test_a_map_that_has_grown_is_near_the_optimum_of_everything(seed: int) -> None:
-    data = recording(seed, keyframes=42, length_m=28.0)
+@pytest.mark.parametrize(
+    ("seed", "keyframes", "changes", "often"),
+    [(61, 42, {}, 3), (66, 42, {}, 3), (303, 43, ONE_CAMERA, 4), (307, 43, ONE_CAMERA, 4)],
+    ids=["stereo", "stereo again", "one camera", "one camera again"],
+)
+def test_a_map_that_has_grown_is_near_the_optimum_of_everything(
+    seed: int, keyframes: int, changes: dict[str, Any], often: int
+) -> None:
+    data = recording(seed, keyframes=keyframes, length_m=0.667 * keyframes, **changes)
     backend, _ = replayed(data)
-    assert backend.map.adjustments == 3  # at 21, 30 and 42 keyframes
+    assert backend.map.adjustments == often  # at 21, 30 and 42 keyframes; with one camera at 21, 27, 34 and 43
     windows, _ = replayed(data, **{"factors.adjust_m": 0.0})
     found, alone = (one.estimate().trajectory.position for one in (backend, windows))
     best = windows.optimize()
@@ -72,9 +81,19 @@ def test_it_is_left_out_where_little_is_seen_or_the_front_end_is_far_worse_than_
     assert replayed(recording(51, **few | changes))[0].map.adjustments == 0
 
 
-def test_maps_without_lengths_and_those_of_which_something_was_said_are_left_to_their_windows() -> None:
+def test_one_camera_is_left_to_its_windows_where_nothing_tells_its_scale_or_tracks_say_no(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = recording(51, keyframes=24, length_m=16.0, **ONE_CAMERA)
+    assert replayed(data)[0].map.adjustments == 1
+    assert replayed(data, **{"odometry.sigma_m_per_m": 0.2})[0].map.adjustments == 0
+    monkeypatch.setattr(adjustment, "_WORSE", -0.1)  # it would have to explain them better by so much
+    backend, _ = replayed(data)
+    assert backend.map.summary().notices == {"not_refined": 1} and not backend.map.adjustments
+
+
+def test_maps_of_which_something_was_said_are_left_to_their_windows() -> None:
     few = {"keyframes": 24, "length_m": 16.0, "landmarks": 800, "tracks": 60}
-    assert replayed(recording(51, **few | {"baseline_m": 0.0}))[0].map.adjustments == 0
     backend = Backend(Config().with_values({"guard.check_setup": False}))
     for _ in backend.replay(m for _, _, m in recording(51, **few).timeline()):
         backend.scene.log.warn("held", "a solution was held")
