@@ -53,8 +53,8 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
     """Return the keyframe's pose, (3, 3) and (3,) m, body from world; None if it stays."""
     if options.kernels != "numpy" and not missing(options):
         limits = _LEAST, _STEPS, _LEAST_GAIN, _DAMPING
-        cost = options.loss, options.loss_scale_px
-        return native.kernels.resect(problem, keyframe, cost, limits)  # type: ignore[no-any-return]
+        model = options.loss, options.loss_scale_px
+        return native.kernels.resect(problem, keyframe, model, limits)  # type: ignore[no-any-return]
     obs = problem.observations
     rows = (obs.keyframe == keyframe) & _seen_by_others(problem, keyframe).take(obs.point)
     if np.count_nonzero(rows) < _LEAST:
@@ -71,7 +71,7 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
             break
         matrix[np.diag_indices(6)] *= 1.0 + _DAMPING
         try:
-            step: FloatArray = -np.linalg.solve(matrix, vector)
+            step = np.asarray(np.linalg.solve(matrix, -vector))
         except np.linalg.LinAlgError:
             break
         turn = geometry.so3_exp(step[:3])
