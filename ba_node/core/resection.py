@@ -36,17 +36,18 @@ def resected(problem: Problem, options: SolverOptions, keyframe: int) -> State:
         return start
     rotation, translation, points = start.rotation.copy(), start.translation.copy(), start.points.copy()
     rotation[keyframe], translation[keyframe] = pose
-    alone = ~_seen_by_others(problem, keyframe)
+    _, alone = _views(problem, keyframe)
     in_body = points[alone] @ start.rotation[keyframe].T + start.translation[keyframe]
     points[alone] = (in_body - translation[keyframe]) @ rotation[keyframe]
     return changed(start, rotation=rotation, translation=translation, points=points)
 
 
-def _seen_by_others(problem: Problem, keyframe: int) -> BoolArray:
-    """Return which points another keyframe sees, (n_pt,)."""
-    seen = np.zeros(problem.n_points, bool)
-    seen[problem.observations.point[problem.observations.keyframe != keyframe]] = True
-    return seen
+def _views(problem: Problem, keyframe: int) -> tuple[IntArray, BoolArray]:
+    """Return the observations of a keyframe, (n,), and which points it alone sees, (n_pt,)."""
+    point, n = problem.observations.point, problem.n_points
+    rows = (problem.observations.keyframe == keyframe).nonzero()[0]
+    own = np.bincount(point.take(rows), minlength=n)
+    return rows, (own > 0) & (own == np.bincount(point, minlength=n))
 
 
 def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[FloatArray, FloatArray] | None:
@@ -55,11 +56,10 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
         limits = _LEAST, _STEPS, _LEAST_GAIN, _DAMPING
         model = options.loss, options.loss_scale_px
         return native.kernels.resect(problem, keyframe, model, limits)  # type: ignore[no-any-return]
-    obs = problem.observations
-    rows = (obs.keyframe == keyframe) & _seen_by_others(problem, keyframe).take(obs.point)
-    if np.count_nonzero(rows) < _LEAST:
+    rows, alone = _views(problem, keyframe)
+    rows = rows[~alone.take(problem.observations.point.take(rows))]
+    if len(rows) < _LEAST:
         return None
-    rows = rows.nonzero()[0]
     start = at = best = problem.start.rotation[keyframe], problem.start.translation[keyframe]
     lowest = np.inf
     for i in range(_STEPS + 1):
