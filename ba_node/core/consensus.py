@@ -38,11 +38,11 @@ def triangulate(rays: Rays, n_points: int, gate: float, kernels: str = "auto") -
     agrees = agreeing(rays, n_points, gate, kernels)
     found = triangulation.triangulate(rays.part(agrees), n_points, kernels)
     near = triangulation.errors(rays, found.points) <= gate
-    if np.array_equal(near, agrees):
-        return found, agrees
     # A point that lost views by it keeps those it had.
     fewer = np.bincount(rays.point, near, n_points) < np.bincount(rays.point, agrees, n_points)
     near = np.where(fewer.take(rays.point), agrees, near)
+    if np.array_equal(near, agrees):
+        return found, agrees
     # Few points have other rays than before.
     changed = np.bincount(rays.point, near != agrees, n_points) > 0
     again = triangulation.triangulate(rays.part(near & changed.take(rays.point)), n_points, kernels)

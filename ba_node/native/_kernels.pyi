@@ -158,6 +158,11 @@ def use_target(name: str) -> None:
 def allocations() -> int:
     """Return how often the kernels have asked for memory."""
 
+def resect(
+    problem: Problem, keyframe: int, cost: tuple[str, float], limits: tuple[int, int, float, float]
+) -> tuple[Doubles, Doubles] | None:
+    """Return what core.resection._pose does; cost: loss and its scale; limits: as its module has them."""
+
 def residual_norms(problem: Problem, state: State) -> Doubles: ...
 def residual_norms_of(problem: Problem, state: State, rows: Ints) -> Doubles:
     """Return the same of some observations."""

@@ -18,8 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ba_node.arrays import changed
 from ba_node.config import Config, SolverOptions
-from ba_node.core import methods, solver
+from ba_node.core import methods, resection, solver
 from ba_node.core.problem import Problem
 from ba_node.core.result import Iteration, Result
 from ba_node.estimate import Refinement
@@ -71,7 +72,7 @@ def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Fol
         if isinstance(selection, str):
             return selection
         options = methods.from_config(config.solver)
-        problem = _begun(selection, options)
+        problem = _arrived(scene, selection, options)
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True, in_haste=True)
         solve_time_s += clock() - began
@@ -85,6 +86,19 @@ def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Fol
             held = trust.hear(verdict.reason, verdict.odd, without, config)
             return Attempt(selection, result, found, verdict.health, held, without, solve_time_s)
         without, trust.cause = verdict.keyframes, verdict.reason
+
+
+def _arrived(scene: Scene, selection: Selection, options: SolverOptions) -> Problem:
+    """Return the problem with a better start: its newest keyframe, where it alone is new, where known points want it.
+
+    See ``core/resection.py``. What is selected, and what a solution is compared with, goes by where it came. Images of
+    one camera alone do not hold the scale of the window, which needs the iterations that this saves.
+    """
+    problem, newest = selection.problem, selection.problem.n_keyframes - 1
+    new = (~scene.keyframes.refined[selection.keyframes]).nonzero()[0].tolist()
+    if problem.n_keyframes <= _YOUNG or new != [newest] or problem.fixed[newest] or not problem.has_scale:
+        return _begun(selection, options)
+    return changed(problem, start=resection.resected(problem, options, newest))
 
 
 def _begun(selection: Selection, options: SolverOptions) -> Problem:

@@ -33,7 +33,7 @@ _MAX_OUTPUTS = 20
 _REPORT_PERIOD_S = 1.0
 # What is done beside solves waits for so long at a time, and in all for this share of its time and as long as that:
 # where solves follow each other at once it must get on too.
-_GIVES_WAY_S, _WAITS = 0.2, 0.67
+_GIVES_WAY_S, _WAITS = 0.2, 0.9
 # Texts that begin alike say the same.
 _HEAD = 40
 # Falling behind for this long is warned about.

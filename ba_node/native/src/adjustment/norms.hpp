@@ -8,6 +8,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <type_traits>
 
 #include "adjustment/layout.hpp"
 #include "adjustment/project.hpp"
@@ -52,19 +53,28 @@ void residual_norms_as(const ProblemView& p, const StateView& s, double* out) {
   }
 }
 
-// out: n_obs, sigmas; infinite for points that their camera cannot see.
-inline void residual_norms(const ProblemView& p, const StateView& s, double* out) {
+// Call f(lens) with the lens that a problem's cameras need, as a type.
+template <class F>
+void with_lens(const ProblemView& p, F f) {
   const std::int64_t n = p.n_cameras;
   const auto bent = [&p](std::int64_t c) {
     return std::any_of(p.params + kParams * c + 4, p.params + kParams * (c + 1), [](double k) { return k != 0.0; });
   };
   if (std::any_of(p.model, p.model + n, [](std::uint8_t model) { return model != 0; })) {
-    residual_norms_as<Lens::kMixed>(p, s, out);
+    f(std::integral_constant<Lens, Lens::kMixed>());
   } else {
     bool straight = true;
     for (std::int64_t c = 0; c < n; ++c) straight &= !bent(c);
-    straight ? residual_norms_as<Lens::kPinhole>(p, s, out) : residual_norms_as<Lens::kRational>(p, s, out);
+    if (straight)
+      f(std::integral_constant<Lens, Lens::kPinhole>());
+    else
+      f(std::integral_constant<Lens, Lens::kRational>());
   }
+}
+
+// out: n_obs, sigmas; infinite for points that their camera cannot see.
+inline void residual_norms(const ProblemView& p, const StateView& s, double* out) {
+  with_lens(p, [&](auto lens) { residual_norms_as<decltype(lens)::value>(p, s, out); });
 }
 
 }  // namespace ba::BA_TARGET

@@ -74,6 +74,26 @@ inline void upper_times(const Packed& li, const V8 (&x)[3], V8 (&out)[3]) {
   out[2] = li[5] * x[2];
 }
 
+// Psi and the IRLS weight of residuals of a squared norm.
+[[gnu::always_inline]] inline void robust(const CostModel& model, V8 norm2, V8& cost, V8& weight) {
+  cost = norm2;
+  weight = splat(1.0);
+  if (model.loss == Loss::kSquared) return;
+  const double c = model.scale;
+  if (model.loss == Loss::kCauchy) {
+    const V8 ratio = norm2 * (1.0 / (c * c));
+    cost = (c * c) * log1p(ratio);
+    weight = 1.0 / (1.0 + ratio);
+    return;
+  }
+  const Mask outside = norm2 > c * c;
+  if (!any(outside)) return;
+  const V8 norm = root(select(outside, norm2, splat(1.0)));
+  const V8 falling = c / norm;
+  cost = select(outside, c * (2 * norm - c), norm2);
+  weight = select(outside, falling, splat(1.0));
+}
+
 class Rows {
  public:
   Rows(Layout& layout, const CostModel& cost_model, const StateView& start)
@@ -170,14 +190,14 @@ class Rows {
     const V8 scale = select(off, V8{}, whiten);
     out.residual[0] = (q.uv[0] - load(&l_.u[at])) * scale;
     out.residual[1] = (q.uv[1] - load(&l_.v[at])) * scale;
-    robust(out.residual[0] * out.residual[0] + out.residual[1] * out.residual[1], out.cost, out.weight[0]);
+    robust(cost_, out.residual[0] * out.residual[0] + out.residual[1] * out.residual[1], out.cost, out.weight[0]);
     if (!keep) out.cost = select(hidden & ~none, splat(cost_of(kBehindNorm)), out.cost);
     V8 depth_scale{};
     if constexpr (kDepth) {
       V8 cost;
       depth_scale = select(off, V8{}, load(&l_.inverse_depth_sigma[at]));
       out.residual[2] = (y[2] - load(&l_.depth[at])) * depth_scale;
-      robust(out.residual[2] * out.residual[2], cost, out.weight[1]);
+      robust(cost_, out.residual[2] * out.residual[2], cost, out.weight[1]);
       out.cost += cost;
     }
     if constexpr (kDerivatives) {
@@ -244,26 +264,6 @@ class Rows {
       return cost_.scale * cost_.scale * std::log1p(norm * norm / (cost_.scale * cost_.scale));
     if (cost_.loss == Loss::kSquared || norm <= cost_.scale) return norm * norm;
     return cost_.scale * (2 * norm - cost_.scale);
-  }
-
-  // Psi and the IRLS weight of residuals of a squared norm.
-  [[gnu::always_inline]] void robust(V8 norm2, V8& cost, V8& weight) const {
-    cost = norm2;
-    weight = splat(1.0);
-    if (cost_.loss == Loss::kSquared) return;
-    const double c = cost_.scale;
-    if (cost_.loss == Loss::kCauchy) {
-      const V8 ratio = norm2 * (1.0 / (c * c));
-      cost = (c * c) * log1p(ratio);
-      weight = 1.0 / (1.0 + ratio);
-      return;
-    }
-    const Mask outside = norm2 > c * c;
-    if (!any(outside)) return;
-    const V8 norm = root(select(outside, norm2, splat(1.0)));
-    const V8 falling = c / norm;
-    cost = select(outside, c * (2 * norm - c), norm2);
-    weight = select(outside, falling, splat(1.0));
   }
 
   // Observations of points that start behind their camera count for nothing.

@@ -45,6 +45,12 @@ struct CostModel {
   double least_promise = 1e-8;  // share of its cost below which a point takes no step of its own
 };
 
+// As in core/resection.py.
+struct ResectionLimits {
+  std::int64_t least, iterations;
+  double least_gain, damping;
+};
+
 // Pairs (i, j > i) of free keyframes, sorted, that factors couple.
 struct CoupledPairs {
   std::vector<std::int32_t> row, column;

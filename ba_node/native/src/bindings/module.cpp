@@ -5,6 +5,7 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
+#include <algorithm>
 #include <charconv>
 #include <cmath>
 #include <cstddef>
@@ -106,6 +107,24 @@ Doubles residual_norms(const py::object& problem, const py::object& state) {
   double* out = norms.mutable_data();
   unless_short(norms.size(), [&] { target->residual_norms(arrays.view(), at.view(), out); });
   return norms;
+}
+
+// cost: loss and its scale, sigmas. limits: as ResectionLimits. None if the keyframe stays where it is.
+py::object resect(const py::object& problem, std::int64_t keyframe, const std::pair<std::string, double>& cost,
+                  const std::tuple<std::int64_t, std::int64_t, double, double>& limits) {
+  const ProblemArrays arrays(problem);
+  const auto& [least, iterations, least_gain, damping] = limits;
+  CostModel model;
+  model.loss = loss_named(cost.first);
+  model.scale = cost.second;
+  double pose[12];
+  if (!target->resect(arrays.view(), arrays.start.view(), keyframe, model, {least, iterations, least_gain, damping},
+                      pose))
+    return py::none();
+  Doubles rotation = empty({3, 3}), translation = empty({3});
+  std::copy_n(pose, 9, rotation.mutable_data());
+  std::copy_n(pose + 9, 3, translation.mutable_data());
+  return py::make_tuple(rotation, translation);
 }
 
 py::tuple triangulate(const py::object& rays, py::ssize_t n_points) {
@@ -368,6 +387,7 @@ PYBIND11_MODULE(_kernels, m) {
   m.def("use_target", &ba::use_target);
   m.def("allocations", [] { return ba::allocations.load(); });
   m.def("residual_norms", &ba::residual_norms);
+  m.def("resect", &ba::resect);
   m.def("triangulate", &ba::triangulate);
   m.def("agreeing", &ba::agreeing);
   m.def("consensus", &ba::consensus);

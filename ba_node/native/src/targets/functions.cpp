@@ -5,6 +5,7 @@
 #include "adjustment/consensus.hpp"
 #include "adjustment/norms.hpp"
 #include "adjustment/relative_poses.hpp"
+#include "adjustment/resection.hpp"
 #include "adjustment/triangulate.hpp"
 #include "front_end/patches.hpp"
 #include "front_end/pose.hpp"
@@ -29,8 +30,8 @@ void agreeing(const RaysView& rays, std::int64_t n_points, double gate, bool* ag
 
 }  // namespace
 
-const Target kTarget{BA_NAME(BA_TARGET),  make_kernel6,   make_kernel9,  make_factor6, make_factor9,
-                     make_relative_poses, residual_norms, triangulate,   agreeing,     consensus,
-                     cut_patches,         align_patches,  pose_equations};
+const Target kTarget{BA_NAME(BA_TARGET),  make_kernel6,   make_kernel9,  make_factor6,  make_factor9,
+                     make_relative_poses, residual_norms, resect,        triangulate,   agreeing,
+                     consensus,           cut_patches,    align_patches, pose_equations};
 
 }  // namespace ba::BA_TARGET
