@@ -111,9 +111,9 @@ def _named(tracks: Tracks, camera: int, k: int, change: Change, usual: FloatArra
     sure = np.abs(value) > np.maximum(_LEAST, _ERRORS * change.error)
     causes = []
     if change.mirrored:
-        axes = {(True, False): "left and right", (False, True): "top and bottom"}
-        what = axes.get(tuple((change.signs < 0.0).tolist()), "both sides")
-        causes.append(f"images of {where} are mirrored: {what} are exchanged")
+        left, top = (change.signs < 0.0).tolist()
+        sides = "mirrored: left and right are exchanged" if left else "mirrored: top and bottom are exchanged"
+        causes.append(f"images of {where} are {'upside down' if left and top else sides}")
     if sure[0] and not change.mirrored:
         causes.append(f"focal length of {where} is {np.exp(value[0]):.3g} times that of before")
     if sure[1:].any() and not change.mirrored:
