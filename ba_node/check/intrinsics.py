@@ -39,9 +39,9 @@ _OFF_CENTRE = 0.2
 # Pixels of cameras are square to better than this.
 _SQUARE = 1.05
 # Another model is better if its sum of residuals is lower by so many times its mean, and by this share: what lenses do
-# that no model says leaves less. A focal length alone needs no share, and less of a sum: both halves of the tracks have
-# to find the same.
-_SURE, _SURE_OF_FOCAL = 16.0, 8.0
+# that no model says leaves less. A focal length alone that is off by less than a factor needs no share, and less of a
+# sum: both halves of the tracks have to find the same.
+_SURE, _SURE_OF_FOCAL, _SLIGHTLY = 16.0, 8.0, 1.1
 _LOWER = 0.05
 # A lens is named rather than a focal length and a principal point that leave no less than this part of its sum.
 _RATHER = 0.9
@@ -59,7 +59,7 @@ class Model:
     change: str  # what to change
     params: FloatArray  # (n_cam, 12)
     lens: cameras.Model | None = None  # the model of all cameras; None for those given
-    focal_alone: bool = False  # it differs in the focal length, by many of its standard deviations
+    focal_alone: bool = False  # it differs in the focal length, slightly but by many of its standard deviations
 
     def of(self, tracks: Tracks) -> Tracks:
         """Return tracks as these cameras see them."""
@@ -196,7 +196,7 @@ def _named(tracks: Tracks, free: Freed) -> Model | None:
     if not causes:
         return None
     if len(causes) == 1 and "focal" in causes[0]:
-        return Model(causes[0], f"k of {_INFO}", free.params, focal_alone=True)
+        return Model(causes[0], f"k of {_INFO}", free.params, focal_alone=abs(np.log(factor)) < np.log(_SLIGHTLY))
     return Model(", and ".join(causes), _ROI, free.params)
 
 

@@ -23,7 +23,6 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Transform
-from ba_node.front_end.patches import inverses
 from ba_node.front_end.rectify import IdealRig
 
 # What a calibration is trusted to, px: yaw and roll.
@@ -143,34 +142,36 @@ class StereoAlignment:
     def _solve(self, pair: Pair, motion: Transform) -> tuple[FloatArray, FloatArray] | None:
         """Return information (2, 2) on yaw and roll by one pair, and how far both are from what is applied, px."""
         f, fb = self._rig.focal, self._rig.focal * self._rig.baseline
-        ray, basis = self._rig.rays(pair.before), self.basis(pair.before)
+        ray, basis = self._rig.rays(pair.before).T, self.basis(pair.before).T
         sigma_d = np.hypot(pair.disparity_sigma, _FLOOR_PX)
         sigma = np.hypot(pair.sigma, _FLOOR_PX)
         turn, d = np.zeros(2), pair.disparity.copy()
+        J = np.zeros((8, 2, len(d)))  # columns, as numpy's products of many small matrices take ten times as long
         for _ in range(_STEPS):
             # At the disparities that both images make likely: at those measured, whose errors would look like parallax
             # where there is none, the scale comes out too small and the yaw too large.
-            m = ray @ motion.rotation.T + motion.translation * (d / fb)[:, None]
-            z = np.maximum(m[:, 2], 1e-2)
-            by_m = np.zeros((len(d), 2, 3))
-            by_m[:, 0, 0] = by_m[:, 1, 1] = f / z
-            by_m[:, :, 2] = -f * m[:, :2] / (z * z)[:, None]
-            by_d = by_m @ motion.translation / fb
-            off = pair.disparity + basis @ turn - d
-            error = pair.after - (f * m[:, :2] / z[:, None] + self._rig.centre) - by_d * off[:, None]
-            smear = by_d * sigma_d[:, None]
-            covariance = np.eye(2) * (sigma * sigma)[:, None, None] + smear[:, :, None] * smear[:, None]
-            inverse = inverses(covariance)
-            likely = d + off + sigma_d * np.einsum("ni,nij,nj->n", smear, inverse, error)
-            squared = np.einsum("ni,nij,nj->n", error, inverse, error)
-            inverse /= (1.0 + squared / 4.0)[:, None, None]
-            jacobian = np.concatenate(
-                [-by_m @ geometry.hat(m), by_m * (d / fb)[:, None, None], by_d[:, :, None] * basis[:, None]], axis=2
-            )
-            weighted = inverse @ jacobian
-            H = np.einsum("nik,nil->kl", jacobian, weighted)
+            w = d / fb
+            x, y, depth = motion.rotation @ ray + motion.translation[:, None] * w
+            z = np.maximum(depth, 1e-2)
+            a, flat, t = f / z, np.stack([x, y]) / z, motion.translation[:, None]
+            by_d = a * (t[:2] - flat * t[2]) / fb
+            off = pair.disparity + turn @ basis - d
+            error = pair.after.T - (f * flat + self._rig.centre[:, None]) - by_d * off
+            # C = sigma^2 + m m':  sigma^2 C^-1 = 1 - m m' / (sigma^2 + m' m)
+            smear = by_d * sigma_d
+            total = sigma * sigma + (smear * smear).sum(axis=0)
+            along = (smear * error).sum(axis=0) / total
+            likely = d + off + sigma_d * along
+            squared = ((error * error).sum(axis=0) - along * along * total) / (sigma * sigma)
+            (u, v), none = flat, np.zeros(len(d))
+            J[:6, 0] = a * (-u * y, depth + u * x, -y, w, none, -u * w)
+            J[:6, 1] = a * (-depth - v * y, v * x, x, none, w, -v * w)
+            J[6:] = basis[:, None] * by_d
+            weighted = J - smear * ((smear * J).sum(axis=1) / total)[:, None]
+            weighted /= sigma * sigma * (1.0 + squared / 4.0)
+            H = J.reshape(8, -1) @ weighted.reshape(8, -1).T
             H[6:, 6:] += 0.01 * self._prior
-            b = np.einsum("nik,ni->k", weighted, error)
+            b = weighted.reshape(8, -1) @ error.reshape(-1)
             b[6:] -= 0.01 * self._prior @ (self.turn + turn)
             step = np.linalg.solve(H + 1e-12 * np.eye(8) * np.trace(H), b)
             rotation = geometry.so3_exp(step[:3])

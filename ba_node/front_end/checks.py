@@ -187,8 +187,10 @@ class ImageWatch:
     def partners(self, frame: Frame, rig: IdealRig, notes: list[str]) -> None:
         """Say so if left and right seem to be exchanged, or the second image has nothing to do with the first."""
         assert frame.right is not None
-        exchanged = Frame(frame.right, frame.grey, None, frame.right_clear, frame.allowed)
-        ours, theirs = (_share(one, rig) for one in (frame, exchanged))
+        ours = _share(frame, rig)
+        if ours > 0.5:
+            return  # no other way are more than twice as many
+        theirs = _share(Frame(frame.right, frame.grey, None, frame.right_clear, frame.allowed), rig)
         if theirs > 2.0 * ours and theirs > _FEW_PARTNERS:
             self.say(
                 "swapped",

@@ -78,11 +78,10 @@ def _learn_rows(frame: Frame, uv: FloatArray, found: stereo.Disparities, side: i
     rows = np.flatnonzero(found.found)[:: max(1, int(found.found.sum()) // _FOR_ROWS)]
     if not len(rows):
         return
-    templates = patches.Templates.of(patches.cut(frame.soft, uv[rows], side), "place")
     affine = np.tile(np.eye(2), (len(rows), 1, 1))
     affine[:, 0] -= found.slant[rows]
     first = np.column_stack([uv[rows, 0] - found.value[rows], uv[rows, 1] + alignment.rows_off(uv[rows])])
-    there = patches.align(templates, frame.right_soft, first, affine)
+    there = patches.align(patches.cut(frame.soft, uv[rows], side), frame.right_soft, first, affine)
     sigma = np.sqrt(np.maximum(there.covariance[:, 1, 1], 0.0))
     good = (there.correlation > _SAME) & (sigma < _SURE_PX) & (np.abs(there.uv - first).max(axis=1) < _MOST_OFF_PX)
     alignment.learn_rows(uv[rows][good], (there.uv[:, 1] - uv[rows, 1])[good], sigma[good])

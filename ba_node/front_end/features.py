@@ -71,10 +71,15 @@ def _best(
     above, below = min(_REACH, top), min(_REACH, len(image) - bottom)
     strength = cv2().cornerMinEigenVal(image[top - above : bottom + below], _BLOCK, ksize=3)
     across = slice(border, border + columns * cell)
-    inner = strength[above : above + bottom - top, across] * allowed[top:bottom, across]
-    cells = inner.reshape(-1, cell, columns, cell).transpose(0, 2, 1, 3).reshape(-1, columns, cell * cell)
-    best = cells.argmax(axis=2)
-    return best, np.take_along_axis(cells, best[..., None], axis=2)[..., 0]
+    across = slice(border, border + columns * cell)
+    inner = strength[above : above + bottom - top, across]
+    inner[~allowed[top:bottom, across]] = 0.0
+    # The best column of each cell first: rows of pixels lie side by side, and squares of them would have to be copied.
+    inner = inner.reshape(-1, cell, columns * cell)
+    x = inner.max(axis=1).reshape(-1, columns, cell).argmax(axis=2)
+    column = inner[np.arange(len(inner))[:, None], :, x + cell * np.arange(columns)]
+    y = column.argmax(axis=2)
+    return cell * y + x, np.take_along_axis(column, y[..., None], axis=2)[..., 0]
 
 
 def _apart(found: FloatArray, taken: FloatArray, distance: float) -> FloatArray:

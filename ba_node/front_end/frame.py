@@ -57,5 +57,5 @@ def inside(allowed: BoolArray, uv: FloatArray) -> BoolArray:
 
 def soften(image: Grey) -> Floats:
     """Return a smoothed image as float32."""
-    soft: Floats = cv2().GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
+    soft: Floats = cv2().sepFilter2D(image, cv2().CV_32F, *[cv2().getGaussianKernel(9, SMOOTHING_PX)] * 2)
     return soft

@@ -140,6 +140,30 @@ class LocalMap:
             flat = np.where(z > 1e-3, np.stack([u, v]) / z, np.nan)
         return np.asarray(self._rig.focal * flat.T + self._rig.centre)
 
+    def triangulate(
+        self, rows: IntArray, uv: FloatArray, sigma: FloatArray, camera_from_map: Transform, error_px: float
+    ) -> BoolArray:
+        """Measure how far points are by a camera's motion since their anchors; return those that are wrong: (n,).
+
+        They are seen at uv (n, 2), px, with standard deviations (n,), px, and taken where they fit to so many px.
+        """
+        anchor = self.anchor[rows]
+        R = camera_from_map.rotation @ self.rotation[anchor]
+        t = self.position[anchor] @ camera_from_map.rotation.T + camera_from_map.translation
+        # q m_z = m_xy with m = R ray + t w, q the ray of now: two equations A w = B.
+        q = self._rig.rays(uv)[:, :2]
+        turned = np.einsum("nij,nj->ni", R, self._rig.rays(self.uv[rows]))
+        A = q * t[:, 2:] - t[:, :2]
+        B = turned[:, :2] - q * turned[:, 2:]
+        squared = np.maximum((A * A).sum(axis=1), 1e-18)
+        w = (A * B).sum(axis=1) / squared
+        error = np.linalg.norm(B - A * w[:, None], axis=1) * self._rig.focal
+        sigma_w = 2.0 * np.hypot(sigma, 0.3) / (self._rig.focal * np.sqrt(squared))
+        good = (error < error_px) & (w > 0.0) & (sigma_w < 0.3 * w)
+        good &= ~(self.sigma[rows] < sigma_w)
+        self.place(rows[good], w[good], sigma_w[good], np.zeros((int(good.sum()), 2)))
+        return np.asarray((error > 3.0 * error_px) | ((w < 0.0) & (sigma_w < 0.1 * np.abs(w))))
+
     def refine(self, track_id: IdArray, position: FloatArray) -> None:
         """Take positions (n, 3) of points in the map, m."""
         order = np.argsort(track_id, kind="stable")

@@ -89,112 +89,100 @@ def _offsets(side: int, rows: bool) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True)
-class Templates:
-    """Patches ready to be found."""
-
-    side: int
-    values: Floats  # (n, P), weighted mean 0
-    weighted: Floats  # (n, P) values times window
-    std: Floats  # (n,) weighted standard deviation
-    jacobian: Floats  # (n, k, P) change by each of k movements, orthogonal to 1 and T, times window
-    hessian: FloatArray  # (n, k, k)
-
-    @classmethod
-    def of(cls, patches: Floats, basis: str, prior: FloatArray | None = None) -> Templates:
-        """Prepare patches as :func:`cut` gives them.
-
-        Args:
-            patches: whole ones for ``place``, of rows for ``row``.
-            basis: ``place`` (2 movements: x, y), or ``row`` (3: x, x by p_x, x by p_y).
-            prior: (k,) added to the diagonal of the Hessian, grey values squared.
-        """
-        side, k = patches.shape[2] - 2, _STRIDE
-        w = window(side)
-        rows = patches if basis == "row" else patches[:, 1:-1:k]
-        values = rows[:, :, 1:-1:k].reshape(len(patches), len(w))
-        dx = (0.5 * (rows[:, :, 2::k] - rows[:, :, :-2:k])).reshape(values.shape)
-        values = values - (values @ w)[:, None]
-        weighted = values * w
-        variance = np.einsum("np,np->n", values, weighted)
-        if basis == "place":
-            dy = (0.5 * (patches[:, 2::k, 1:-1:k] - patches[:, :-2:k, 1:-1:k])).reshape(values.shape)
-            jacobian = np.stack([dx, dy], axis=1)
-        else:
-            p = grid(side)
-            jacobian = np.stack([dx, dx * p[:, 0], dx * p[:, 1]], axis=1)
-        jacobian -= (jacobian @ w)[..., None]
-        along = np.einsum("nkp,np->nk", jacobian, weighted) / np.maximum(variance, _LEAST_STD**2)[:, None]
-        jacobian -= along[..., None] * values[:, None]
-        moved = jacobian * w
-        hessian = np.matmul(moved, jacobian.transpose(0, 2, 1)).astype(np.float64)
-        if prior is not None:
-            hessian += np.diag(prior)
-        return cls(side, values, weighted, np.sqrt(variance), moved, hessian)
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-
-@dataclass(frozen=True)
 class Aligned:
-    """Where templates were found."""
+    """Where patches were found."""
 
     uv: FloatArray  # (n, 2) px
-    slant: FloatArray  # (n, 2) of ``row``: change of x' - x by p_x and by p_y; 0 of ``place``
-    correlation: FloatArray  # (n,) of template and image, -1 to 1
+    slant: FloatArray  # (n, 2) of rows: change of x' - x by p_x and by p_y; 0 of whole patches
+    correlation: FloatArray  # (n,) of patch and image, -1 to 1
     covariance: FloatArray  # (n, k, k) of the movements, px^2, by what is left unexplained
 
 
 def align(
-    templates: Templates,
+    patches: Floats,
     image: Floats,
     uv: FloatArray,
     affine: FloatArray,
     bend: FloatArray | None = None,
+    prior: FloatArray | None = None,
     iterations: int = 8,
 ) -> Aligned:
-    """Find templates in an image, from a first place each.
+    """Find patches in an image, from a first place each.
 
     Args:
-        templates: n of them.
+        patches: n of them as :func:`cut` gives them: whole ones have k = 2 movements, x and y, those of rows 3: x, x by
+            p_x, x by p_y.
         image: (h, w) float32.
         uv: (n, 2) first places, px.
-        affine: (n, 2, 2) A; its first row changes for templates of ``row``.
+        affine: (n, 2, 2) A; its first row changes for patches of rows.
         bend: (n, 2) g, 1/px; None for 0.
+        prior: (k,) added to the diagonal of the Hessian, grey values squared; None for 0.
         iterations: most steps.
     """
-    k, p, w = templates.hessian.shape[1], grid(templates.side), window(templates.side)
-    # A patch without texture has no Hessian to speak of; what it is given moves it by nothing.
-    inverse = inverses(templates.hessian + _LEAST_HESSIAN * np.eye(k))
+    side = patches.shape[2] - 2
+    p, w = grid(side), window(side)
+    if prior is None:
+        prior = np.zeros(2 if patches.shape[1] == patches.shape[2] else 3)
     if native.kernels is not None:
-        of = templates.weighted, templates.std, templates.jacobian, inverse, p, w
-        bends = np.empty(0) if bend is None else bend
-        limits = iterations, _STEP_PX, _FARTHEST_PX
-        place, a, correlation, left = native.kernels.align_patches(image, of, uv, affine, bends, limits)
+        of, bends = (patches, prior, p, w), np.empty(0) if bend is None else bend
+        limits = iterations, _STEP_PX, _FARTHEST_PX, _LEAST_STD**2, _LEAST_HESSIAN
+        place, a, correlation, left, inverse = native.kernels.align_patches(image, of, uv, affine, bends, limits)
     else:
-        place, a, correlation, left = _align(templates, inverse, image, (uv, affine, bend), iterations)
+        templates = _Templates.of(patches, prior)
+        place, a, correlation, left = _align(templates, image, (uv, affine, bend), iterations)
+        inverse = templates.inverse
     # As many independent values as pixels under the window.
     independent = 1.0 / float((w * w).sum())
     covariance = inverse * (left / independent)[:, None, None]
     return Aligned(place, a[:, 0] - [1.0, 0.0], correlation, covariance)
 
 
+@dataclass(frozen=True)
+class _Templates:
+    """Patches ready to be found."""
+
+    side: int
+    weighted: Floats  # (n, P) values, of weighted mean 0, times window
+    std: Floats  # (n,) weighted standard deviation
+    jacobian: Floats  # (n, k, P) change by each of k movements, orthogonal to 1 and T, times window
+    inverse: FloatArray  # (n, k, k) of the Hessian
+
+    @classmethod
+    def of(cls, patches: Floats, prior: FloatArray) -> _Templates:
+        side, k, w = patches.shape[2] - 2, _STRIDE, window(patches.shape[2] - 2)
+        rows = patches if len(prior) == 3 else patches[:, 1:-1:k]
+        values = rows[:, :, 1:-1:k].reshape(len(patches), len(w))
+        dx = (0.5 * (rows[:, :, 2::k] - rows[:, :, :-2:k])).reshape(values.shape)
+        values = values - (values @ w)[:, None]
+        weighted = values * w
+        variance = np.einsum("np,np->n", values, weighted)
+        if len(prior) == 3:
+            p = grid(side)
+            jacobian = np.stack([dx, dx * p[:, 0], dx * p[:, 1]], axis=1)
+        else:
+            dy = (0.5 * (patches[:, 2::k, 1:-1:k] - patches[:, :-2:k, 1:-1:k])).reshape(values.shape)
+            jacobian = np.stack([dx, dy], axis=1)
+        jacobian -= (jacobian @ w)[..., None]
+        along = np.einsum("nkp,np->nk", jacobian, weighted) / np.maximum(variance, _LEAST_STD**2)[:, None]
+        jacobian -= along[..., None] * values[:, None]
+        moved = jacobian * w
+        hessian = np.matmul(moved, jacobian.transpose(0, 2, 1)).astype(np.float64)
+        # A patch without texture has no Hessian to speak of; what it is given moves it by nothing.
+        return cls(side, weighted, np.sqrt(variance), moved, inverses(hessian + np.diag(prior + _LEAST_HESSIAN)))
+
+
 def _align(
-    templates: Templates,
-    inverse: FloatArray,
-    image: Floats,
-    start: tuple[FloatArray, FloatArray, FloatArray | None],
-    iterations: int,
+    templates: _Templates, image: Floats, start: tuple[FloatArray, FloatArray, FloatArray | None], iterations: int
 ) -> tuple[FloatArray, ...]:
     """Return places (n, 2), A, correlations and variances that are left: what the kernels do, from uv, A and g."""
     uv, affine, bend = start
-    n, k = len(templates), templates.hessian.shape[1]
+    n, k = templates.jacobian.shape[:2]
     p, w = grid(templates.side), window(templates.side)
     place, a = uv.astype(np.float64).copy(), affine.astype(np.float64).copy()
     correlation, left = np.zeros(n), np.full(n, np.inf)
     depth = None if bend is None else 1.0 / (1.0 + bend.astype(np.float32) @ p.T)
     rows = np.arange(n)
-    std, back = templates.std, inverse
+    std, back = templates.std, templates.inverse
     compared = np.concatenate([templates.weighted[:, None], templates.jacobian], axis=1)
     for _ in range(iterations if n else 0):
         s = _at(image, place[rows], a[rows], p, depth)
@@ -219,12 +207,16 @@ def _align(
 
 
 def inverses(matrices: FloatArray) -> FloatArray:
-    """Invert matrices (n, k, k), those of 2 x 2 by hand, as LAPACK takes ten times as long."""
-    if matrices.shape[1] != 2:
-        return np.asarray(np.linalg.inv(matrices))
-    a, b, c, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1]
-    out = np.stack([d, -b, -c, a], axis=1) / (a * d - b * c)[:, None]
-    return out.reshape(-1, 2, 2)
+    """Invert symmetric matrices (n, 2, 2) or (n, 3, 3) by hand, as LAPACK takes ten times as long."""
+    if matrices.shape[1] == 2:
+        a, b, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+        cofactors = np.stack([d, -b, -b, a])
+        return np.asarray((cofactors / (a * d - b * b)).T.reshape(-1, 2, 2))
+    (a, b, c), (_, d, e), (_, _, f) = matrices.transpose(1, 2, 0)
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    cofactors = np.stack([A, B, C, B, D, E, C, E, F])
+    return np.asarray((cofactors / (a * A + b * B + c * C)).T.reshape(-1, 3, 3))
 
 
 def _at(image: Floats, place: FloatArray, a: FloatArray, p: Floats, depth: Floats | None) -> Floats:

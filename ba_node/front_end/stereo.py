@@ -158,9 +158,8 @@ def _along(
     left: Floats, right: Floats, uv: FloatArray, shift: FloatArray, slant: FloatArray, side: int, prior: FloatArray
 ) -> tuple[FloatArray, ...]:
     """Return disparity, its sigma, slant and correlation of patches of one image in the rows of another."""
-    templates = patches.Templates.of(patches.cut(left, uv, side, rows=True), "row", prior)
     affine = np.tile(np.eye(2), (len(uv), 1, 1))
     affine[:, 0] -= slant
-    found = patches.align(templates, right, uv + shift, affine)
+    found = patches.align(patches.cut(left, uv, side, rows=True), right, uv + shift, affine, prior=prior)
     sigma = np.sqrt(np.maximum(found.covariance[:, 0, 0], 0.0))
     return uv[:, 0] - found.uv[:, 0], sigma, -found.slant, found.correlation

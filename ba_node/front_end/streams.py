@@ -27,6 +27,8 @@ MASK = "mask"
 RECTIFIED = "image_rect"
 # Images further apart are never of one time, ns; what is nearer but not near enough, the front-end says.
 MAX_APART_NS = 50_000_000
+# Share of the first camera's period within which an image of another is near one of it.
+NEAR = 0.75
 # A pose so near is that of a time; stamps are rounded in files. Between poses further apart nothing is known.
 _SAME_NS, _GAP_NS = 100_000, 1_000_000_000
 # Poses between others so far apart miss what a vehicle does there.
@@ -62,7 +64,8 @@ class Streams:
     """Pairs images of several topics by the nearest stamp, in the order of the first.
 
     An image of the first topic is decided on once each of the others has an image of that time or later. Without one
-    it is left out and counted, unless the other is optional, which is waited for as long as ``patience`` images.
+    it is left out and counted, unless the other is optional, which is waited for as long as ``patience`` images. An
+    image of another topic is counted where the first misses one.
 
     Args:
         names: of the streams, the leading one first.
@@ -77,6 +80,7 @@ class Streams:
         self.apart_ns: dict[str, int] = {}
         self._first, *self._others = names
         self._optional, self._patience = optional, patience
+        self._last_ns, self._gaps_ns = 0, deque[int](maxlen=2)  # the last stamp of the first, and between those before
         self._waiting: dict[str, deque[tuple[int, Any]]] = {name: deque(maxlen=depth) for name in names}
 
     def put(self, name: str, stamp_ns: int, message: Any) -> list[Frame]:
@@ -110,6 +114,7 @@ class Streams:
         return True
 
     def _frame(self, stamp_ns: int, leading: Any) -> Frame | None:
+        self._count_alone(stamp_ns)
         messages, skew_ns = {self._first: leading}, 0
         for place, name in enumerate(self._others):
             queue = self._waiting[name]
@@ -126,6 +131,17 @@ class Streams:
             messages[name] = nearest[1] if nearest else None
             skew_ns = apart_ns if place == 0 and name not in self._optional else skew_ns
         return Frame(stamp_ns, messages, skew_ns)
+
+    def _count_alone(self, stamp_ns: int) -> None:
+        """Count images of the others since the last of the first that are too far from that and from this one."""
+        last_ns, self._last_ns = self._last_ns, stamp_ns
+        for name in self._others if self._gaps_ns else ():
+            near_ns = NEAR * min(self._gaps_ns)
+            alone = sum(last_ns + near_ns < at_ns < stamp_ns - near_ns for at_ns, _ in self._waiting[name])
+            if alone and name not in self._optional:
+                self.counted[f"{name} alone"] += alone
+        if last_ns and stamp_ns > last_ns:
+            self._gaps_ns.append(stamp_ns - last_ns)
 
 
 class OdometryBuffer:

@@ -228,7 +228,8 @@ class Tracker:
         self._look_for_lost(frame)
         if frame.right is None and frame.depth is None:
             self._agree_in_pairs()
-            self._triangulate()
+            wrong = self.map.triangulate(self.rows, self.uv, self.sigma, self.pose, self.options.max_error_px)
+            self.rows, self.uv, self.sigma = self.rows[~wrong], self.uv[~wrong], self.sigma[~wrong]
         place = self.map.add_keyframe(keyframe_id, self.pose)
         old = len(self.rows)
         border = self.side // 2 + 2
@@ -316,8 +317,7 @@ class Tracker:
             return uv, np.empty(0), np.zeros(0, bool)
         affine = np.where(np.isfinite(warp.affine), warp.affine, np.eye(2))
         bend = np.nan_to_num(np.clip(warp.bend, -0.05, 0.05))
-        templates = patches.Templates.of(self.map.patch[rows], "place")
-        found = patches.align(templates, frame.soft, uv, affine, bend)
+        found = patches.align(self.map.patch[rows], frame.soft, uv, affine, bend)
         sigma = np.sqrt(np.maximum(np.trace(found.covariance, axis1=1, axis2=2), 0.0) / 2.0)
         sigma = np.hypot(sigma, self._floor_px(frame))
         height, width = frame.grey.shape
@@ -347,27 +347,6 @@ class Tracker:
         keep[j[~found[1]]] = False
         self.rows, self.uv, self.sigma = self.rows[keep], self.uv[keep], self.sigma[keep]
 
-    def _triangulate(self) -> None:
-        """Measure how far followed points are by the camera's motion since their anchors."""
-        rows = self.rows
-        anchor = self.map.anchor[rows]
-        R = self.pose.rotation @ self.map.rotation[anchor]
-        t = self.map.position[anchor] @ self.pose.rotation.T + self.pose.translation
-        # q m_z = m_xy with m = R ray + t w, q the ray of now: two equations A w = B.
-        q = self.rig.rays(self.uv)[:, :2]
-        turned = np.einsum("nij,nj->ni", R, self.rig.rays(self.map.uv[rows]))
-        A = q * t[:, 2:] - t[:, :2]
-        B = turned[:, :2] - q * turned[:, 2:]
-        squared = np.maximum((A * A).sum(axis=1), 1e-18)
-        w = (A * B).sum(axis=1) / squared
-        error = np.linalg.norm(B - A * w[:, None], axis=1) * self.rig.focal
-        sigma = 2.0 * np.hypot(self.sigma, 0.3) / (self.rig.focal * np.sqrt(squared))
-        good = (error < self.options.max_error_px) & (w > 0.0) & (sigma < 0.3 * w)
-        good &= ~(self.map.sigma[rows] < sigma)
-        self.map.place(rows[good], w[good], sigma[good], np.zeros((int(good.sum()), 2)))
-        wrong = (error > 3.0 * self.options.max_error_px) | ((w < 0.0) & (sigma < 0.1 * np.abs(w)))
-        self.rows, self.uv, self.sigma = rows[~wrong], self.uv[~wrong], self.sigma[~wrong]
-
     def _look_for_lost(self, frame: Frame) -> None:
         """Look for points of the map that are not followed and should be in view."""
         free = self.map.known.copy()
@@ -375,15 +354,12 @@ class Tracker:
         rows = np.flatnonzero(free)
         if not len(rows):
             return
-        warp = self.map.warp(rows, self.pose)
         height, width = frame.grey.shape
-        margin = self.side // 2
+        margin, uv = self.side // 2, self.map.seen_at(rows, self.pose)
+        rows = rows[((uv > margin) & (uv < [width - margin, height - margin])).all(axis=1)]
+        warp = self.map.warp(rows, self.pose)
         scale = warp.scale
-        good = np.isfinite(warp.uv).all(axis=1) & (scale > 0.5) & (scale < 2.0)
-        good[good] &= (warp.uv[good] > margin).all(axis=1) & (warp.uv[good] < [width - margin, height - margin]).all(
-            axis=1
-        )
-        rows_of = np.flatnonzero(good)
+        rows_of = np.flatnonzero((scale > 0.5) & (scale < 2.0))
         rows_of = rows_of[np.argsort(-self.map.last_seen[rows[rows_of]], kind="stable")[:_LOOKED_FOR]]
         rows_of = rows_of[inside(frame.allowed, warp.uv[rows_of])]
         rows, warp = rows[rows_of], take_rows(warp, rows_of)

@@ -339,16 +339,16 @@ def cut_patches(image: Floats, uv: Doubles, offsets: Floats) -> Floats:
 
 def align_patches(
     image: Floats,
-    templates: tuple[Floats, Floats, Floats, Doubles, Floats, Floats],
+    patches: tuple[Floats, Doubles, Floats, Floats],
     uv: Doubles,
     affine: Doubles,
     bend: Doubles,
-    limits: tuple[int, float, float],
-) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-    """Return what front_end.patches._align does: place, A, correlation, and the variance that is left unexplained.
+    limits: tuple[int, float, float, float, float],
+) -> tuple[Doubles, Doubles, Doubles, Doubles, Doubles]:
+    """Return what front_end.patches._align does: place, A, correlation, the variance left unexplained, inverse Hessian.
 
-    templates: weighted, std, jacobian, inverse Hessian, grid and window; bend may be empty; limits: iterations, the
-    step that ends them and the longest one, px.
+    patches: as cut, prior (2 or 3 movements), grid and window; bend may be empty; limits: iterations, the step that
+    ends them and the longest one, px, the least variance of a template and what is added to each diagonal of a Hessian.
     """
 
 def pose_equations(

@@ -18,6 +18,7 @@ from ba_node.estimate import Transform
 from ba_node.front_end.records import FrontEndError, Images
 from ba_node.front_end.streams import (
     MODES,
+    NEAR,
     RECTIFIED,
     Frame,
     OdometryBuffer,
@@ -41,8 +42,6 @@ _FIXED = "odom"
 _PACKED = re.compile(r"/compressed(Depth)?$")
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
 _QUEUE = 100
-# Share of the first camera's period within which an image of another is near one of it.
-_NEAR = 0.75
 # Bytes of a message until after its header's stamp.
 _STAMPED = 12
 
@@ -252,6 +251,7 @@ def _paired(
     first, *others = came
     for name in others:
         alone, nearest_ns = _alone(came[first], came[name])
+        source.counted.pop(f"{name} alone", None)  # those that were seen to be on the way
         if alone:
             source.counted[f"{name} alone"] = alone
             source.notes[f"{name} alone"] = f"the nearest of {first} is {nearest_ns / 1e6:+.1f} ms off"
@@ -270,7 +270,7 @@ def _alone(first_ns: Sequence[int], other_ns: Sequence[int]) -> tuple[int, int]:
     at = np.clip(np.searchsorted(first, other), 1, len(first) - 1)
     after, before = first[at] - other, first[at - 1] - other
     off = np.where(np.abs(after) < np.abs(before), after, before)
-    off = off[np.abs(off) > _NEAR * np.median(np.diff(first))]
+    off = off[np.abs(off) > NEAR * np.median(np.diff(first))]
     return len(off), int(off[-1]) if len(off) else 0
 
 

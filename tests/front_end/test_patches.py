@@ -65,10 +65,10 @@ def test_a_moved_picture_is_found(
     at = places()
     if kernels == "numpy":
         without_kernels(monkeypatch)
-    templates = patches.Templates.of(patches.cut(soften(picture), at, SIDE, rows=basis == "row"), basis)
+    cut = patches.cut(soften(picture), at, SIDE, rows=basis == "row")
     start = np.tile(np.eye(2), (COUNT, 1, 1))
     bend = np.full((COUNT, 2), 1e-4) if bent else None
-    found = patches.align(templates, image, at + np.array([0.9, 0.0]), start, bend)
+    found = patches.align(cut, image, at + np.array([0.9, 0.0]), start, bend)
     good = found.correlation > 0.9
     assert good.mean() > 0.9
     off = (found.uv - at - moved)[good]
@@ -77,20 +77,48 @@ def test_a_moved_picture_is_found(
 
 
 @pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
-def test_both_find_the_same(picture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    there: Any = cv2.warpAffine(picture, np.array([[1.01, 0.0, 0.3], [0.0, 0.99, -0.4]]), (300, 200))
-    cut = patches.cut(soften(picture), places(), SIDE)
-    templates, start = patches.Templates.of(cut, "place"), np.tile(np.eye(2), (COUNT, 1, 1))
-    first = places() * [1.01, 0.99] + [0.8, 0.1]
-    ours = patches.align(templates, soften(there), first, start)
+@pytest.mark.parametrize("prior", [None, np.array([50.0, 20.0]), np.array([0.0, 800.0, 800.0])])
+def test_both_find_the_same(picture: Any, prior: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also along rows, with a slant, and where a part of what is looked at lies outside the image."""
+    along_rows = prior is not None and len(prior) == 3
+    down = np.array([0.01, -0.4]) * (not along_rows)
+    matrix = np.array([[1.01, 0.0, 0.3], [0.0, 1.0 - down[0], down[1]]])
+    there: Any = cv2.warpAffine(picture, matrix, (300, 200))
+    at = np.concatenate([places(), [[4.0, 100.0], [295.0, 90.0], [150.0, 6.0]]])
+    cut = patches.cut(soften(picture), at, SIDE, along_rows)
+    start = np.tile(np.eye(2), (len(at), 1, 1))
+    first = at * [1.01, 1.0 - down[0]] + [0.8, 0.1 * (not along_rows)]
+    ours = patches.align(cut, soften(there), first, start, prior=prior)
     without_kernels(monkeypatch)
-    theirs = patches.align(templates, soften(there), first, start)
+    theirs = patches.align(cut, soften(there), first, start, prior=prior)
     good = theirs.correlation > 0.9
     assert good.mean() > 0.9
     assert np.abs(ours.uv - theirs.uv)[good].max() < 0.03
     assert np.median(np.abs(ours.uv - theirs.uv)[good]) < 0.5 * _OF_OPENCV_PX
+    assert np.abs(ours.slant - theirs.slant)[good].max() < 0.01
     assert np.abs(ours.correlation - theirs.correlation)[good].max() < 0.01
-    assert np.allclose(ours.covariance[good], theirs.covariance[good], rtol=0.3)
+    assert np.allclose(ours.covariance[good], theirs.covariance[good], rtol=0.3, atol=2e-5)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="needs the C++ kernels")
+@pytest.mark.parametrize("along_rows", [False, True])
+def test_both_make_the_same_of_a_patch(picture: Any, along_rows: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One look, on whole pixels, where both see the same to rounding."""
+    soft, at, start = soften(picture), np.round(places()), np.tile(np.eye(2), (COUNT, 1, 1))
+    cut, first = patches.cut(soft, at, SIDE, along_rows), at + np.array([1.0, 0.0])
+    ours = patches.align(cut, soft, first, start, iterations=1)
+    without_kernels(monkeypatch)
+    theirs = patches.align(cut, soft, first, start, iterations=1)
+    for name in ("uv", "slant", "correlation"):
+        assert np.allclose(getattr(ours, name), getattr(theirs, name), rtol=0.0, atol=1e-3), name
+    assert np.allclose(ours.covariance, theirs.covariance, rtol=1e-2, atol=1e-7)
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_symmetric_matrices_are_inverted_by_hand(size: int) -> None:
+    root = np.random.default_rng(6).normal(size=(20, size, 5))
+    matrices = root @ root.transpose(0, 2, 1)
+    assert np.allclose(patches.inverses(matrices), np.linalg.inv(matrices), rtol=1e-6)
 
 
 @pytest.mark.parametrize("kernels", ["native", "numpy"])
@@ -102,9 +130,10 @@ def test_what_has_no_texture_or_lies_nowhere_is_not_found(
     if kernels == "numpy":
         without_kernels(monkeypatch)
     at = np.array([[50.0, 50.0], [np.nan, 20.0], [1e9, -1e9]])
-    plain = patches.Templates.of(np.full((3, SIDE + 2, SIDE + 2), 7.0, np.float32), "place")
+    plain = np.full((3, SIDE + 2, SIDE + 2), 7.0, np.float32)
     found = patches.align(plain, soften(picture), at, np.tile(np.eye(2), (3, 1, 1)))
     assert not (found.correlation > 0.5).any()
-    none = patches.align(patches.Templates.of(np.empty((0, SIDE + 2, SIDE + 2), np.float32), "place"),
-                         soften(picture), np.empty((0, 2)), np.empty((0, 2, 2)))  # fmt: skip
+    none = patches.align(
+        np.empty((0, SIDE + 2, SIDE + 2), np.float32), soften(picture), np.empty((0, 2)), np.empty((0, 2, 2))
+    )
     assert none.uv.shape == (0, 2)

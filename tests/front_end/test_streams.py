@@ -45,6 +45,20 @@ def test_a_dropped_image_costs_its_partner_alone() -> None:
     assert abs(streams.apart_ns["right"]) == 100 * MS
 
 
+def test_images_are_counted_where_the_first_camera_misses_some() -> None:
+    streams = pair()
+    both = [(name, float(ms)) for ms in range(0, 1000, 100) for name in ("left", "right")]
+    frames = fed(streams, *(one for one in both if one not in (("left", 400.0), ("left", 700.0))))
+    assert [f.stamp_ns // MS for f in frames] == [0, 100, 200, 300, 500, 600, 800, 900]
+    assert streams.counted == {"right alone": 2}
+
+
+def test_a_second_camera_may_be_the_quicker_one() -> None:
+    streams = pair()
+    fed(streams, *((name, ms) for ms in range(0, 600, 50) for name in (["right"] if ms % 100 else ["left", "right"])))
+    assert not streams.counted
+
+
 def test_a_partner_that_never_comes_is_counted_and_nothing_grows() -> None:
     streams = pair(depth=5)
     assert fed(streams, *(("left", 100.0 * i) for i in range(50))) == []

@@ -25,26 +25,26 @@ Floats cut(const Floats& image, const Doubles& uv, const Floats& offsets) {
   return values;
 }
 
-// templates: weighted, std, jacobian, inverse, grid and window; bend may be empty; limits as AlignLimits.
-py::tuple align(const Floats& image, const std::tuple<Floats, Floats, Floats, Doubles, Floats, Floats>& templates,
-                const Doubles& uv, const Doubles& affine, const Doubles& bend,
-                const std::tuple<int, double, double>& limits) {
-  const auto& [weighted, std, jacobian, inverse, grid, window] = templates;
-  const auto& [iterations, step_px, farthest_px] = limits;
-  const py::ssize_t n = uv.shape(0);
-  Doubles place({n, py::ssize_t{2}}), shape({n, py::ssize_t{2}, py::ssize_t{2}}), correlation({n}), left({n});
+// patches: of patches.cut, prior, grid and window; bend may be empty; limits as AlignLimits.
+py::tuple align(const Floats& image, const std::tuple<Floats, Doubles, Floats, Floats>& patches, const Doubles& uv,
+                const Doubles& affine, const Doubles& bend,
+                const std::tuple<int, double, double, float, double>& limits) {
+  const auto& [values, prior, grid, window] = patches;
+  const auto& [iterations, step_px, farthest_px, least_variance, least_hessian] = limits;
+  const py::ssize_t n = uv.shape(0), k = prior.size(), two = 2;
+  Doubles place({n, two}), shape({n, two, two}), correlation({n}), left({n}), inverse({n, k, k});
   std::copy_n(uv.data(), 2 * n, place.mutable_data());
   std::copy_n(affine.data(), 4 * n, shape.mutable_data());
   std::fill_n(correlation.mutable_data(), n, 0.0);
   std::fill_n(left.mutable_data(), n, std::numeric_limits<double>::infinity());
-  const TemplatesView view{
-      n,           jacobian.shape(1), window.size(), weighted.data(), std.data(), jacobian.data(), inverse.data(),
-      grid.data(), window.data()};
-  const PlacesSpan to{place.mutable_data(), shape.mutable_data(), correlation.mutable_data(), left.mutable_data()};
+  const PatchesView view{n,           values.shape(1), values.shape(2), k,           window.size(), values.data(),
+                         grid.data(), window.data(),   prior.data()};
+  const PlacesSpan to{place.mutable_data(), shape.mutable_data(), correlation.mutable_data(), left.mutable_data(),
+                      inverse.mutable_data()};
+  const AlignLimits limit{iterations, step_px, farthest_px, least_variance, least_hessian};
   const double* bends = bend.size() ? bend.data() : nullptr;
-  without_gil(
-      [&] { active_target().align_patches(view_of(image), view, {iterations, step_px, farthest_px}, bends, to); });
-  return py::make_tuple(place, shape, correlation, left);
+  without_gil([&] { active_target().align_patches(view_of(image), view, limit, bends, to); });
+  return py::make_tuple(place, shape, correlation, left, inverse);
 }
 
 // seen: points, along, uv, sigma and (focal, u, v) of the camera.

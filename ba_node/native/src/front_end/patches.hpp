@@ -27,6 +27,9 @@ class Sampler {
 
   float* x() { return x_.data(); }
   float* y() { return y_.data(); }
+  // What is written by the next sample, for those who sample in another way.
+  float* pairs() { return above_.data(); }
+  std::int32_t* columns() { return column_.data(); }
 
   void sample(float* out) {
     if (lies_inside()) {
@@ -148,32 +151,43 @@ inline void cut_patches(const ImageView& image, const double* uv, std::int64_t n
   }
 }
 
-// Aligns one template after another; bend (n, 2) may be null.
+// Aligns one patch after another; bend (n, 2) may be null. Of all that is made of a patch nothing leaves the cache.
 class Aligner {
  public:
-  Aligner(const ImageView& image, const TemplatesView& templates, const AlignLimits& limits)
-      : sampler_(image, templates.pixels),
-        templates_(templates),
+  Aligner(const ImageView& image, const PatchesView& patches, const AlignLimits& limits)
+      : sampler_(image, patches.pixels),
+        image_(image),
+        patches_(patches),
         limits_(limits),
-        seen_(static_cast<std::size_t>(templates.pixels)),
-        grid_(2 * static_cast<std::size_t>(templates.pixels)) {
-    for (std::int64_t j = 0; j < templates.pixels; ++j) {
-      grid_[j] = templates.grid[2 * j];
-      grid_[templates.pixels + j] = templates.grid[2 * j + 1];
+        size_((patches.pixels + 7) / 8 * 8),
+        seen_(static_cast<std::size_t>(size_)),
+        values_(seen_),
+        weighted_(seen_),
+        window_(seen_),
+        grid_(2 * static_cast<std::size_t>(size_)),
+        by_(3 * static_cast<std::size_t>(size_)),
+        jacobian_(by_),
+        strip_(static_cast<std::size_t>(patches.height * kStrip)) {
+    std::copy_n(patches.window, patches.pixels, window_.data());
+    for (std::int64_t j = 0; j < patches.pixels; ++j) {
+      grid_[j] = patches.grid[2 * j];
+      grid_[size_ + j] = patches.grid[2 * j + 1];
     }
   }
 
   void align(std::int64_t i, const double* bend, const PlacesSpan& to) {
-    const std::int64_t k = templates_.movements;
-    double *place = to.place + 2 * i, *affine = to.affine + 4 * i;
-    const double std = templates_.std[i];
+    const std::int64_t k = patches_.movements;
+    double *place = to.place + 2 * i, *affine = to.affine + 4 * i, *inverse = to.inverse + i * k * k;
+    prepare(i, inverse);
+    strip_begin_ = strip_end_ = 0;
+    const double std = std_;
     for (int step = 0; step < limits_.iterations; ++step) {
-      const Look seen = look(i, place, affine, bend == nullptr ? nullptr : bend + 2 * i);
-      const double spread = seen.spread, agree = seen.alike[0] / spread / std::max(templates_.std[i], 1e-6F);
+      const Look seen = look(place, affine, bend == nullptr ? nullptr : bend + 2 * i);
+      const double spread = seen.spread, agree = seen.alike[0] / spread / std::max(std_, 1e-6F);
       std::array<double, 3> right{}, move{};
       for (std::int64_t r = 0; r < k; ++r) right[r] = seen.alike[1 + r] * (std / spread);
       for (std::int64_t r = 0; r < k; ++r)
-        for (std::int64_t c = 0; c < k; ++c) move[r] += templates_.inverse[(i * k + r) * k + c] * right[c];
+        for (std::int64_t c = 0; c < k; ++c) move[r] += inverse[r * k + c] * right[c];
       to.correlation[i] = agree;
       to.left[i] = 2.0 * std * std * std::max(1.0 - agree, 0.0);
       const double length = k == 2 ? std::hypot(move[0], move[1]) : std::abs(move[0]);
@@ -200,56 +214,156 @@ class Aligner {
     std::array<float, 4> alike;
   };
 
-  Look look(std::int64_t i, const double* place, const double* affine, const double* bend) {
-    const std::int64_t n = templates_.pixels, k = templates_.movements;
+  // Columns of a strip, and those on either side of what is looked at first.
+  static constexpr std::int64_t kStrip = 64, kBeside = 4;
+
+  // Makes a template of a patch, as patches._Templates.of: weighted values, their standard deviation, Jacobian; and the
+  // inverse of its Hessian.
+  void prepare(std::int64_t i, double* inverse) {
+    const std::int64_t n = patches_.pixels, k = patches_.movements, wide = patches_.width;
+    const std::int64_t step = k == 3 ? 1 : 2;  // rows that are not compared are there for differences across rows
+    const float* patch = patches_.at + i * patches_.height * wide;
+    float *values = values_.data(), *weighted = weighted_.data(), *by = by_.data();
+    const float* w = window_.data();
+    std::int64_t j = 0;
+    for (std::int64_t row = step - 1; j < n; row += step)
+      for (std::int64_t column = 1; column + 1 < wide; column += 2, ++j) {
+        const float* at = patch + row * wide + column;
+        values[j] = at[0];
+        by[j] = 0.5F * (at[1] - at[-1]);
+        if (k == 2) by[size_ + j] = 0.5F * (at[wide] - at[-wide]);
+      }
+    for (std::int64_t r = 1; r < k && k == 3; ++r)
+      for (j = 0; j < n; ++j) by[r * size_ + j] = by[j] * grid_[(r - 1) * size_ + j];
+    const float mean = product(values, w);
+    for (j = 0; j < n; ++j) {
+      values[j] -= mean;
+      weighted[j] = values[j] * w[j];
+    }
+    const float variance = product(values, weighted);
+    std_ = std::sqrt(variance);
+    std::array<double, 9> H{};
+    for (std::int64_t r = 0; r < k; ++r) {
+      float *movement = by + r * size_, *moved = jacobian_.data() + r * size_;
+      const float middle = product(movement, w);
+      // Values have a mean of 0: what they share with a movement does not depend on its mean.
+      const float along = product(movement, weighted) / std::max(variance, limits_.least_variance);
+      for (j = 0; j < n; ++j) {
+        movement[j] -= middle + along * values[j];
+        moved[j] = movement[j] * w[j];
+      }
+      for (std::int64_t c = 0; c <= r; ++c) H[3 * r + c] = H[3 * c + r] = product(moved, by + c * size_);
+      H[4 * r] += patches_.prior[r] + limits_.least_hessian;
+    }
+    if (k == 2) {
+      const double scale = 1.0 / (H[0] * H[4] - H[1] * H[1]);
+      inverse[0] = H[4] * scale;
+      inverse[1] = inverse[2] = -H[1] * scale;
+      inverse[3] = H[0] * scale;
+      return;
+    }
+    for (int r = 0; r < 3; ++r)
+      for (int c = 0; c < 3; ++c) {
+        const int a = (r + 1) % 3, b = (r + 2) % 3, d = (c + 1) % 3, e = (c + 2) % 3;
+        inverse[3 * r + c] = H[3 * a + d] * H[3 * b + e] - H[3 * a + e] * H[3 * b + d];
+      }
+    const double determinant = H[0] * inverse[0] + H[1] * inverse[1] + H[2] * inverse[2];
+    for (int r = 0; r < 9; ++r) inverse[r] /= determinant;
+  }
+
+  Look look(const double* place, const double* affine, const double* bend) {
+    const std::int64_t n = patches_.pixels, k = patches_.movements;
     const auto u = static_cast<float>(place[0]), v = static_cast<float>(place[1]);
     const auto xx = static_cast<float>(affine[0]), xy = static_cast<float>(affine[1]);
     const auto yx = static_cast<float>(affine[2]), yy = static_cast<float>(affine[3]);
     const float gx = bend == nullptr ? 0.0F : static_cast<float>(bend[0]);
     const float gy = bend == nullptr ? 0.0F : static_cast<float>(bend[1]);
-    const float *px = grid_.data(), *py = px + n;
+    const float *px = grid_.data(), *py = px + size_;
     float *s = seen_.data(), *to_x = sampler_.x(), *to_y = sampler_.y();
-    for (std::int64_t j = 0; j < n; ++j) {
-      const float depth = 1.0F / (1.0F + gx * px[j] + gy * py[j]);
-      to_x[j] = u + (xx * px[j] + xy * py[j]) * depth;
-      to_y[j] = v + (yx * px[j] + yy * py[j]) * depth;
+    if (k == 3 && bend == nullptr && yx == 0.0F && yy == 1.0F && look_along(u, v, xx, xy)) {
+      // It has been looked at.
+    } else {
+      for (std::int64_t j = 0; j < n; ++j) {
+        const float depth = 1.0F / (1.0F + gx * px[j] + gy * py[j]);
+        to_x[j] = u + (xx * px[j] + xy * py[j]) * depth;
+        to_y[j] = v + (yx * px[j] + yy * py[j]) * depth;
+      }
+      sampler_.sample(s);
     }
-    sampler_.sample(s);
-    const float mean = product(templates_.window);
+    const float mean = product(s, window_.data());
     for (std::int64_t j = 0; j < n; ++j) s[j] -= mean;
-    Look result{0.0, {product(templates_.weighted + i * n)}};
-    for (std::int64_t r = 0; r < k; ++r) result.alike[1 + r] = product(templates_.jacobian + (i * k + r) * n);
+    Look result{0.0, {product(s, weighted_.data())}};
+    for (std::int64_t r = 0; r < k; ++r) result.alike[1 + r] = product(s, jacobian_.data() + r * size_);
     for (std::int64_t j = 0; j < n; ++j) s[j] *= s[j];
-    result.spread = std::sqrt(std::max(product(templates_.window), 1e-6F));
+    result.spread = std::sqrt(std::max(product(s, window_.data()), 1e-6F));
     return result;
   }
 
-  // In eight sums, so that none waits for another.
-  float product(const float* a) const {
+  // What moves along rows alone is looked at in these rows, which are taken from between those of the image once.
+  // Returns false where they do not lie inside it.
+  bool look_along(float u, float v, float xx, float xy) {
+    const std::int64_t n = patches_.pixels, rows = patches_.height, columns = n / rows;
+    const float *px = grid_.data(), *py = px + size_;
+    const float half = std::abs(px[0]), reach = (std::abs(xx) + std::abs(xy)) * half;
+    if (!(u - reach >= 0.0F) || !(u + reach < static_cast<float>(image_.width - 1)) || !(v - half >= 0.0F) ||
+        !(v + half < static_cast<float>(image_.height - 1)) || !(reach < static_cast<float>(kStrip / 2 - kBeside - 2)))
+      return false;
+    const auto begin = static_cast<std::int64_t>(u - reach), end = static_cast<std::int64_t>(u + reach) + 2;
+    if (begin < strip_begin_ || end > strip_end_) {
+      strip_begin_ = std::max<std::int64_t>(begin - kBeside, 0);
+      strip_end_ = std::min(end + kBeside, image_.width);
+      for (std::int64_t r = 0; r < rows; ++r) {
+        const float y = v + py[r * columns];
+        const auto row = static_cast<std::int64_t>(y);
+        const float down = y - static_cast<float>(row);
+        const float* above = image_.at + row * image_.width + strip_begin_;
+        const float* below = above + image_.width;
+        float* to = strip_.data() + r * kStrip;
+        for (std::int64_t c = 0; c < strip_end_ - strip_begin_; ++c) to[c] = above[c] + down * (below[c] - above[c]);
+      }
+    }
+    float *right = sampler_.x(), *pairs = sampler_.pairs(), *s = seen_.data();
+    std::int32_t* column = sampler_.columns();
+    for (std::int64_t j = 0; j < n; ++j) {
+      const float x = u + (xx * px[j] + xy * py[j]);
+      column[j] = static_cast<std::int32_t>(x);
+      right[j] = x - static_cast<float>(column[j]);
+    }
+    const float* strip = strip_.data() - strip_begin_;
+    for (std::int64_t r = 0, j = 0; r < rows; ++r, strip += kStrip)
+      for (std::int64_t c = 0; c < columns; ++c, ++j)
+        std::memcpy(pairs + 2 * j, strip + column[j], 2 * sizeof(float));
+    for (std::int64_t j = 0; j < n; ++j) s[j] = pairs[2 * j] + right[j] * (pairs[2 * j + 1] - pairs[2 * j]);
+    return true;
+  }
+
+  // Of size_ values, in eight sums, so that none waits for another.
+  float product(const float* a, const float* b) const {
     using Lanes = float __attribute__((vector_size(8 * sizeof(float))));
-    const float* s = seen_.data();
     Lanes sums{}, one, other;
-    std::int64_t j = 0;
-    for (; j + 8 <= templates_.pixels; j += 8) {
+    for (std::int64_t j = 0; j < size_; j += 8) {
       std::memcpy(&one, a + j, sizeof(one));
-      std::memcpy(&other, s + j, sizeof(other));
+      std::memcpy(&other, b + j, sizeof(other));
       sums += one * other;
     }
-    float rest = 0.0F;
-    for (; j < templates_.pixels; ++j) rest += a[j] * s[j];
-    return rest + ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
+    return ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]));
   }
 
   Sampler sampler_;
-  TemplatesView templates_;
+  ImageView image_;
+  PatchesView patches_;
   AlignLimits limits_;
-  std::vector<float> seen_, grid_;  // the grid as x, then y
+  std::int64_t size_;  // of the buffers of pixels, with zeros behind those of a patch
+  std::vector<float> seen_, values_, weighted_, window_, grid_, by_, jacobian_;  // the grid as x, then y
+  std::vector<float> strip_;
+  std::int64_t strip_begin_ = 0, strip_end_ = 0;  // columns of the image
+  float std_ = 0.0F;
 };
 
-inline void align_patches(const ImageView& image, const TemplatesView& templates, const AlignLimits& limits,
+inline void align_patches(const ImageView& image, const PatchesView& patches, const AlignLimits& limits,
                           const double* bend, const PlacesSpan& to) {
-  Aligner aligner(image, templates, limits);
-  for (std::int64_t i = 0; i < templates.n; ++i) aligner.align(i, bend, to);
+  Aligner aligner(image, patches, limits);
+  for (std::int64_t i = 0; i < patches.n; ++i) aligner.align(i, bend, to);
 }
 
 }  // namespace ba::BA_TARGET

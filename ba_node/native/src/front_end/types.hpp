@@ -14,22 +14,24 @@ struct ImageView {
   std::int64_t height, width;
 };
 
-// As patches.Templates, with the inverse of its Hessian; pixels are those that are compared, values in each of n.
-struct TemplatesView {
-  std::int64_t n, movements, pixels;
-  const float *weighted, *std, *jacobian;
-  const double* inverse;
-  const float *grid, *window;
+// Patches (n, height, width) as patches.cut gives them: whole ones for 2 movements, of rows for 3, with a prior of each
+// on the diagonal of the Hessian. pixels are those that are compared, at grid (pixels, 2) around the centre.
+struct PatchesView {
+  std::int64_t n, height, width, movements, pixels;
+  const float *at, *grid, *window;
+  const double* prior;
 };
 
-// Where templates are: (n, 2) px, (n, 2, 2), and how they look there.
+// Where patches are: (n, 2) px, (n, 2, 2), how they look there, and the inverse of the Hessian, (n, k, k).
 struct PlacesSpan {
-  double *place, *affine, *correlation, *left;
+  double *place, *affine, *correlation, *left, *inverse;
 };
 
 struct AlignLimits {
   int iterations;
   double step_px, farthest_px;
+  float least_variance;
+  double least_hessian;
 };
 
 // Points and where a camera sees them, as pose.Seen: (n, 3), (n, 3), (n, 2), (n,); the camera is (focal, u, v), px.

@@ -116,7 +116,7 @@ struct Target {
                     bool* measured, bool* agrees);
   void (*cut_patches)(const ImageView&, const double* uv, std::int64_t n, const float* offsets, std::int64_t m,
                       float* out);
-  void (*align_patches)(const ImageView&, const TemplatesView&, const AlignLimits&, const double* bend,
+  void (*align_patches)(const ImageView&, const PatchesView&, const AlignLimits&, const double* bend,
                         const PlacesSpan&);
   void (*pose_equations)(const SeenView&, const double* rotation, const double* translation, double cauchy,
                          const PoseEquationsSpan&);
