@@ -8,7 +8,7 @@ one window to the next, or in keyframes that were left out, shows in all observa
 
 from __future__ import annotations
 
-from ba_node.check.departure import DOUBTED, departed, deviates
+from ba_node.check.departure import departed, deviates
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.watch import Check, of_few_keyframes, of_the_newest
 from ba_node.config import Config
@@ -30,7 +30,7 @@ def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
     """Return what is wrong with a map when no more will come, None if nothing is."""
     wrong = of_the_newest(scene, deviates(scene, final=True))
     wrong = wrong or departed(scene, final=True) or explains_worse(scene, config) or of_few_keyframes(scene)
-    return wrong or departed(scene, final=True, limits=DOUBTED)
+    return wrong or departed(scene, final=True, doubted=True)
 
 
 def explains_worse(scene: Scene, config: Config) -> Check | None:

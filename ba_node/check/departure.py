@@ -20,6 +20,8 @@ What changes on the way, as when a lens is zoomed, shows in the newest steps alo
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ba_node.arrays import FloatArray
@@ -29,13 +31,14 @@ from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
 from ba_node.scene.scene import Scene
 
-# Factors beyond which lengths are said to differ, each if it is so many standard errors from 1: rigs and wheels are
-# known better, and odometry that shows a smaller factor so clearly is precise. Directions differ by as much aside.
+# Factors beyond which lengths are said to differ, each if it is so many standard errors from 1 (one pair is enough):
+# rigs and wheels are known better, and odometry that shows a smaller factor so clearly is precise. Directions differ by
+# as much aside.
 Limits = tuple[tuple[float, float], ...]
 _FACTORS: Limits = ((1.015, 4.5), (1.012, 8.0))
 # At the end, when it is asked but once, this many standard errors are a warning: 2 or 3 in 10 000 sound drives have as
 # much by chance, in lengths or along an axis, too many to give up what was refined.
-DOUBTED: Limits = ((1.012, 3.6),)
+_DOUBTED: Limits = ((1.012, 3.6),)
 # With as much the set-up may have changed: the newest keyframes are worth a look with all tests.
 _WORTH_A_LOOK: Limits = ((1.012, 2.4),)
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
@@ -55,13 +58,14 @@ _LEAST_M = 0.02
 _TELLING, _TRIMMED = 0.3, 0.1
 
 
-def departed(scene: Scene, *, final: bool = False, limits: Limits = _FACTORS) -> Check | None:
+def departed(scene: Scene, *, final: bool = False, doubted: bool = False) -> Check | None:
     """Return what is wrong if the refined steps of a young map are off the front-end's by one factor or to one side.
 
     ``final``: no more keyframes will come, so that it is asked at any number of them, and of directions too: another
-    test of the set-up would have told by now that two cameras do not fit each other. ``limits``: least factor and
-    standard errors of it, either pair of which is enough; with ``DOUBTED`` it is a warning alone.
+    test of the set-up would have told by now that two cameras do not fit each other. ``doubted``: less is enough, for a
+    warning alone.
     """
+    limits = _DOUBTED if doubted else _FACTORS
     count, least = len(scene.keyframes), _STEPS if final else _STEPS_BEFORE
     if (count % _EVERY and not final) or not least < count <= _YOUNG or scene.cameras is None:
         return None
@@ -73,10 +77,10 @@ def departed(scene: Scene, *, final: bool = False, limits: Limits = _FACTORS) ->
     finding = _by_a_factor(scene, refined, given, limits) if _has_scale(scene) else None
     if final:
         finding = finding or _aside(scene, refined, given, limits)
-    finding = finding or (_of_the_newest(scene, _FACTORS) if final and limits is _FACTORS else None)
+    finding = finding or (_of_the_newest(scene, limits) if final and not doubted else None)
     if finding is None:
         return None
-    found = Diagnosis([finding])
+    found = Diagnosis([dataclasses.replace(finding, harmful=not doubted)])
     return Check(scene, lambda: found, found)
 
 
@@ -84,16 +88,17 @@ def deviates(scene: Scene, *, final: bool = False) -> bool:
     """Return True if the newest refined steps are so far off the front-end's that the set-up is worth a look."""
     if len(scene.keyframes) % _EVERY and not final:
         return False
-    return _of_the_newest(scene, _WORTH_A_LOOK) is not None
+    return _of_the_newest(scene, _WORTH_A_LOOK, look=True) is not None
 
 
-def _of_the_newest(scene: Scene, limits: Limits) -> Finding | None:
+def _of_the_newest(scene: Scene, limits: Limits, *, look: bool = False) -> Finding | None:
+    """Return what is wrong with the newest steps; for a ``look`` lengths count even where images have no scale."""
     if scene.cameras is None or scene.constraints.absolute or scene.constraints.landmarks:
         return None
     refined, given = _steps(scene, NEWEST)
     if len(refined) <= _STEPS:
         return None
-    by_a_factor = limits is _WORTH_A_LOOK or _has_scale(scene)
+    by_a_factor = look or _has_scale(scene)
     return (_by_a_factor(scene, refined, given, limits) if by_a_factor else None) or _aside(
         scene, refined, given, limits
     )
@@ -117,7 +122,7 @@ def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: L
         change = "k in the camera_info, or body_from_camera, of the camera_rig"
     steps = f"scale of the front-end's steps: they are {1.0 / factor:.3g} times what {by}"
     changes = (change, "the position in the keyframes, expected metres")
-    return Finding((ours, steps), evidence, changes, harmful=limits is _FACTORS)
+    return Finding((ours, steps), evidence, changes)
 
 
 def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
@@ -140,7 +145,7 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits)
         "roi in camera_info in camera_rig, or subtract its offset from the principal point in k",
         "body_from_camera in camera_rig (or tf_static), or the pose in the keyframes if it is not that of the body",
     )
-    return Finding((region, place), evidence, changes, harmful=limits is _FACTORS)
+    return Finding((region, place), evidence, changes)
 
 
 def _differs(mean: float, error: float, count: int, limits: Limits, times: float = 1.0) -> bool:

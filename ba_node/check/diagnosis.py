@@ -30,6 +30,7 @@ class Finding:
     changes: tuple[str, ...]  # the field or parameter to change, for each cause
     harmful: bool = True  # solves would make poses worse
     usual: bool = False  # it is one of the mistakes that are made often, and explains the tracks; not only a misfit
+    since_ns: int | None = None  # stamp of the keyframe from which on it is so; None for all of them, or unknown
 
     @property
     def sentence(self) -> str:
@@ -61,6 +62,12 @@ class Diagnosis:
     def harmful(self) -> bool:
         """Return True if solves would make poses worse."""
         return any(finding.harmful for finding in self.findings)
+
+    @property
+    def since_ns(self) -> int | None:
+        """Return the stamp from which on solves would make poses worse; None for all, or if that is not known."""
+        since = [finding.since_ns for finding in self.findings if finding.harmful]
+        return min((one for one in since if one is not None), default=None) if None not in since else None
 
     @property
     def usual(self) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ba_node.check import ids, intrinsics, motion, mounting, placement, relations, units
+from ba_node.check import ids, intrinsics, motion, mounting, onset, placement, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
@@ -20,8 +20,8 @@ _BUILD_ON_THESE = ("intrinsics", "mounting", "lengths")
 _ALIKE = 1.1
 # Part of the loss as given that another size may leave where the poses alone do not tell.
 _CLEARLY = 0.9
-# What nothing can be told without.
-_PIXELS = "pixels"
+# What all others would but repeat.
+_ALONE = ("pixels", "onset")
 
 
 def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
@@ -39,11 +39,12 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         return pairs
 
     tests: dict[str, Callable[[], Diagnosis]] = {
-        _PIXELS: lambda: units.check_pixels(tracks),
+        "pixels": lambda: units.check_pixels(tracks),
         "image size": lambda: units.check_image_size(tracks),
         "stamps": lambda: units.check_stamps(tracks),
         "sigma": lambda: units.check_sigma(tracks),
         "ids": lambda: ids.check_ids(tracks),
+        "onset": lambda: onset.check_onset(tracks),
         "silent": lambda: placement.check_silent(tracks),
         "cameras": lambda: placement.check_cameras(tracks, related),
         "poses": lambda: _poses(tracks, related()),
@@ -62,11 +63,14 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         outcome.add(found)
         if not found.untold:
             outcome.told |= {name}
-        if name == _PIXELS and found.findings:
+        if name in _ALONE and found.findings:
             outcome.told |= tests.keys()
         if name in ("ids", "sigma") and found.findings:
             # Such tracks are of several points, or how precise they are is not known: little things are not told.
             outcome.told |= set(_BUILD_ON_THESE)
+    if outcome.harmful and "onset" in told:
+        # It may be so only since images changed.
+        outcome.findings = _run(tests["onset"], "onset").findings or outcome.findings
     if outcome.harmful:
         outcome.sound, outcome.untold = [], []
     return outcome

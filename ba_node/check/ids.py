@@ -64,7 +64,9 @@ def check_ids(tracks: Tracks) -> Diagnosis:
         evidence = f"{near:.0%} of the tracks agree from one keyframe to the next, next to none across that one"
         cause = f"track ids stand for other points from stamp {tracks.stamp_ns[since] * 1e-9:.3f} s on"
         change = "track_id in the feature_tracks: a tracker that begins anew counts on, or raises session_id"
-        return Diagnosis([Finding((cause,), evidence, (change,), usual=True)], rows=rows)
+        return Diagnosis(
+            [Finding((cause,), evidence, (change,), usual=True, since_ns=int(tracks.stamp_ns[since]))], rows=rows
+        )
     if again < _OTHER_POINTS * near or (far < _LOST * near and persist >= _PERSIST):
         evidence = (
             f"{near:.0%} of the tracks agree from one keyframe to the next, {far:.0%} over {_FAR},"

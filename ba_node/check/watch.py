@@ -16,6 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
@@ -29,6 +31,8 @@ _AGAIN = (15, 40, 90)
 # A session that ends with fewer is looked at once more with all of them.
 _FEW = 10
 _ONCE = frozenset({"pixels", "stamps"})
+# Looked for where there is doubt.
+_CHANGES = frozenset({"onset"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
 # The newest of them are looked at; and fewer by themselves, where what was right at first may have changed.
@@ -97,6 +101,14 @@ def _said(scene: Scene) -> frozenset[str]:
     return _ONCE | ({"depth"} if "depths" in scene.log.warnings else set())
 
 
+def _sound_until(scene: Scene, found: Diagnosis) -> int:
+    """Return how many keyframes were refined before what was found could reach them."""
+    if found.since_ns is None:
+        return 0
+    sound = int(np.count_nonzero(scene.keyframes.stamp_ns[scene.order] < found.since_ns)) - _BEFORE
+    return sound if sound >= _BEFORE else 0
+
+
 def _doubtful(scene: Scene) -> bool:
     return _fell_silent(scene) or not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES)
 
@@ -156,7 +168,7 @@ class SetUpWatch:
         if self._next < len(_AT) and count >= _AT[self._next]:
             again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
-            self._check(scene, self._told & _ONCE if again else self._told, _NEWEST)
+            self._check(scene, (self._told & _ONCE if again else self._told) | _CHANGES, _NEWEST)
         elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked][0]:
             newest = _SINCE[self._looked][1] or count - self._doubted
             self._looked += 1
@@ -201,7 +213,7 @@ class SetUpWatch:
                 self._next = next((i for i, at in enumerate(_AT) if i >= self._next and at in _AGAIN), len(_AT))
             return False
         self._reason = f"the set-up contradicts the tracks: {found.causes()}"
-        scene.forget_solutions()
+        scene.forget_solutions(_sound_until(scene, found))
         for kind in _CONSEQUENCES:
             scene.log.warnings.pop(kind, None)
         return True

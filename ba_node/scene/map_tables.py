@@ -179,15 +179,22 @@ class MapTables(Views):
             place, size = begin, 2 * size
         return -1
 
-    def forget_solutions(self) -> None:
-        """Put keyframes back to where the front-end has them; forget where points are and which views are outliers."""
-        table = self.keyframes
-        table.rotation[:], table.position[:] = table.input_rotation, table.input_position
-        table.refined[:] = False
-        self.moved()
-        self.landmarks.has_position[:] = False
+    def forget_solutions(self, since: int = 0) -> None:
+        """Put keyframes back to where the front-end has them; forget where points are and which views are outliers.
+
+        ``since``: only keyframes from this place in the order of time on, and points that these or later ones see.
+        """
+        table, rows = self.keyframes, self.order[since:]
+        table.rotation[rows], table.position[rows] = table.input_rotation[rows], table.input_position[rows]
+        table.refined[rows] = False
+        self.moved(rows)
+        seen = np.zeros(len(self.landmarks), bool)
+        seen[self.observations.landmark[np.isin(self.observations.keyframe, rows)]] = True
+        if not since:
+            seen[:] = True
+        self.landmarks.has_position[seen] = False
         self.landmarks.changed()
-        self.observations.outlier[:] = False
+        self.observations.outlier[seen[self.observations.landmark]] = False
 
     def corrections(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the transform from the front-end's fixed frame to the refined map, as it is at some keyframes."""

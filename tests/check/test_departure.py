@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from ba_node.check.departure import DOUBTED, departed
+from ba_node.check.departure import departed
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.scene.scene import Scene
@@ -97,11 +97,11 @@ def test_less_is_doubted_at_the_end_alone() -> None:
         scene = refined(data, 1.02, seed=seed)
         if departed(scene, final=True) is not None:
             continue
-        check = departed(scene, final=True, limits=DOUBTED)
+        check = departed(scene, final=True, doubted=True)
         if check is not None and check.found is not None:
             assert not check.found.harmful and "baseline: lengths are 1.0" in check.found.causes()
             said += 1
-        assert departed(refined(data, 1.0, seed=seed), final=True, limits=DOUBTED) is None, f"seed {seed}"
+        assert departed(refined(data, 1.0, seed=seed), final=True, doubted=True) is None, f"seed {seed}"
     assert said >= 3, f"{said} of 20 are doubted"
 
 
