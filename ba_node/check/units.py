@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
+from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
 from ba_node.check.relations import Relation, agreed, in_motion, rays
@@ -42,6 +42,8 @@ _NO_PIXEL = 3.0
 _FOCAL = 30.0
 # Share of the observations that may lie outside the image, by so much and more, px.
 _MOST_OUTSIDE, _ASIDE_PX = 0.05, 4.0
+# Keyframes before that have next to none outside, where all later ones but a few have; and those that are needed.
+_NEXT_TO_NONE, _LATER_OUTSIDE, _BEFORE, _LATER = 0.002, 0.02, 5, 3
 # Values of sigma_px that are not looked at; the factor by which others are wrong, and the least noise of tracks, px.
 _USUAL_SIGMA_PX = (0.05, 5.0)
 _SIGMA_FACTOR, _LEAST_NOISE_PX = 8.0, 0.01
@@ -71,13 +73,34 @@ def check_image_size(tracks: Tracks) -> Diagnosis:
         uv = tracks.uv[tracks.camera == camera]
         if not size.all() or not len(uv):
             continue
-        outside = float(np.mean(((uv < -_ASIDE_PX) | (uv > size - 1.0 + _ASIDE_PX)).any(axis=1)))
-        if outside > _MOST_OUTSIDE:
+        outside = ((uv < -_ASIDE_PX) | (uv > size - 1.0 + _ASIDE_PX)).any(axis=1)
+        since = _outside_since(tracks.keyframe[tracks.camera == camera], outside, len(tracks))
+        if since is not None:
+            cause = f"images of camera {camera} are others from stamp {tracks.stamp_ns[since] * 1e-9:.3f} s on"
+            cause += ": another focal length (zoomed), another size, or another region of interest"
+            evidence = f"none of its observations lie outside {size[0]} x {size[1]} px before, then many do"
+            change = "images as they were before, or another session_id with a camera_rig that is theirs"
+            at = int(tracks.stamp_ns[since])
+            outcome.findings.append(Finding((cause,), evidence, (change,), usual=True, since_ns=at))
+        elif (share := float(np.mean(outside))) > _MOST_OUTSIDE:
             cause = f"image size of camera {camera} is not that of the images that were tracked"
-            evidence = f"{outside:.0%} of its observations lie outside {size[0]} x {size[1]} px"
+            evidence = f"{share:.0%} of its observations lie outside {size[0]} x {size[1]} px"
             change = "width and height in the camera_info of camera_rig, and k if it is that of another size"
             outcome.findings.append(Finding((cause,), evidence, (change,), harmful=False, usual=True))
     return outcome
+
+
+def _outside_since(keyframe: IntArray, outside: BoolArray, count: int) -> int | None:
+    """Return the keyframe from which on observations lie outside the image while none did before; None if none is."""
+    seen, out = np.bincount(keyframe, minlength=count), np.bincount(keyframe, outside, count)
+    looked = np.flatnonzero(seen)
+    many = out[looked] > _LATER_OUTSIDE * seen[looked]
+    if not many.any():
+        return None
+    first = int(np.argmax(many))
+    before, later = looked[:first], many[first:]
+    clean = first >= _BEFORE and out[before].sum() <= _NEXT_TO_NONE * seen[before].sum()
+    return int(looked[first]) if clean and len(later) >= _LATER and later.mean() > 0.8 else None
 
 
 def check_sigma(tracks: Tracks) -> Diagnosis:

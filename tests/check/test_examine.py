@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ba_node.check import intrinsics
+from ba_node.check import intrinsics, units
 from ba_node.check.examine import examine
 from ba_node.check.ids import check_ids
 from ba_node.check.tracks import Tracks, tracks_of
@@ -259,6 +259,22 @@ def test_observations_outside_the_image_are_named() -> None:
     found = examine(tracks)
     assert not found.harmful and "image size of camera 0 is not that of the images" in found.summary()
     assert re.search(r"\d+% of its observations lie outside 480 x 640 px", found.summary())
+
+
+@pytest.mark.parametrize(("since", "zoom"), [(10, 1.2), (13, 1.2), (2, 1.2), (10, 1.0)])
+def test_observations_that_come_to_lie_outside_the_image_tell_since_when(since: int, zoom: float) -> None:
+    tracks = dataclasses.replace(seen(recording(mode="mono"), 16), image_size=np.array([[640, 480]]))
+    later, middle = tracks.keyframe >= since, np.array([320.0, 240.0])
+    found = units.check_image_size(
+        tracks.seen(np.where(later[:, None], middle + zoom * (tracks.uv - middle), tracks.uv))
+    )
+    if zoom == 1.0:
+        assert not found.findings
+    elif since < 5:
+        assert not found.harmful  # those before are too few to tell
+    else:
+        assert found.since_ns == tracks.stamp_ns[since], found.summary()
+        assert "images of camera 0 are others from stamp" in found.summary()
 
 
 @pytest.mark.slow
