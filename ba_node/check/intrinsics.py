@@ -41,7 +41,7 @@ _SQUARE = 1.05
 # Another model is better if its sum of residuals is lower by so many times its mean, and by this share: what lenses do
 # that no model says leaves less. A focal length alone that is off by less than a factor needs no share, and less of a
 # sum: both halves of the tracks have to find the same.
-_SURE, _SURE_OF_FOCAL, _SLIGHTLY = 16.0, 8.0, 1.1
+_SURE, _SURE_OF_FOCAL, _SLIGHTLY = 16.0, 8.0, 1.15
 _LOWER = 0.05
 # A lens is named rather than a focal length and a principal point that leave no less than this part of its sum.
 _RATHER = 0.9

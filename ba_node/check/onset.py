@@ -31,7 +31,7 @@ _KEYFRAMES, _FOLLOW, _SAME = 6, 2, 0.6
 # Those of which the standard errors are more than this part of it tell nothing.
 _KNOWN = 0.5
 # Standard errors that a change has to be worth; they are no less than those by which all keyframes scatter.
-_ERRORS = 5.0
+_ERRORS = 8.0
 # Changes that are not named: of the focal length by a share, of the principal point in focal lengths.
 _LEAST = np.array([0.03, 0.02, 0.02])
 _MIRRORED = -0.5
@@ -98,7 +98,7 @@ def check_onset(tracks: Tracks) -> Diagnosis:
                 for one, steps in others
                 if one is not None and found[k].measured_by(one)
             ]
-            if len(agree) > 1 and all(agree):
+            if all(agree) and (len(agree) > 1 or found[k].mirrored):
                 outcome.findings.append(_named(tracks, camera, k, found[k], usual))
                 break
     return outcome

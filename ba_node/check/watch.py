@@ -41,6 +41,9 @@ _NEWEST, NEWEST = 60, 20
 _SINCE = ((5, 0), (8, _NEWEST), (12, 0), (24, 0))
 # Steps deviate some keyframes after what has changed.
 _BEFORE = 10
+# A map that was sound for so many is kept up to there; the end of a shorter one would be worse than as it came, where
+# it is carried along by what the first few were worth.
+_SOUND = 40
 # A camera is silent that delivered for each of the first and none of so many of the newest keyframes; said after more.
 _SILENT, _SAID = 5, 10
 
@@ -106,7 +109,7 @@ def _sound_until(scene: Scene, found: Diagnosis) -> int:
     if found.since_ns is None:
         return 0
     sound = int(np.count_nonzero(scene.keyframes.stamp_ns[scene.order] < found.since_ns)) - _BEFORE
-    return sound if sound >= _BEFORE else 0
+    return sound if sound >= _SOUND else 0
 
 
 def _doubtful(scene: Scene) -> bool:

@@ -47,6 +47,10 @@ _MIN_SPANNING = 10
 _SPANNING_SHARE = 0.5
 # A point that so many keyframes agree on ties them together.
 _TIED = 3
+# Tracks strain at a keyframe where the mean square of their residuals is so many standard errors above that of others,
+# by so many at least. What a residual counts at most, and the least mean square that is compared with, sigmas.
+_STRAINED, _MIN_STRAINED, _BOUND, _LEAST_SQUARE = 3.0, 30, 4.0, 0.1
+_CHANGED = "as where images change on the way: zoomed, or another region of interest"
 # By how much bounds narrow where much of what is seen moves, or seems to; and how surely steps may be off to one side
 # there, see ``steps.bias``.
 _NARROW, _MAX_BIAS = 0.5, 24.0
@@ -261,7 +265,9 @@ class _Compared:
         if confirmed is not None:
             known |= agree(self._odd(odd), confirmed, self.config, self._keys(np.arange(len(odd))))
         spanned = np.zeros(len(odd), bool)
+        strained = [self._strained(int(k)) for k in np.flatnonzero(odd)]
         spanned[odd] = [self._borne_out(int(k)) for k in np.flatnonzero(odd)]
+        spanned[odd] &= ~np.array(strained)
         odd &= ~(known & spanned)
         if not odd.any():
             return Verdict(health=health)
@@ -274,7 +280,8 @@ class _Compared:
         if spanned[odd].all():
             return Verdict(f"{text}; it waits for more solves that agree", health, odd=self._odd(odd))
         rows = self._to_blame(odd & ~spanned)
-        return Verdict(f"{text}, and no tracks bear it out", health, rows, systematic=not rows)
+        why = f"the tracks that span it fit worse behind it, {_CHANGED}" if any(strained) else "no tracks bear it out"
+        return Verdict(f"{text}, and {why}", health, rows, systematic=not rows)
 
     def _keys(self, which: IntArray) -> list[tuple[int, int]]:
         rows = self.selection.keyframes
@@ -298,6 +305,25 @@ class _Compared:
             if agreeing < max(_MIN_SPANNING, _SPANNING_SHARE * np.count_nonzero(across[point[own]])):
                 return False
         return True
+
+    def _strained(self, k: int) -> bool:
+        """Return True if points that are seen across a step fit its end clearly worse than others fit theirs.
+
+        They do where images changed, not the pose: no pose explains a zoom of points at many depths. Others are the
+        views from before, and those of points that one side alone sees. With one camera that shows no lengths.
+        """
+        if self.selection.problem.has_scale:
+            return False
+        point, keyframe = self.selection.observations.point, self.selection.observations.keyframe
+        before = keyframe <= self.first[k]
+        across = _both(point[before], point[~before], self.selection.problem.n_points)[point]
+        square = np.minimum(self.norms, _BOUND) ** 2
+        own, others = across & (keyframe == self.second[k]), ~across | (keyframe < self.first[k])
+        count = np.count_nonzero(own)
+        if count < _MIN_STRAINED or not others.any():
+            return False
+        ratio = float(square[own].mean()) / max(float(square[others].mean()), _LEAST_SQUARE)
+        return ratio > 1.0 + _STRAINED * ratio / math.sqrt(count)
 
     def _to_blame(self, odd: BoolArray) -> tuple[int, ...]:
         """Return the keyframes (rows in the scene) without which no step is odd; none if they are too many."""

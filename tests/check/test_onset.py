@@ -79,20 +79,20 @@ def test_one_image_or_a_jump_of_the_poses_is_no_change() -> None:
 
 def test_the_map_before_it_stays() -> None:
     """From some keyframes before the change on the front-end's steps stand, carried along by the last correction."""
-    data = recording(mode="stereo", path="line")
+    data = recording(mode="stereo", path="line", keyframes=85, length_m=85.0)
     centre = data.rig.intrinsics[1, 2:4]
     mirrored = [
         (left, dataclasses.replace(right, uv=centre + (right.uv - centre) * [-1.0, 1.0]))
-        for left, right in data.tracks[25:]
+        for left, right in data.tracks[55:]
     ]
-    data = dataclasses.replace(data, tracks=(*data.tracks[:25], *mirrored))
+    data = dataclasses.replace(data, tracks=(*data.tracks[:55], *mirrored))
     backend = Backend(Config())
     play(backend, data)
     table, order = backend.scene.keyframes, backend.scene.order
     assert "mirrored" in backend.setup.reason(backend.scene)
     refined = table.refined[order]
     kept = int(np.count_nonzero(refined))
-    assert 10 <= kept < 25 and refined[:kept].all()
+    assert 40 <= kept < 55 and refined[:kept].all()
     later = order[kept - 1 :]
     pairs = later[:-1], later[1:]
     solved = geometry.steps_between(table.rotation, table.position, *pairs)
