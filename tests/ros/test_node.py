@@ -295,7 +295,8 @@ def test_parameters_over_services(start_node: StartNode, make_peer: MakePeer, sc
     senseless = SetParameters.Request(parameters=[ParameterMessage(name="solver.loss", value=ParameterValue(type=42))])
     peer.send(SetParameters, "ba_node/set_parameters", senseless)
     assert _set(peer, "solver.loss_scale_px", 2).successful, "an int is taken for a double"
-    for name, value in (("window.max_keyframes", 3), ("window.max_fixed_keyframes", 0)):
+    # Windows alone: without the whole map, which would be refined as it grows.
+    for name, value in (("window.max_keyframes", 3), ("window.max_fixed_keyframes", 0), ("factors.adjust_m", 0.0)):
         result = _set(peer, name, value)
         assert result.successful, result.reason
     _play(peer, scene)
@@ -309,6 +310,7 @@ def test_starts_with_a_file_and_a_namespace(
     file = tmp_path / "params.yaml"
     file.write_text(
         "/**:\n  ros__parameters:\n    window:\n      max_keyframes: 4\n    solver:\n      loss_scale_px: 2\n"
+        "    factors:\n      adjust_m: 0.0\n"
     )
     arguments = ["--ros-args", "-r", "__ns:=/car", "--params-file", str(file), "-p", "window.max_fixed_keyframes:=0"]
     node, peer, stranger = start_node(*arguments), make_peer(namespace="car"), make_peer()
