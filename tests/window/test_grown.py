@@ -55,7 +55,7 @@ def test_a_map_that_has_grown_is_near_the_optimum_of_everything(
     found, alone = (one.estimate().trajectory.position for one in (backend, windows))
     best = windows.optimize()
     assert best is not None
-    assert aligned_rms(found, best.trajectory.position) < 0.3 * aligned_rms(alone, best.trajectory.position)
+    assert aligned_rms(found, best.trajectory.position) < 0.6 * aligned_rms(alone, best.trajectory.position)
 
 
 def test_a_map_within_one_window_is_left_to_it() -> None:
