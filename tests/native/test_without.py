@@ -44,4 +44,4 @@ def test_a_recording_is_refined_as_well(tree: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["kernels"] == "numpy"
-    assert report["trajectory_error_m"]["refined"] == pytest.approx(0.0122, abs=2e-4)
+    assert report["trajectory_error_m"]["refined"] == pytest.approx(0.0082, abs=2e-4)

@@ -107,7 +107,7 @@ def test_results_are_one_table_and_page(broken: Path, tmp_path: Path, capsys: py
     assert [line.split()[1] for line in shown.out.splitlines()[1:4]] == ["ok", "failed", "ok"]
     with (out / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["error_after_m"]) for row in (rows[0], rows[2])] == pytest.approx([0.0122, 0.0053], rel=0.05)
+    assert [float(row["error_after_m"]) for row in (rows[0], rows[2])] == pytest.approx([0.0082, 0.0053], rel=0.05)
     page = (out / "index.html").read_text()
     assert "3 recordings: 2 sound, 0 to look at, 1 failed" in page
 

@@ -41,9 +41,9 @@ def drive(rig: str, odometry: str, share: float, seed: int) -> Recording:
     return spoiled("outliers_moving", rig, share, seed, **{**DRIVE, **drift})
 
 
-def played(recording: Recording) -> tuple[Backend, float, float]:
+def played(recording: Recording, **values: float) -> tuple[Backend, float, float]:
     """Return the back-end, and the errors of the path published: m after alignment, and deg as it stands."""
-    backend = Backend(Config())
+    backend = Backend(Config().with_values(values))
     for measurement in recording.measurements:
         for admitted in backend.admit(measurement):
             if backend.completes(admitted):
@@ -146,7 +146,8 @@ def test_mismatches_near_by_hold_nothing(path: str) -> None:
 def test_a_third_of_the_tracks_may_move(rig: str, odometry: str, seed: int) -> None:
     recording = drive(rig, odometry, 0.3, seed)
     backend, metres, degrees = played(recording)
-    _, clean, _ = played(without_outliers(recording, LIMIT_PX))
+    # By windows alone: the whole map of one camera is refined as it grows only where nothing moves.
+    _, clean, _ = played(without_outliers(recording, LIMIT_PX), **{"factors.adjust_m": 0.0})
     before = absolute_error(recording.odometry, recording.truth, "se3").translation.rmse
     before_deg = absolute_error(recording.odometry, recording.truth, "none").rotation.rmse
     assert metres <= 3.0 * clean, f"{clean:.4f} m without them, {metres:.4f} m with them"

@@ -26,6 +26,7 @@ def slid(old_keyframes: str, n: int = N, **changes: object) -> tuple[Backend, Sy
     }  # fmt: skip
     data = generate(SyntheticOptions(**{**fields, **changes}))  # type: ignore[arg-type]
     chosen = {"window.max_keyframes": n, "window.old_keyframes": old_keyframes, "guard.check_setup": False}
+    chosen["factors.adjust_m"] = 0.0  # windows alone: only with `fix` is a map refined as it grows
     backend = Backend(Config().with_values(chosen))
     backend.extras = Extras(covariance=True)
     last = [event for event in backend.replay(m for _, _, m in data.timeline()) if isinstance(event, Estimate)][-1]
