@@ -262,12 +262,13 @@ class _Compared:
         start = self.selection.problem.start
         began = steps.between(start.rotation, start.translation, self.first, self.second)
         known = steps.compare(self.found.solved, began, self.config.guard).sigmas <= limit
+        strained = np.zeros(len(odd), bool)
+        strained[odd & ~known] = [self._strained(int(k)) for k in np.flatnonzero(odd & ~known)]
         if confirmed is not None:
             known |= agree(self._odd(odd), confirmed, self.config, self._keys(np.arange(len(odd))))
         spanned = np.zeros(len(odd), bool)
-        strained = [self._strained(int(k)) for k in np.flatnonzero(odd)]
         spanned[odd] = [self._borne_out(int(k)) for k in np.flatnonzero(odd)]
-        spanned[odd] &= ~np.array(strained)
+        spanned &= ~strained
         odd &= ~(known & spanned)
         if not odd.any():
             return Verdict(health=health)
@@ -280,7 +281,7 @@ class _Compared:
         if spanned[odd].all():
             return Verdict(f"{text}; it waits for more solves that agree", health, odd=self._odd(odd))
         rows = self._to_blame(odd & ~spanned)
-        why = f"the tracks that span it fit worse behind it, {_CHANGED}" if any(strained) else "no tracks bear it out"
+        why = f"the tracks that span it fit worse behind it, {_CHANGED}" if strained.any() else "no tracks bear it out"
         return Verdict(f"{text}, and {why}", health, rows, systematic=not rows)
 
     def _keys(self, which: IntArray) -> list[tuple[int, int]]:
