@@ -98,6 +98,7 @@ def check_onset(tracks: Tracks) -> Diagnosis:
                 for one, steps in others
                 if one is not None and found[k].measured_by(one)
             ]
+            # Mirrored images are plain by themselves, where the next ones share too little with those before.
             if all(agree) and (len(agree) > 1 or found[k].mirrored):
                 outcome.findings.append(_named(tracks, camera, k, found[k], usual))
                 break
