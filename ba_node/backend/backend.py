@@ -117,7 +117,7 @@ class Backend:
         if isinstance(what, CameraRig) or self.scene.keyframes.solved.all():
             return False
         admitted = (what,) if isinstance(what, Admitted) else self._sessions.decide(self.scene, what).admitted
-        return any(self._is_new(one) for one in admitted)
+        return any(one.is_new(self.scene) for one in admitted)
 
     def add(self, measurement: Measurement) -> None:
         """Take in a measurement; what cannot be used is counted in ``rejected``."""
@@ -143,7 +143,7 @@ class Backend:
         if not isinstance(measurement, Keyframe):
             self.scene.add(measurement)
             return
-        is_new = self._is_new(admitted)
+        is_new = admitted.is_new(self.scene)
         self.scene.add(measurement)
         if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
             self.refused.append(measurement)
@@ -371,14 +371,6 @@ class Backend:
             if isinstance(refusal.measurement, Keyframe):
                 self.refused.append(refusal.measurement)
         return decision.admitted
-
-    def _is_new(self, admitted: Admitted) -> bool:
-        """Return True if a keyframe (or a session) begins with it."""
-        one = admitted.measurement
-        if not isinstance(one, Keyframe) or admitted.begins is not None:
-            return admitted.begins is not None
-        of_current = self.scene.session_id in (None, one.session_id)
-        return of_current and self.scene.find_keyframe(one.keyframe_id) is None
 
     def _begin(self, session_id: int, begin: Begin) -> None:
         before = self.scene

@@ -58,6 +58,13 @@ class Admitted:
     measurement: Measurement
     begins: Begin | None = None
 
+    def is_new(self, scene: Scene) -> bool:
+        """Return True if a keyframe (or a session) begins with it."""
+        one = self.measurement
+        if not isinstance(one, Keyframe) or self.begins is not None:
+            return self.begins is not None
+        return scene.session_id in (None, one.session_id) and scene.find_keyframe(one.keyframe_id) is None
+
 
 @dataclass(frozen=True)
 class Candidate:

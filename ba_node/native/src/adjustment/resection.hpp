@@ -42,9 +42,10 @@ inline bool pose_step(PoseSums& s, double damping, double (&x)[6]) {
   return std::all_of(x, x + 6, [](double one) { return std::isfinite(one); });
 }
 
+// pose: (3, 3) and (3,), body from world, of the keyframe that rows are of; points: (P, 3).
 template <Lens kLens>
-PoseSums pose_sums(const ProblemView& p, const StateView& s, const std::vector<std::int64_t>& rows,
-                   const CostModel& cost_model) {
+PoseSums pose_sums(const ProblemView& p, const double* pose, const double* points,
+                   const std::vector<std::int64_t>& rows, const CostModel& cost_model) {
   constexpr int kUsed = kLens == Lens::kPinhole ? 4 : kParams;
   V8 cost{}, matrix[21] = {}, vector[6] = {};
   const auto n = static_cast<std::int64_t>(rows.size());
@@ -52,8 +53,8 @@ PoseSums pose_sums(const ProblemView& p, const StateView& s, const std::vector<s
     V8 body[3] = {}, turn[9] = {}, x[3] = {}, seen[2] = {}, scale{};
     Cameras cameras{};
     for (int l = 0; l < kLanes; ++l) {
-      const std::int64_t o = rows[std::min(first + l, n - 1)], c = p.camera[o], k = p.keyframe[o];
-      const double *r = s.rotation + 9 * k, *t = s.translation + 3 * k, *X = s.points + 3 * p.point[o];
+      const std::int64_t o = rows[std::min(first + l, n - 1)], c = p.camera[o];
+      const double *r = pose, *t = pose + 9, *X = points + 3 * p.point[o];
       const double *q = p.camera_rotation + 9 * c, *move = p.camera_translation + 3 * c;
       double b[3];
       for (int i = 0; i < 3; ++i)
@@ -109,16 +110,14 @@ inline bool resect(const ProblemView& p, const StateView& start, std::int64_t ke
   for (std::int64_t o = 0; o < p.n_obs; ++o)
     if (p.keyframe[o] == keyframe && known[p.point[o]]) rows.push_back(o);
   if (static_cast<std::int64_t>(rows.size()) < limits.least) return false;
-  // The views are those of one keyframe, so its pose stands for all.
   double at[12], best[12];
   std::copy_n(start.rotation + 9 * keyframe, 9, at);
   std::copy_n(start.translation + 3 * keyframe, 3, at + 9);
-  const StateView state{at - 9 * keyframe, at + 9 - 3 * keyframe, start.points, nullptr};
   bool moved = false;
   double lowest = 0.0;
   for (std::int64_t i = 0; i <= limits.iterations; ++i) {
     PoseSums sums;
-    with_lens(p, [&](auto lens) { sums = pose_sums<decltype(lens)::value>(p, state, rows, cost); });
+    with_lens(p, [&](auto lens) { sums = pose_sums<decltype(lens)::value>(p, at, start.points, rows, cost); });
     if (i > 0 && !(sums.cost < lowest)) break;
     const bool arrived = i > 0 && lowest - sums.cost <= limits.least_gain * lowest;
     lowest = sums.cost;
