@@ -120,6 +120,14 @@ class ImageWatch:
         self._gaps_ns = self._gaps_ns[1], gap_ns
         return True
 
+    def pause(self, gap_s: float, stamp_ns: int, notes: list[str]) -> None:
+        """Say of an image whose pose was found that none came for ``gap_s`` before it; 0 where it came as usual."""
+        if gap_s:
+            found = "what was seen before is found again, and the session goes on"
+            self.say("pause", f"{gap_s:.1f} s without images before {stamp_ns} ns: {found}", notes)
+        else:
+            self.clear("pause")
+
     def _alone(self, images: Images, notes: list[str]) -> Images:
         """Return the images without a second one that shows nothing, or no other than before while the first does."""
         second = images.depth_m if len(images.grey) == 1 else images.grey[1]

@@ -234,16 +234,17 @@ class FrontEnd:
                 self._forget()
                 return self._first(images, frame, odometry)
             return told
+        gap = gap_s > self.options.max_gap_s
         why = "no odometry, which the session has its scale from"
         if odometry is not None or not session.tracker.given:
-            told = session.take(images, frame, odometry, gap=gap_s > self.options.max_gap_s, sure=sure)
+            told = session.take(images, frame, odometry, gap=gap, sure=sure)
             if told is not None:
                 self._watch.clear("lost")
+                self._watch.pause(gap_s if gap else 0.0, images.stamp_ns, self._notes)
                 return told
             why = "too little of what was seen before is found again"
         session.lost, session.unseen = session.lost + 1, session.unseen + 1
         self._watch.say("lost", f"lost at {images.stamp_ns} ns: {why}", self._notes)
-        gap = gap_s > self.options.max_gap_s
         if session.lost <= self.options.max_lost and not gap:
             return session.told(State.LOST, images)
         self._end(f"{gap_s:.1f} s without images" if gap else f"{session.lost} images without a pose")

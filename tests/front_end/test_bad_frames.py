@@ -89,6 +89,9 @@ def test_long_pause_begins_a_session_only_where_nothing_is_known(stereo: list[Im
     later = [world.without(one, stamp_ns=one.stamp_ns + 30_000_000_000) for one in stereo[4:6]]
     paused = follow(front_end, later)
     assert [(one.session_id, one.state) for one in paused] == [(1, State.TRACKING)] * 2 and paused[0].keyframe is None
+    (note,) = paused[1].notes
+    assert "30.2 s without images" in note and "the session goes on" in note and not paused[0].notes
+    assert not any(one.notes for one in follow(front_end, [world.without(stereo[6], stamp_ns=later[1].stamp_ns + 1)]))
     far = Transform(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.array([0.3, 0.0, 15.0]))
     elsewhere = [
         world.without(world.images(world.rig(), far, 0), stamp_ns=later[1].stamp_ns + 30_000_000_000 + i * 100_000_000)
