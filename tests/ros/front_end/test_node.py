@@ -20,7 +20,7 @@ from ba_node.estimate import Correction
 from ba_node.messages.cdr import tf_message
 from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
-from tests.ros.front_end.cameras import BEGIN_NS, FACTORY, STEP_NS, Camera, Kitti, begin, image_message, play
+from tests.ros.front_end.cameras import BEGIN_NS, STEP_NS, Camera, Kitti, begin, image_message, play
 
 pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
 pytestmark = pytest.mark.dds
