@@ -28,7 +28,8 @@ each kind of factor):
 
     sum psi^2 = sum v d (1 - 2 h d) + sum d^2 J Sigma J'
 
-  with Sigma of all components together; the sigma that a factor states counts as two rows more.
+  with Sigma of all components together, pixels at their mean variance; the sigma that a factor states counts as two
+  rows more.
 
 The keyframes' part needs S = B - E C^-1 E' of A alone (3.64-3.67): with C the points' blocks, and ``u = J_c - J_p C^-1
 E'`` of a row, the error of the keyframes is ``delta_c = -S^-1 sum u' psi``, and that of a point ``-C^-1 (sum J_p' psi +
@@ -136,7 +137,7 @@ def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, vari
     groups = np.unique(rows.group[rows.group > DEPTHS])
     if not len(groups):
         return
-    of_seen = roots.T @ _weighted_square(reduced.influence, variance) @ roots
+    of_seen = roots.T @ _weighted_square(reduced.influence, rows.evened(variance)) @ roots
     members = [np.flatnonzero(rows.group == group) for group in groups]
     slopes = [np.maximum(rows.slope[of], 0.0) for of in members]
     moved = [np.asarray(rows.keyframes[of] @ roots) for of in members]
@@ -258,11 +259,7 @@ class Uncertainty:
     def points(self, which: IntArray) -> FloatArray:
         """Return the covariances (n, 3, 3) of some points, m^2; NaN for those that nothing determines."""
         # A point has few rows of its own: each group's mean variance tells more than theirs.
-        variance = self.variance.copy()
-        for group in np.unique(self.reduced.rows.group):
-            of = self.reduced.rows.group == group
-            slope = np.maximum(self.reduced.rows.slope[of], 0.0)
-            variance[of] = slope * (variance[of].sum() / max(float(slope.sum()), 1e-300))
+        variance = self.reduced.rows.evened(self.variance)
         meat = self._meat(variance)
         starts = range(0, len(which), _CHUNK)
         parts = [self._of_points(which[begin : begin + _CHUNK], variance, meat) for begin in starts]

@@ -50,6 +50,15 @@ class Rows:
     def __len__(self) -> int:
         return len(self.residual)
 
+    def evened(self, variance: FloatArray) -> FloatArray:
+        """Return variances (m,) of scores as those of each group would be if its rows differed by their slope alone."""
+        out = variance.copy()
+        for group in np.unique(self.group):
+            of = self.group == group
+            slope = np.maximum(self.slope[of], 0.0)
+            out[of] = slope * (variance[of].sum() / max(float(slope.sum()), 1e-300))
+        return out
+
     def take(self, kept: BoolArray) -> Rows:
         """Return some of the rows."""
         return Rows(**{f.name: getattr(self, f.name)[kept] for f in dataclasses.fields(self)})

@@ -138,12 +138,13 @@ def _of_poses(estimate: Estimate, data: SyntheticData) -> FloatArray:
 
 
 def _of_points(estimate: Estimate, data: SyntheticData) -> float:
-    """Return the share of the points within their 95 % ellipsoid."""
+    """Return the share of the points within their 95 % ellipsoid; those a track was parted into are left out."""
     assert estimate.point_covariance is not None
     cloud = estimate.cloud
-    place = np.searchsorted(data.track_id, cloud.track_id)
-    error = cloud.position - data.landmarks[data.track_landmark[place]]
-    each = [_nees(e, covariance) for e, covariance in zip(error, estimate.point_covariance, strict=True)]
+    kept = np.isin(cloud.track_id, data.track_id)
+    place = np.searchsorted(data.track_id, cloud.track_id[kept])
+    error = cloud.position[kept] - data.landmarks[data.track_landmark[place]]
+    each = [_nees(e, covariance) for e, covariance in zip(error, estimate.point_covariance[kept], strict=True)]
     return float(np.mean(np.array(each)[np.isfinite(each)] <= scipy.stats.chi2.ppf(0.95, 3)))
 
 
