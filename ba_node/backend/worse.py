@@ -45,7 +45,7 @@ def explains_worse(scene: Scene, config: Config) -> Check | None:
     if before is None or after is None or not is_worse(before, after):
         return None
     held = scene.log.warnings.get("held", "")
-    evidence = f"rms with none above 20 px {before:.3g} -> {after:.3g} px{held and '; '}{held}"
+    evidence = f"rms with none above 10 sigmas {before:.3g} -> {after:.3g} px{held and '; '}{held}"
     cause = "the result explains the observations worse than what came in"
     change = "what ba check names, track ids that are not of one point, or solver.* and tracks.* that were set"
     found = Diagnosis([Finding((cause,), evidence, (change,))])

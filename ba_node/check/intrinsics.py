@@ -40,8 +40,8 @@ _OFF_CENTRE = 0.2
 _SQUARE = 1.05
 # Another model is better if its sum of residuals is lower by so many times its mean, and by this share: what lenses do
 # that no model says leaves less. A focal length alone that is off by less than a factor needs no share, and less of a
-# sum: both halves of the tracks have to find the same.
-_SURE, _SURE_OF_FOCAL, _SLIGHTLY = 16.0, 8.0, 1.15
+# sum, but more standard deviations: both halves of the tracks have to find the same.
+_SURE, _SURE_OF_FOCAL, _SLIGHTLY, _SIGMAS_SLIGHTLY = 16.0, 8.0, 1.15, 5.0
 _LOWER = 0.05
 # A lens is named rather than a focal length and a principal point that leave no less than this part of its sum.
 _RATHER = 0.9
@@ -186,7 +186,8 @@ def _named(tracks: Tracks, free: Freed) -> Model | None:
     if scaled:
         return _size(tracks, scaled[0], free.params)
     causes = []
-    if abs(np.log(factor)) > max(np.log1p(_LEAST_FACTOR), sigma[0]):
+    slightly = abs(np.log(factor)) < np.log(_SLIGHTLY)
+    if abs(np.log(factor)) > max(np.log1p(_LEAST_FACTOR), _SIGMAS_SLIGHTLY * free.sigma[0] if slightly else sigma[0]):
         causes.append(
             f"focal length off by a factor of about {1.0 / factor:.2f}:"
             f" the tracks fit {fits[FX]:.0f} px, not {given[FX]:.0f}"
@@ -196,7 +197,7 @@ def _named(tracks: Tracks, free: Freed) -> Model | None:
     if not causes:
         return None
     if len(causes) == 1 and "focal" in causes[0]:
-        return Model(causes[0], f"k of {_INFO}", free.params, focal_alone=abs(np.log(factor)) < np.log(_SLIGHTLY))
+        return Model(causes[0], f"k of {_INFO}", free.params, focal_alone=slightly)
     return Model(", and ".join(causes), _ROI, free.params)
 
 

@@ -13,10 +13,10 @@ from ba_node.backend import is_worse
 # What arrives twice changes nothing.
 HARMLESS = ("duplicate_keyframe", "duplicate_observation")
 # What must not rise by more than a share. Outliers decide the rms of all, and good points do not follow them;
-# one alone may be three times as far off, so that the rms with none above 20 px must not fall.
+# one alone may be three times as far off, so that the rms with none above 10 sigmas must not fall.
 _MEASURES = (
     ("rms_px", "rms of all", 0.5),
-    ("bounded_px", "rms with none above 20 px", 0.05),
+    ("bounded_px", "rms with none above 10 sigmas", 0.05),
     ("median_px", "median residual", 0.05),
 )
 # Half of all observations are nearer than this by their sigma_px, or the result explains little. By noise alone half

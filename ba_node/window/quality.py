@@ -24,8 +24,8 @@ STATES = ("input", "refined")
 BOUND_PX = 1000.0
 # A factor that is this many scales of a loss off that fades pulls at a twentieth of its weight, or less.
 _OUTVOTED, _FADING = 5.0, ("cauchy", "geman_mcclure")
-# And this, where two states are compared: outliers are as far off in the one as in the other.
-_COMPARED_PX = 20.0
+# And this by its sigma_px, where two states are compared: outliers are as far off in the one as in the other.
+_COMPARED_SIGMAS = 10.0
 # No noise is so many sigmas off.
 _WILD = 10.0
 
@@ -106,11 +106,13 @@ def summary(scene: Scene, config: Config, state: str) -> dict[str, float | int |
     Returns:
         ``rms_px`` of all observations, ``rms_px_without_outliers`` of those that solves use now, ``median_px`` of the
         lengths of all residuals, ``median_sigmas`` the same by their ``sigma_px``, ``bounded_px`` the rms of all with
-        none above 20 px, ``observations_behind``, which count in none of these. None where no point is placed.
+        none above 10 of these, ``observations_behind``, which count in none of these. None where no point is placed.
     """
     problem, _, error = _evaluated(scene, config, state, outliers=True)
     behind = int(np.count_nonzero(np.isnan(error[:, 0])))
-    sigmas = np.hypot(*error.T) / (1.0 if problem is None else problem.observations.sigma_px)
+    sigma_px = np.ones(len(error)) if problem is None else problem.observations.sigma_px
+    sigmas = np.hypot(*error.T) / sigma_px
+    bounded = (np.minimum(sigmas, _COMPARED_SIGMAS) * sigma_px)[~np.isnan(sigmas)]
     error, inliers = _in_front(error), errors_px(scene, config, state, outliers=False)
     length = np.hypot(error[:, 0], error[:, 1])
     return {
@@ -118,7 +120,7 @@ def summary(scene: Scene, config: Config, state: str) -> dict[str, float | int |
         "rms_px_without_outliers": _rms(inliers) if len(inliers) else None,
         "median_px": float(np.median(length)) if len(error) else None,
         "median_sigmas": float(np.nanmedian(sigmas)) if len(error) else None,
-        "bounded_px": float(np.sqrt(np.mean(np.minimum(length, _COMPARED_PX) ** 2) / 2.0)) if len(error) else None,
+        "bounded_px": float(np.sqrt(np.mean(bounded**2) / 2.0)) if len(error) else None,
         "observations_behind": behind,
     }
 

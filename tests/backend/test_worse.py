@@ -20,7 +20,7 @@ def test_few_keyframes_at_their_optimum_that_windows_make_worse_are_kept() -> No
     events = [one for one in backend.replay(iter(recording.measurements)) if isinstance(one, Estimate)]
     np.testing.assert_allclose(events[-1].trajectory.position, recording.odometry.position, atol=1e-9)
     (line,) = (line for line in backend.report.warnings if "worse than what came in" in line)
-    assert "rms with none above 20 px 0.995 -> 1.7 px" in line
+    assert "rms with none above 10 sigmas 0.995 -> 1.22 px" in line
 
 
 @pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
