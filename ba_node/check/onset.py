@@ -40,6 +40,8 @@ _TURNED_DEG = 5.0
 # Points meet if they do so to this many times the usual distance.
 _MEET = 3.0
 _ITERATIONS, _HALF = 10, 2.0
+# What to change.
+ADVICE = "images as they were before, or another session_id with a camera_rig that is theirs"
 
 
 @dataclass(frozen=True)
@@ -122,8 +124,7 @@ def named(tracks: Tracks, camera: int, k: int, change: Change, usual: FloatArray
         u, v = value[1:] * focal
         causes.append(f"region of interest or principal point of {where} is another, by ({u:.0f}, {v:.0f}) px")
     evidence = "the same points are seen so by several keyframes"
-    advice = "images as they were before, or another session_id with a camera_rig that is theirs"
-    return Finding((", and ".join(causes),), evidence, (advice,), usual=True, since_ns=int(tracks.stamp_ns[k]))
+    return Finding((", and ".join(causes),), evidence, (ADVICE,), usual=True, since_ns=int(tracks.stamp_ns[k]))
 
 
 def _change(tracks: Tracks, camera: int, before: int, k: int) -> Change | None:
