@@ -338,6 +338,13 @@ FAULTS: dict[str, Fault] = {
     "clock_stepped": Fault(
         "clock set forward, s", stamps.clock_stepped, amounts=(3600.0, -0.3), named=("clock",), codes=_LOOK
     ),
+    "mirrored_midway": Fault(
+        "second camera mirrored from midway on",
+        midway.from_midway(midway.mirrored),
+        rigs=_TWO,
+        named=("mirrored",),
+        codes=_LOOK,
+    ),
 }
 
 
