@@ -305,7 +305,7 @@ FAULTS: dict[str, Fault] = {
         "camera 1 sent as camera 0 from midway on",
         midway.other_index,
         rigs=_TWO,
-        named=("camera 1 come as",),
+        named=("camera 1 come as|under which camera_index",),
         codes=_LOOK,
     ),
     "falls_silent": Fault(
