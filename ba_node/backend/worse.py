@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from ba_node.check.departure import departed, deviates
 from ba_node.check.diagnosis import Diagnosis, Finding
-from ba_node.check.watch import Check, of_few_keyframes, of_the_newest
+from ba_node.check.watch import Check, of_all_images, of_few_keyframes, of_the_newest
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
 from ba_node.window import quality
@@ -29,7 +29,13 @@ def is_worse(before: float, after: float, share: float = _SHARE) -> bool:
 def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
     """Return what is wrong with a map when no more will come, None if nothing is."""
     wrong = of_the_newest(scene, deviates(scene, final=True))
-    wrong = wrong or departed(scene, final=True) or explains_worse(scene, config) or of_few_keyframes(scene)
+    wrong = (
+        wrong
+        or of_all_images(scene)
+        or departed(scene, final=True)
+        or explains_worse(scene, config)
+        or of_few_keyframes(scene)
+    )
     return wrong or departed(scene, final=True, doubted=True)
 
 

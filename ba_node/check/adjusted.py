@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import numpy as np
 
-from ba_node.arrays import FloatArray
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.check.relations import Relation, spread
 from ba_node.check.tracks import Tracks
 from ba_node.config import SolverOptions
@@ -35,9 +36,9 @@ _WIDE, _NARROW = (
 )
 _PATIENT = dataclasses.replace(_NARROW, max_iterations=60, function_tolerance=1e-5)
 # Cameras are adjusted along by numpy's kernels, which know no trust region.
-_ALONG = dataclasses.replace(_PATIENT, trust_region="none", schur="points", annealing="none", kernels="numpy")
+ALONG = dataclasses.replace(_PATIENT, trust_region="none", schur="points", annealing="none", kernels="numpy")
 # Of each unknown, relative, so that what the tracks do not tell at all has a large standard deviation.
-_DAMPING = 1e-9
+DAMPING = 1e-9
 # Where a step of focal length and principal point and its standard deviations come to less, in focal lengths, the
 # given ones stand, and no more steps are taken. A third of what is named, see intrinsics.py.
 _AT_ONCE = 0.007
@@ -67,15 +68,26 @@ def problem_of(tracks: Tracks, relations: list[Relation], part: int) -> Problem 
     keyframes = np.arange(first, len(tracks))[::stride][:_KEYFRAMES]
     if len(keyframes) < _MIN_KEYFRAMES:
         return None
+    return _problem(tracks, keyframes, (part, 2), _OBSERVATIONS)
+
+
+def problem_of_all(tracks: Tracks, keyframes: IntArray, most: int) -> Problem | None:
+    """Return the adjustment of some keyframes, of tracks with about so many observations, the first fixed."""
+    return _problem(tracks, keyframes, (0, 1), most)
+
+
+def _problem(tracks: Tracks, keyframes: IntArray, part: tuple[int, int], most: int) -> Problem | None:
+    """Return the adjustment of some keyframes; every so many of the tracks, from one on; None where they are few."""
+    first, (begin, stride) = keyframes[0], part
     place = np.full(len(tracks), -1)
     place[keyframes] = np.arange(len(keyframes))
     rows = np.flatnonzero((place[tracks.keyframe] >= 0) & np.isfinite(tracks.ray[:, 0]))
     image = np.unique(tracks.track[rows] * len(tracks) + tracks.keyframe[rows])
     views = np.bincount(image // len(tracks))
     # Tracks are numbered as they begin: so some of each keyframe.
-    longest = np.flatnonzero(views >= _MIN_VIEWS)[part::2]
+    longest = np.flatnonzero(views >= _MIN_VIEWS)[begin::stride]
     count = np.bincount(tracks.track[rows])[longest].sum()
-    longest = longest[spread(len(longest), int(len(longest) * _OBSERVATIONS / max(count, 1)))]
+    longest = longest[spread(len(longest), int(len(longest) * most / max(count, 1)))]
     if len(longest) < _MIN_POINTS:
         return None
     number = np.full(len(views), -1)
@@ -98,6 +110,14 @@ def problem_of(tracks: Tracks, relations: list[Relation], part: int) -> Problem 
     return Problem(start, fixed, tracks.cameras, observations)
 
 
+class Fit(Protocol):
+    """What an adjustment left."""
+
+    @property
+    def norms(self) -> FloatArray:
+        """Return the sizes of the residuals, sigmas."""
+
+
 class Measure:
     """How well an adjustment explains the observations that are no mismatches, as the given model has them.
 
@@ -114,7 +134,7 @@ class Measure:
     def __len__(self) -> int:
         return int(np.count_nonzero(self._rows))
 
-    def __call__(self, adjusted: Adjusted | Freed) -> float:
+    def __call__(self, adjusted: Fit) -> float:
         """Return the mean Cauchy loss of a residual; beyond a limit, and behind a camera, all count the same."""
         norms = np.minimum(adjusted.norms[self._rows], _CAP) / self.noise
         return float(np.log1p(norms * norms).mean())
@@ -133,7 +153,7 @@ class Adjusted:
         model = problem.cameras.model if lens is None else np.full_like(problem.cameras.model, lens)
         rig = dataclasses.replace(problem.cameras, params=params, model=model)
         self.problem = dataclasses.replace(problem, cameras=rig)
-        self.state = solver.solve(_placed(self.problem), _WIDE).state
+        self.state = solver.solve(placed(self.problem), _WIDE).state
         self._finish(_NARROW)
 
     def thorough(self, state: State, measure: Measure) -> float:
@@ -143,13 +163,13 @@ class Adjusted:
         for wide in (False, True):
             self.state = state
             if wide:
-                self.state = solver.solve(_placed(dataclasses.replace(self.problem, start=state)), _WIDE).state
+                self.state = solver.solve(placed(dataclasses.replace(self.problem, start=state)), _WIDE).state
             self._finish(_PATIENT)
             costs.append(measure(self))
         return min(costs)
 
     def _finish(self, options: SolverOptions) -> None:
-        self.state = solver.solve(_placed(dataclasses.replace(self.problem, start=self.state)), options).state
+        self.state = solver.solve(placed(dataclasses.replace(self.problem, start=self.state)), options).state
         self.norms = native_kernels.residual_norms(self.problem, self.state)
 
 
@@ -169,12 +189,12 @@ class Freed:
         unknowns = [bordered.Unknown(c, columns) for c in range(n) for columns in ((FX, FY), (CX,), (CY,))]
         basis = (focal[:, None, None] * np.eye(3)).reshape(3 * n, 3)
         shared = bordered.Shared(tuple(unknowns), basis)
-        problem = _placed(dataclasses.replace(start.problem, start=start.state))
+        problem = placed(dataclasses.replace(start.problem, start=start.state))
         self.params, self.state, self.norms = rig.params, start.state, start.norms
         with np.errstate(all="ignore"):
             step, self.sigma = self._told(problem, shared)
             if not (np.abs(step) + self.sigma).max() < _AT_ONCE:
-                _, end = bordered.solve_shared(problem, shared, _ALONG)
+                _, end = bordered.solve_shared(problem, shared, ALONG)
                 at = dataclasses.replace(problem, start=end, cameras=end.cameras)
                 self.params = end.cameras.params
                 self.state = State(end.rotation, end.translation, end.points, end.intrinsics)
@@ -183,17 +203,17 @@ class Freed:
 
     def _told(self, problem: Problem, shared: bordered.Shared) -> tuple[FloatArray, FloatArray]:
         """Return a Gauss-Newton step of what is free, and its standard deviations, (3,) focal lengths each."""
-        kernels = bordered.SharedKernels(problem, _ALONG, shared)
+        kernels = bordered.SharedKernels(problem, ALONG, shared)
         kernels.linearise(kernels.start)
-        system = kernels.damp("diag", _DAMPING)
+        system = kernels.damp("diag", DAMPING)
         assert isinstance(system, bordered.BorderedSystem)
-        values, vectors = np.linalg.eigh(system.of_border())
+        values, vectors = np.linalg.eigh(system.of_border()[0])
         sigma = np.median(self.norms) * np.sqrt((vectors**2) @ (1.0 / np.maximum(values, 1e-12)))
         step = system.solve_dense()
         return np.full(3, np.inf) if step is None else step[-3:], sigma
 
 
-def _placed(problem: Problem) -> Problem:
+def placed(problem: Problem) -> Problem:
     """Return a problem with its points where the rays of its poses meet; far away where they meet behind a camera."""
     rays, n = triangulation.rays_of(problem), problem.n_points
     if not len(rays.point):

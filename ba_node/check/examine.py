@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ba_node.check import ids, intrinsics, motion, mounting, onset, placement, relations, units
+from ba_node.check import change, ids, intrinsics, motion, mounting, onset, placement, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
@@ -52,6 +52,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
         "mounting": lambda: mounting.check_mounting(tracks, related()),
         "lengths": lambda: units.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
+        "change": lambda: change.check_change(tracks),
     }
     for name, test in tests.items():
         if name in told | outcome.told or (outcome.harmful and name not in _RELATIONS):
@@ -59,7 +60,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         if name in _BUILD_ON_THESE and not told | outcome.told >= _RELATIONS:
             outcome.untold.append(f"{name}: not before cameras and poses are known to fit")
             continue
-        found = _run(test, name)
+        found = run(test, name)
         outcome.add(found)
         if not found.untold:
             outcome.told |= {name}
@@ -70,13 +71,13 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
             outcome.told |= set(_BUILD_ON_THESE)
     if outcome.harmful and "onset" in told:
         # It may be so only since images changed.
-        outcome.findings = _run(tests["onset"], "onset").findings or outcome.findings
+        outcome.findings = run(tests["onset"], "onset").findings or outcome.findings
     if outcome.harmful:
         outcome.sound, outcome.untold = [], []
     return outcome
 
 
-def _run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
+def run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
     """Run a test; a fault in it must not keep anybody from solving, and is told as what it is."""
     try:
         return test()

@@ -31,15 +31,17 @@ _KEYFRAMES, _FOLLOW, _SAME = 6, 2, 0.6
 # Those of which the standard errors are more than this part of it tell nothing.
 _KNOWN = 0.5
 # Standard errors that a change has to be worth; they are no less than those by which all keyframes scatter.
-_ERRORS = 8.0
+ERRORS = 8.0
 # Changes that are not named: of the focal length by a share, of the principal point in focal lengths.
-_LEAST = np.array([0.03, 0.02, 0.02])
+LEAST = np.array([0.03, 0.02, 0.02])
 _MIRRORED = -0.5
 # The front-end's step to an image is not further off, degrees.
 _TURNED_DEG = 5.0
 # Points meet if they do so to this many times the usual distance.
 _MEET = 3.0
 _ITERATIONS, _HALF = 10, 2.0
+# What to change.
+ADVICE = "images as they were before, or another session_id with a camera_rig that is theirs"
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def check_onset(tracks: Tracks) -> Diagnosis:
         clear = [
             k
             for (k, one), score in zip(found.items(), scores / spread, strict=True)
-            if one.mirrored or ((np.abs(score) > _ERRORS) & (np.abs(one.value - usual) > _LEAST)).any()
+            if one.mirrored or ((np.abs(score) > ERRORS) & (np.abs(one.value - usual) > LEAST)).any()
         ]
         # Those that come after it are compared with points that are wrong.
         for k in clear:
@@ -100,16 +102,17 @@ def check_onset(tracks: Tracks) -> Diagnosis:
             ]
             # Mirrored images are plain by themselves, where the next ones share too little with those before.
             if all(agree) and (len(agree) > 1 or found[k].mirrored):
-                outcome.findings.append(_named(tracks, camera, k, found[k], usual))
+                outcome.findings.append(named(tracks, camera, k, found[k], usual))
                 break
     return outcome
 
 
-def _named(tracks: Tracks, camera: int, k: int, change: Change, usual: FloatArray) -> Finding:
+def named(tracks: Tracks, camera: int, k: int, change: Change, usual: FloatArray) -> Finding:
+    """Return in words what changes at a keyframe, beside what (3,) is usual between images."""
     since = f"from stamp {tracks.stamp_ns[k] * 1e-9:.3f} s on"
     where = f"camera {camera} {since}"
     value, focal = change.value - usual, tracks.cameras.params[camera, :2]
-    sure = np.abs(value) > np.maximum(_LEAST, _ERRORS * change.error)
+    sure = np.abs(value) > np.maximum(LEAST, ERRORS * change.error)
     causes = []
     if change.mirrored:
         left, top = (change.signs < 0.0).tolist()
@@ -121,8 +124,7 @@ def _named(tracks: Tracks, camera: int, k: int, change: Change, usual: FloatArra
         u, v = value[1:] * focal
         causes.append(f"region of interest or principal point of {where} is another, by ({u:.0f}, {v:.0f}) px")
     evidence = "the same points are seen so by several keyframes"
-    advice = "images as they were before, or another session_id with a camera_rig that is theirs"
-    return Finding((", and ".join(causes),), evidence, (advice,), usual=True, since_ns=int(tracks.stamp_ns[k]))
+    return Finding((", and ".join(causes),), evidence, (ADVICE,), usual=True, since_ns=int(tracks.stamp_ns[k]))
 
 
 def _change(tracks: Tracks, camera: int, before: int, k: int) -> Change | None:

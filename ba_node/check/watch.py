@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ba_node.check import two_view
+from ba_node.check.change import check_change
 from ba_node.check.diagnosis import Diagnosis
-from ba_node.check.examine import examine
+from ba_node.check.examine import examine, run
 from ba_node.check.tracks import tracks_of
 from ba_node.scene.scene import Scene
 
@@ -31,8 +32,8 @@ _AGAIN = (15, 40, 90)
 # A session that ends with fewer is looked at once more with all of them.
 _FEW = 10
 _ONCE = frozenset({"pixels", "stamps"})
-# Looked for where there is doubt.
-_CHANGES = frozenset({"onset"})
+# Looked for where there is doubt; and at few of these numbers too.
+_IN_DOUBT, _AT_FEW = frozenset({"onset"}), frozenset({"change"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
 # The newest of them are looked at; and fewer by themselves, where what was right at first may have changed.
@@ -93,6 +94,13 @@ def of_the_newest(scene: Scene, deviates: bool) -> Check | None:
         if found is not None and found.harmful:
             return _done(scene, found)
     return None
+
+
+def of_all_images(scene: Scene) -> Check | None:
+    """Return the check whether images changed among the newest keyframes, at the end; None if none did."""
+    tracks = tracks_of(scene, _NEWEST) if scene.keyframes.refined.any() else None
+    found = None if tracks is None else run(lambda: check_change(tracks), "change")
+    return _done(scene, found) if found is not None and found.harmful else None
 
 
 def _done(scene: Scene, found: Diagnosis) -> Check:
@@ -171,7 +179,8 @@ class SetUpWatch:
         if self._next < len(_AT) and count >= _AT[self._next]:
             again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
-            self._check(scene, (self._told & _ONCE if again else self._told) | _CHANGES, _NEWEST)
+            told = self._told & _ONCE if again else self._told - _AT_FEW if count > _AGAIN[-1] else self._told | _AT_FEW
+            self._check(scene, told | _IN_DOUBT, _NEWEST)
         elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked][0]:
             newest = _SINCE[self._looked][1] or count - self._doubted
             self._looked += 1
@@ -212,8 +221,6 @@ class SetUpWatch:
         if found.findings:
             scene.log.warn(kind="setup", text=found.summary())
         if not found.harmful:
-            if found.settled:
-                self._next = next((i for i, at in enumerate(_AT) if i >= self._next and at in _AGAIN), len(_AT))
             return False
         self._reason = f"the set-up contradicts the tracks: {found.causes()}"
         scene.forget_solutions(_sound_until(scene, found))

@@ -259,18 +259,20 @@ class BorderedReduction(ReducedSystem):
         step_c, step_p = super().expand(x[: self._n_c])
         return step_c, step_p - np.reshape(self._eliminated @ x[self._n_c :], step_p.shape)
 
-    def of_border(self) -> FloatArray:
-        """Return what is left of the matrix once the keyframes are eliminated too, (n_z, n_z)."""
+    def of_border(self) -> tuple[FloatArray, FloatArray]:
+        """Return what is left once the keyframes are eliminated too: matrix (n_z, n_z) and right-hand side (n_z,)."""
         s, n = self.dense(), self._n_c
         s[range(n), range(n)] *= 1.0 + 1e-12
-        return np.asarray(s[n:, n:] - s[n:, :n] @ np.linalg.solve(s[:n, :n], s[:n, n:]))
+        right = np.column_stack([s[:, n:], self.rhs])
+        left = right[n:] - s[n:, :n] @ np.linalg.solve(s[:n, :n], right[:n])
+        return left[:, :-1], left[:, -1]
 
 
 class BorderedSystem(NumpySystem):
     """A bordered reduction that also knows the full model."""
 
-    def of_border(self) -> FloatArray:
-        """Return what is left of the matrix once the keyframes are eliminated too, (n_z, n_z)."""
+    def of_border(self) -> tuple[FloatArray, FloatArray]:
+        """Return what is left once the keyframes are eliminated too: matrix (n_z, n_z) and right-hand side (n_z,)."""
         assert isinstance(self._reduction, BorderedReduction)
         return self._reduction.of_border()
 

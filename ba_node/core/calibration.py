@@ -228,7 +228,7 @@ def _round(
         kernels.linearise(kernels.start)
         system = kernels.damp("none", 0.0)
         assert isinstance(system, bordered.BorderedSystem)
-        values, vectors = np.linalg.eigh(system.of_border())
+        values, vectors = np.linalg.eigh(system.of_border()[0])
     told = vectors[:, values > 1.0]
     if not told.shape[1]:
         return state, found

@@ -305,7 +305,7 @@ FAULTS: dict[str, Fault] = {
         "camera 1 sent as camera 0 from midway on",
         midway.other_index,
         rigs=_TWO,
-        named=("camera 1 come as",),
+        named=("camera 1 come as|under which camera_index",),
         codes=_LOOK,
     ),
     "falls_silent": Fault(
@@ -337,6 +337,13 @@ FAULTS: dict[str, Fault] = {
     ),
     "clock_stepped": Fault(
         "clock set forward, s", stamps.clock_stepped, amounts=(3600.0, -0.3), named=("clock",), codes=_LOOK
+    ),
+    "mirrored_midway": Fault(
+        "second camera mirrored from midway on",
+        midway.from_midway(midway.mirrored),
+        rigs=_TWO,
+        named=("mirrored",),
+        codes=_LOOK,
     ),
 }
 

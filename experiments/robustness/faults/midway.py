@@ -51,6 +51,19 @@ def zoomed(recording: Recording, amount: float, _rng: np.random.Generator) -> Re
     return recording.changed(FeatureTracks, change)
 
 
+def mirrored(recording: Recording, _amount: float, _rng: np.random.Generator) -> Recording:
+    """Exchange left and right in the images of the last camera."""
+    last = len(recording.sound.rig) - 1
+
+    def change(image: FeatureTracks) -> FeatureTracks:
+        if image.camera_index != last:
+            return image
+        width = recording.sound.rig.image_size[last, 0]
+        return dataclasses.replace(image, uv=[width - 1.0, 0.0] + image.uv * [-1.0, 1.0])
+
+    return recording.changed(FeatureTracks, change)
+
+
 def ids_shifted(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
     """Count track ids from another number on, so that those of before stand for other points."""
 
