@@ -64,7 +64,7 @@ class Table:
 
     COLUMNS: ClassVar[Mapping[str, Column]] = {}
     COPIED: ClassVar[tuple[str, ...]] = ()
-    _FILLS: ClassVar[Mapping[str, Any]] = {}  # what is not zero of a row of which nothing is given
+    _FILLS: ClassVar[dict[str, object]] = {}  # what is not zero of a row of which nothing is given
 
     def __init_subclass__(cls) -> None:
         """Find the columns."""
