@@ -115,6 +115,13 @@ def _equations(
     norm = np.where(behind, _BEHIND_NORM, np.sqrt(np.sum(residual * residual, axis=1)))
     cost, weight = loss.evaluate(options.loss, norm, options.loss_scale_px)
     by_body = columns.product(d_uv, views.turn) * scale[:, :, None]
-    jacobian = np.concatenate([np.cross(body[:, None], by_body), by_body], axis=2)
+    jacobian = np.empty((len(body), 2, 6))
+    (x, y, z), (by_x, by_y, by_z) = body.T[:, :, None], by_body.transpose(2, 0, 1)
+    jacobian[:, :, 0], jacobian[:, :, 1], jacobian[:, :, 2] = (
+        y * by_z - z * by_y,
+        z * by_x - x * by_z,
+        x * by_y - y * by_x,
+    )
+    jacobian[:, :, 3:] = by_body
     weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
     return float(np.sum(cost)), weighted.T @ jacobian.reshape(-1, 6), weighted.T @ residual.ravel()

@@ -239,5 +239,5 @@ class IdIndex:
 def _found(known: IdArray, rows: IntArray, ids: IdArray) -> IntArray:
     if not len(known):
         return np.full(len(ids), -1)
-    at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-    return np.where(known[at] == ids, rows[at], -1)
+    at = known.searchsorted(ids)
+    return np.where(known.take(at, mode="clip") == ids, rows.take(at, mode="clip"), -1)
