@@ -109,11 +109,15 @@ class Triangulator {
   // The points that are wanted, those with fewer views first: all lanes wait for the one with most.
   std::vector<std::int64_t> by_views(const char* wanted) const {
     const auto n_points = static_cast<std::int64_t>(begin_.size()) - 1;
-    std::vector<std::int64_t> order;
+    std::int64_t most = 0;
+    for (std::int64_t p = 0; p < n_points; ++p) most = std::max(most, views_of(p));
+    // Where those of so many views begin. Sorting by std would be compiled for this target and linked for all.
+    std::vector<std::int64_t> place(most + 2);
+    for (std::int64_t p = 0; p < n_points; ++p) place[views_of(p) + 1] += wanted == nullptr || wanted[p];
+    for (std::int64_t k = 0; k <= most; ++k) place[k + 1] += place[k];
+    std::vector<std::int64_t> order(place[most + 1]);
     for (std::int64_t p = 0; p < n_points; ++p)
-      if (wanted == nullptr || wanted[p]) order.push_back(p);
-    std::stable_sort(order.begin(), order.end(),
-                     [this](std::int64_t a, std::int64_t b) { return views_of(a) < views_of(b); });
+      if (wanted == nullptr || wanted[p]) order[place[views_of(p)]++] = p;
     return order;
   }
 

@@ -61,7 +61,8 @@ inline std::vector<std::int64_t> views_of(const std::int64_t* last, const std::i
   return rows;
 }
 
-// Ask for the lines that hold some elements of a column, which is read from there on in no order that a processor knows.
+// Ask for the lines that hold some elements of a column, which is read from there on in no order that a processor
+// knows.
 template <class T>
 void fetch_ahead(const T* column, std::int64_t begin, std::int64_t end) {
   constexpr std::int64_t kEach = 64 / sizeof(T);
