@@ -177,7 +177,9 @@ class Backend:
         """
         if len(self.scene.keyframes) == 0:
             return None
-        wrong = self.setup.look(self.scene, deviates(self.scene)) if self.config.checks_setup else ""
+        checks, aside = self.config.checks_setup, self.setup.elsewhere is not None
+        # What is found elsewhere comes later as it is: nobody waits for it to begin.
+        wrong = "" if not checks else self.setup.reason(self.scene) if aside else self._look()
         self.solve_count += 1
 
         asked: list[Check | None] = []
@@ -188,9 +190,15 @@ class Backend:
                 on_poses(refinement)
 
         estimate = self.map.solve(self.solve_count, wrong, self.extras, Following(self._clock, on_iteration, taken))
+        if checks and aside:
+            self._look()
         if (study := self.map.begun_study()) is not None:
             self._work(study)
         return estimate if wrong else self.take_check(*(asked or [departed(self.scene)])) or self.adjust() or estimate
+
+    def _look(self) -> str:
+        """Have the set-up checked if that is due; return why solves are held, empty if they are not."""
+        return self.setup.look(self.scene, deviates(self.scene))
 
     def adjust(self, *, final: bool = False) -> Estimate | None:
         """Bend the map and refine all of it, if a loop or what is absolute asks for it, see ``window/adjustment.py``.

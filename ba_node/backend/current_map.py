@@ -24,7 +24,7 @@ from ba_node.core.calibration import Calibration
 from ba_node.estimate import Correction, Estimate, Extras, Poses, Refinement, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import culling, full, old_keyframes, precision, quality, view
+from ba_node.window import culling, full, guard, old_keyframes, precision, quality, view
 from ba_node.window.attempt import Following, attempt
 from ba_node.window.correction import MapCorrection, Move
 from ba_node.window.trust import Trust
@@ -221,32 +221,34 @@ class CurrentMap:
         if isinstance(tried, str):
             self.report = dataclasses.replace(self.base_report(count, newest), reason=tried)
             return None, {}
-        selection, (norms, state, _) = tried.selection, tried.found
+        selection, tracks, kernels = tried.selection, self.config.tracks, self.config.solver.kernels
+        taken = None if tried.held else tried.found.state
         taking_part = _taking_part_of(self.scene, selection)
         refined: Poses | None = None
         extra: dict[str, Any] = {}
         for stray in selection.strays:
-            text = stray.text(int(self.scene.keyframes.keyframe_id[stray.row]))
-            if text:
+            if text := stray.text(int(self.scene.keyframes.keyframe_id[stray.row])):
                 self.scene.log.warn("stray", text)
-        quality.note_unbounded(self.scene, self.config, norms)
         if tried.held:
             self.hold(tried.held)
-        elif state is not None:
-            window.put_poses(self.scene, selection, state, tried.without)
+        elif taken is not None:
+            window.put_poses(self.scene, selection, taken, tried.without)
             moved = self._correct(int(taking_part[-1]))
             refined = poses_of(self.scene, taking_part)
             following.on_poses(self._refinement(refined))
-            norms = window.apply(self.scene, selection, state, norms, self.config.tracks, self.config.solver.kernels)
+        norms, state, _ = window.returned(selection, tried.found, tracks, kernels)
+        agree = {"inlier_share": guard.inlier_share(selection, norms, self.config)} if tried.health else {}
+        quality.note_unbounded(self.scene, self.config, norms)
+        if taken is not None and state is not None:
+            norms = window.apply(self.scene, selection, state, norms, tracks, kernels)
             rows = selection.keyframes, selection.landmarks, selection.origin
             old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
             if self._study is None:
                 self._study = self._precision.study(self.scene, self.config, selection, state)
                 self._asks = self._study is not None
             extra = view.work_out(wanted, self.scene, self.config, selection, state, taking_part)
-        statistics = quality.statistics(selection, tried.result, norms) | tried.health
-        if tried.held:
-            statistics |= {"status": Status.HELD, "reason": tried.held}
+        statistics = quality.statistics(selection, tried.result, norms) | tried.health | agree
+        statistics |= {"status": Status.HELD, "reason": tried.held} if tried.held else {}
         statistics |= moved.statistics() | {"solve_time_s": tried.solve_time_s}
         self.report = dataclasses.replace(self.base_report(count, newest), **statistics)
         return refined if refined is not None else poses_of(self.scene, taking_part), extra

@@ -7,6 +7,7 @@ Those of :class:`SolverConfig` are parameters of the node too, where some have a
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -262,6 +263,7 @@ class SolverOptions(SolverConfig):
         """Return which D scales the space of PCG: that of the region, without one that of the damping."""
         return self.damping if self.trust_region == "none" else self.trust_region
 
+    @functools.lru_cache(maxsize=16)  # noqa: B019  few are kept, and they are small
     def check(self) -> None:
         """Raise ConfigError if a choice does not exist or contradicts another; say which, and what to do."""
         for chosen, names in _CHOSEN:

@@ -12,6 +12,8 @@ that agree with them, so these triangulate it, and then all rays are classified 
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from ba_node import native
@@ -114,6 +116,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
+@functools.lru_cache(maxsize=256)
 def _pairs(n: int) -> tuple[IntArray, IntArray]:
     if n * (n - 1) // 2 <= _MAX_PAIRS:
         i, j = np.triu_indices(n, k=1)

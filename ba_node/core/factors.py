@@ -24,6 +24,7 @@ The global one (3.26-3.28) is ``dphi_local = Jr(phi) dphi, dt_local = R' dt``: b
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +40,8 @@ from ba_node.core.problem import KeyframeFactors, ProblemError, State
 
 # A measured rotation may differ from an orthonormal one by this much.
 _ORTHONORMAL = 1e-6
+# Of so many keyframes it is remembered how factors couple them: there to find out takes longer than the sums.
+_WINDOW = 100
 
 
 @dataclass(frozen=True)
@@ -179,21 +182,14 @@ class FactorSum:
     def __init__(self, factors: Sequence[KeyframeFactors], fixed: BoolArray, parameterisation: str = "local") -> None:
         """Find which free keyframes they couple; ``fixed`` is (n_kf,)."""
         self._factors, self._parameterisation = tuple(factors), parameterisation
-        self._free = (~fixed).nonzero()[0]
-        self._column = np.full(len(fixed), -1, np.intp)
-        self._column[self._free] = np.arange(len(self._free))
-        n = len(self._free)
         # Rotation and translation of the same steps are two kinds.
-        ends = [kind.keyframes for kind in self._factors]
-        keys = {id(one): self._keys(self._column[one], n) for one in {id(one): one for one in ends}.values()}
-        distinct = np.concatenate([key.ravel() for key in keys.values()]) if keys else np.empty(0, np.intp)
-        distinct = distinct[distinct >= 0]
-        if not (distinct[1:] > distinct[:-1]).all():  # those of consecutive keyframes rise
-            distinct = np.unique(distinct)
-        self.rows, self.columns = np.divmod(distinct, max(n, 1))
+        ends = {id(kind.keyframes): kind.keyframes for kind in self._factors}
+        given = fixed.tobytes(), *((one.shape[1], one.astype(np.intp).tobytes()) for one in ends.values())
+        # A window couples its keyframes as the one before does.
+        found = _coupled(*given) if len(fixed) <= _WINDOW else _coupled.__wrapped__(*given)
+        self._free, self._column, self.rows, self.columns, pairs = found
         # By kind: (n, n_places) the pair that each two places of a factor belong to, -1 if one of them is fixed.
-        pairs = {one: np.where(key >= 0, np.searchsorted(distinct, key), -1) for one, key in keys.items()}
-        self._pair = [pairs[id(one)] for one in ends]
+        self._pair = [pairs[list(ends).index(id(kind.keyframes))] for kind in self._factors]
 
     def value(self, state: State) -> float:
         """Return 1/2 sum Psi."""
@@ -243,15 +239,6 @@ class FactorSum:
             to.add(terms.pairs.blocks, turned[to.rows, low] @ jacobian[to.rows, high])
         return 0.5 * float(np.sum(cost))
 
-    @staticmethod
-    def _keys(column: IntArray, n: int) -> IntArray:
-        """Return a key of the pair of free keyframes at each two places of a factor, (n, n_places), -1 for none."""
-        keys = []
-        for a, b in itertools.combinations(range(column.shape[1]), 2):
-            low, high = np.minimum(column[:, a], column[:, b]), np.maximum(column[:, a], column[:, b])
-            keys.append(np.where(low >= 0, low * n + high, -1))
-        return np.stack(keys, axis=1) if keys else np.empty((len(column), 0), np.intp)
-
     def _stepped(self, state: State, terms: FactorTerms) -> FactorTerms:
         """Return terms by the steps of the parameterisation in place of local ones."""
         if self._parameterisation == "local":
@@ -267,6 +254,35 @@ class FactorSum:
             back @ terms.diagonal @ turn,
             replace(terms.pairs, blocks=back[self.rows] @ terms.pairs.blocks @ turn[self.columns]),
         )
+
+
+@functools.lru_cache(maxsize=4)
+def _coupled(fixed: bytes, *ends: tuple[int, bytes]) -> tuple[IntArray, IntArray, IntArray, IntArray, list[IntArray]]:
+    """Return the free keyframes, the number of each keyframe among them, and which pairs of them factors couple.
+
+    ``fixed`` are booleans (n_kf,), ``ends`` the keyframes of factors, so many of each; both as bytes. Of each such kind
+    the last list tells the pair that each two places of a factor belong to. Nobody may change what is returned.
+    """
+    is_fixed = np.frombuffer(fixed, bool)
+    free = (~is_fixed).nonzero()[0]
+    column, n = np.full(len(is_fixed), -1, np.intp), len(free)
+    column[free] = np.arange(n)
+    keys = [_keys(column[np.frombuffer(one, np.intp).reshape(-1, places)], n) for places, one in ends]
+    distinct = np.concatenate([key.ravel() for key in keys]) if keys else np.empty(0, np.intp)
+    distinct = distinct[distinct >= 0]
+    if not (distinct[1:] > distinct[:-1]).all():  # those of consecutive keyframes rise
+        distinct = np.unique(distinct)
+    rows, others = np.divmod(distinct, max(n, 1))
+    return free, column, rows, others, [np.where(key >= 0, np.searchsorted(distinct, key), -1) for key in keys]
+
+
+def _keys(column: IntArray, n: int) -> IntArray:
+    """Return a key of the pair of free keyframes at each two places of a factor, (n, n_places), -1 for none."""
+    keys = []
+    for a, b in itertools.combinations(range(column.shape[1]), 2):
+        low, high = np.minimum(column[:, a], column[:, b]), np.maximum(column[:, a], column[:, b])
+        keys.append(np.where(low >= 0, low * n + high, -1))
+    return np.stack(keys, axis=1) if keys else np.empty((len(column), 0), np.intp)
 
 
 class _Sum:

@@ -80,7 +80,9 @@ def residual_norms(problem: Problem, state: State, kernels: str = "auto", rows: 
     if rows is not None:
         problem = changed(problem, observations=problem.observations.take(rows))
     error = reprojection_errors(problem, state)
-    return np.nan_to_num(np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px, nan=np.inf)
+    sizes = np.hypot(error[:, 0], error[:, 1]) / problem.observations.sigma_px
+    sizes[np.isnan(sizes)] = np.inf
+    return sizes
 
 
 class NativeKernels:

@@ -10,7 +10,10 @@ keyframe: to begin there costs a tenth of an iteration of the window, and saves 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
@@ -61,9 +64,9 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
     if len(rows) < _LEAST:
         return None
     start = at = best = problem.start.rotation[keyframe], problem.start.translation[keyframe]
-    lowest = np.inf
+    lowest, views = np.inf, _Views.of(problem, rows)
     for i in range(_STEPS + 1):
-        cost, matrix, vector = _equations(problem, options, rows, at)
+        cost, matrix, vector = _equations(views, options, at)
         if i and not cost < lowest:
             break
         arrived, lowest, best = bool(i) and lowest - cost <= _LEAST_GAIN * lowest, cost, at
@@ -79,23 +82,46 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
     return None if best is start else best
 
 
+class _Views(NamedTuple):
+    """Observations of one keyframe."""
+
+    points: FloatArray  # (n, 3) m
+    turn: FloatArray  # (n, 3, 3) camera from body
+    shift: FloatArray  # (n, 3) m
+    model: NDArray[np.uint8]  # (n,)
+    params: FloatArray  # (n, 12)
+    uv: FloatArray  # (n, 2) px
+    weight: FloatArray  # (n,) 1 / sigma, 1/px
+
+    @classmethod
+    def of(cls, problem: Problem, rows: IntArray) -> _Views:
+        obs, cams = problem.observations, problem.cameras
+        camera, points = obs.camera[rows], problem.start.points[obs.point[rows]]
+        places = cams.rotation[camera], cams.translation[camera]
+        return cls(points, *places, cams.model[camera], cams.params[camera], obs.uv[rows], 1.0 / obs.sigma_px[rows])
+
+
 def _equations(
-    problem: Problem, options: SolverOptions, rows: IntArray, pose: tuple[FloatArray, FloatArray]
+    views: _Views, options: SolverOptions, pose: tuple[FloatArray, FloatArray]
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return the cost of some observations of one keyframe at a pose, J'J (6, 6) and J'r (6,)."""
-    obs, cams = problem.observations, problem.cameras
-    camera = obs.camera[rows]
-    body = problem.start.points[obs.point[rows]] @ pose[0].T + pose[1]
-    turn, model, params = cams.rotation[camera], cams.model[camera], cams.params[camera]
-    x_cam = (turn @ body[:, :, None])[..., 0] + cams.translation[camera]
-    behind = cameras.behind(x_cam, model)
+    body = views.points @ pose[0].T + pose[1]
+    x_cam = (views.turn @ body[:, :, None])[..., 0] + views.shift
+    behind = cameras.behind(x_cam, views.model)
     x_cam[behind] = (0.0, 0.0, 1.0)
-    uv, d_uv, _ = cameras.project_jacobian(x_cam, model, params, intrinsics=False)
-    scale = np.where(behind, 0.0, 1.0 / obs.sigma_px[rows])[:, None]
-    residual = (uv - obs.uv[rows]) * scale
+    uv, d_uv, _ = cameras.project_jacobian(x_cam, views.model, views.params, intrinsics=False)
+    scale = np.where(behind, 0.0, views.weight)[:, None]
+    residual = (uv - views.uv) * scale
     norm = np.where(behind, _BEHIND_NORM, np.sqrt(np.sum(residual * residual, axis=1)))
     cost, weight = loss.evaluate(options.loss, norm, options.loss_scale_px)
-    by_body = columns.product(d_uv, turn) * scale[:, :, None]
-    jacobian = np.concatenate([np.cross(body[:, None], by_body), by_body], axis=2)
+    by_body = columns.product(d_uv, views.turn) * scale[:, :, None]
+    jacobian = np.empty((len(body), 2, 6))
+    (x, y, z), (by_x, by_y, by_z) = body.T[:, :, None], by_body.transpose(2, 0, 1)
+    jacobian[:, :, 0], jacobian[:, :, 1], jacobian[:, :, 2] = (
+        y * by_z - z * by_y,
+        z * by_x - x * by_z,
+        x * by_y - y * by_x,
+    )
+    jacobian[:, :, 3:] = by_body
     weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
     return float(np.sum(cost)), weighted.T @ jacobian.reshape(-1, 6), weighted.T @ residual.ravel()

@@ -153,16 +153,19 @@ class MapTables(Views):
         begin, self._unsettled = self._unsettled, len(table)
         if begin >= len(table) or table.refined[self.order[begin:]].all():
             return
-        before = self._refined_before(begin)
-        if before < 0:
-            begin = 0
-        rows = self.order[begin:]
-        refined = table.refined[rows]
-        if before < 0 and not refined.any():
-            return
-        at = np.maximum.accumulate(np.where(refined, np.arange(begin, len(table)), before))
-        anchor = np.where(at < 0, begin + int(np.argmax(refined)), at)
-        rows, anchors = rows[~refined], self.order[anchor[~refined]]
+        if begin == len(table) - 1 and begin and table.refined[self.order[begin - 1]]:  # as of most keyframes
+            rows, anchors = self.order[begin:], self.order[begin - 1 : begin]
+        else:
+            before = self._refined_before(begin)
+            if before < 0:
+                begin = 0
+            rows = self.order[begin:]
+            refined = table.refined[rows]
+            if before < 0 and not refined.any():
+                return
+            at = np.maximum.accumulate(np.where(refined, np.arange(begin, len(table)), before))
+            anchor = np.where(at < 0, begin + int(np.argmax(refined)), at)
+            rows, anchors = rows[~refined], self.order[anchor[~refined]]
         rotation, translation = self.corrections(anchors)
         moved = geometry.compose(rotation, translation, table.input_rotation[rows], table.input_position[rows])
         table.rotation[rows], table.position[rows] = moved

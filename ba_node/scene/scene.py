@@ -277,16 +277,17 @@ class Scene(MapTables):
         tracks = self._renamed(tracks)
         landmarks = self._rows_of(tracks.track_id)
         new = self._unseen(row, tracks, landmarks)
-        landmarks = landmarks[new]
+        which = slice(None) if new.all() else new
+        landmarks = landmarks[which]
         added = self.observations.append(
             len(landmarks),
             keyframe=row,
             camera=tracks.camera_index,
             landmark=landmarks,
             previous=self.landmarks.last[landmarks],
-            uv=tracks.uv[new],
-            sigma_px=tracks.sigma_px[new],
-            depth_m=tracks.depth_m[new],
+            uv=tracks.uv[which],
+            sigma_px=tracks.sigma_px[which],
+            depth_m=tracks.depth_m[which],
         )
         if len(added) or tracks.camera_index not in self.cameras_of(row):
             begin = len(self.observations) - len(added)

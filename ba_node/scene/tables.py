@@ -64,13 +64,15 @@ class Table:
 
     COLUMNS: ClassVar[Mapping[str, Column]] = {}
     COPIED: ClassVar[tuple[str, ...]] = ()
+    _FILLS: ClassVar[dict[str, object]] = {}  # what is not zero of a row of which nothing is given
 
     def __init_subclass__(cls) -> None:
         """Find the columns."""
         cls.COLUMNS = {name: value for name, value in vars(cls).items() if isinstance(value, Column)}
+        cls._FILLS = {name: value.fill for name, value in cls.COLUMNS.items() if value.fill != 0}
 
     def __init__(self) -> None:
-        self._size = 0
+        self._size = self._room = 0
         self._buffers: dict[str, NDArray[Any]] = {
             name: np.empty((0, *column.shape), column.dtype) for name, column in self.COLUMNS.items()
         }
@@ -86,13 +88,10 @@ class Table:
         begin, end = self._size, self._size + count
         if not count:
             return np.arange(begin, end)
-        for name, column in self.COLUMNS.items():
-            buffer = self._buffers[name]
-            if end > len(buffer):
-                grown = np.empty((max(end, 2 * len(buffer), 16), *column.shape), column.dtype)
-                grown[:begin] = buffer[:begin]
-                self._buffers[name] = grown
-            self._buffers[name][begin:end] = values.get(name, column.fill)
+        if end > self._room:
+            self._grow(max(end, 2 * self._room, 16))
+        for name, value in (self._FILLS | values).items():
+            self._buffers[name][begin:end] = value
         self._size = end
         self._expose()
         if self.COPIED:
@@ -104,7 +103,7 @@ class Table:
         renumbered = np.where(rows, np.cumsum(rows) - 1, -1)
         for name in self.COLUMNS:
             self._buffers[name] = self._buffers[name][: self._size][rows]
-        self._size = int(np.count_nonzero(rows))
+        self._size = self._room = int(np.count_nonzero(rows))
         self._expose()
         self.changed()
         return renumbered
@@ -147,6 +146,14 @@ class Table:
     @property
     def _n_pieces(self) -> int:
         return max(1, -(-self._size // _PIECE))
+
+    def _grow(self, room: int) -> None:
+        """Make room, all zero."""
+        for name, column in self.COLUMNS.items():
+            grown = np.zeros((room, *column.shape), column.dtype)
+            grown[: self._size] = self._buffers[name][: self._size]
+            self._buffers[name] = grown
+        self._room = room
 
     def _expose(self) -> None:
         for name, buffer in self._buffers.items():
@@ -232,5 +239,5 @@ class IdIndex:
 def _found(known: IdArray, rows: IntArray, ids: IdArray) -> IntArray:
     if not len(known):
         return np.full(len(ids), -1)
-    at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-    return np.where(known[at] == ids, rows[at], -1)
+    at = known.searchsorted(ids)
+    return np.where(known.take(at, mode="clip") == ids, rows.take(at, mode="clip"), -1)

@@ -111,7 +111,7 @@ class Views:
         rows, keyframe = rows[keyframe >= 0], keyframe[keyframe >= 0]
         landmark = self.numbers(table.landmark.take(rows), landmarks)
         camera = table.camera.take(rows).astype(np.intp)
-        order = np.lexsort((camera, keyframe, landmark))
+        order = _in_order(camera, keyframe, landmark)
         rows = rows.take(order)
         depth = table.depth_m.take(rows).astype(float)
         return (
@@ -131,3 +131,9 @@ class Views:
             self._scratch = np.full((2, 2 * size), -1)
         cleared: IntArray = self._scratch[which]
         return cleared
+
+
+def _in_order(camera: IntArray, keyframe: IntArray, landmark: IntArray) -> IntArray:
+    """Return in which order observations are sorted by landmark, keyframe, camera; mostly they come so."""
+    place = camera + (1 + camera.max(initial=0)) * (keyframe + (1 + keyframe.max(initial=0)) * landmark)
+    return np.arange(len(place)) if (place[1:] > place[:-1]).all() else np.argsort(place, kind="stable")

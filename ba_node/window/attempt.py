@@ -45,7 +45,7 @@ class Attempt(NamedTuple):
 
     selection: Selection  # what was solved
     result: Result  # what came of it
-    found: Merged  # the same in the scale of the map, without a state where it is of no use
+    found: Merged  # the same in the scale of the map, see ``merging.outcome``; without a state where it is of no use
     health: dict[str, float]  # figures for the report
     held: str  # why it is not to be taken, empty if it is, or of no use anyway
     without: tuple[int, ...]  # rows of keyframes that were left out as they alone were wrong
@@ -76,7 +76,7 @@ def attempt(scene: Scene, config: Config, end: int, trust: Trust, following: Fol
         began = clock()
         result = solver.solve(problem, options, clock=clock, on_iteration=on_iteration, weakest=True, in_haste=True)
         solve_time_s += clock() - began
-        found = outcome(scene, selection, result, config.tracks, config.solver.kernels)
+        found = outcome(scene, selection, result, config.solver.kernels)
         if found.state is None:
             return Attempt(selection, result, found, {}, "", without, solve_time_s)
         verdict = guard.decide(config, selection, found, trust)

@@ -47,6 +47,8 @@ def choose(problem: Problem, old: BoolArray, tied: BoolArray) -> Gauge:
     """
     obs, n_kf = problem.observations, problem.n_keyframes
     fixed, unscaled = old.copy(), np.full(n_kf, -1)
+    if tied.all() and old.any():  # ties hold all of it, one to the other, as in most windows
+        return Gauge(fixed, unscaled)
     part_of = _parts(problem, tied)
     has_tie = np.zeros(n_kf, bool)
     has_tie[:-1] |= tied

@@ -108,6 +108,11 @@ def _narrowed(config: Config) -> Config:
     )
 
 
+def inlier_share(selection: Selection, norms: FloatArray, config: Config) -> float:
+    """Return which share of the observations agree with a solution, by the sizes of its residuals (n_all,), sigmas."""
+    return _agreeing(selection, norms, config).share
+
+
 class _Agreeing(NamedTuple):
     """Observations that agree with a solution."""
 

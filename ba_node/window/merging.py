@@ -42,57 +42,66 @@ class Merged(NamedTuple):
 
 def merge(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
     """Put the refined poses and points of a usable, finite result into the scene and classify its observations anew."""
-    found = outcome(scene, selection, result, tracks, kernels)
+    found = returned(selection, outcome(scene, selection, result, kernels), tracks, kernels)
     if found.state is None:
         return found
     put_poses(scene, selection, found.state)
     return found._replace(norms=apply(scene, selection, found.state, found.norms, tracks, kernels))
 
 
-def outcome(scene: Scene, selection: Selection, result: Result, tracks: TracksConfig, kernels: str = "auto") -> Merged:
-    """Return what came of a result, in the scale of the map; the scene stays as it is."""
+def outcome(scene: Scene, selection: Selection, result: Result, kernels: str = "auto") -> Merged:
+    """Return what came of a result, in the scale of the map; the scene stays as it is.
+
+    It is to be judged by that; before points are published those that ran away are to be :func:`returned`.
+    """
     if not result.status.usable or not result.state.is_finite():
         return Merged(selection.norms, None)
     state = scaled(selection, scene.keyframes.input_position[selection.keyframes], result.state)
-    return settled(selection, state, tracks, kernels)
+    return _placed(selection, state, kernels)
 
 
 def settled(selection: Selection, state: State, tracks: TracksConfig, kernels: str = "auto") -> Merged:
-    """Return a solution with its points where they may be published, see ``Merged``.
+    """Return a solution with its points where they may be published, see ``Merged``."""
+    return returned(selection, _placed(selection, state, kernels), tracks, kernels)
 
-    Points that took no part are placed by their rays. A point that has left to where fewer of its views agree, or so
-    far away that no view would notice, goes back to where it began; if it was there already, no view is left to it.
-    """
+
+def _placed(selection: Selection, state: State, kernels: str) -> Merged:
+    """Return a solution in which points that took no part are placed by their rays."""
     explained = selection.explained(state, kernels)
     found = explained.points
     if len(found):
         points, aside = state.points.copy(), selection.tried[: len(found)]
         points[aside] = np.where(np.isnan(found), points[aside], found)
         state = changed(state, points=points)
-    norms = native_kernels.residual_norms(selection.whole, state, kernels)
-    state = _returned(selection, state, norms, tracks.outlier_px or np.inf, kernels)
-    return Merged(norms, state, explained)
+    return Merged(native_kernels.residual_norms(selection.whole, state, kernels), state, explained)
 
 
-def _returned(selection: Selection, state: State, norms: FloatArray, gate: float, kernels: str) -> State:
-    """Return a state whose points that ran away are back where they began; their norms are written over."""
+def returned(selection: Selection, found: Merged, tracks: TracksConfig, kernels: str = "auto") -> Merged:
+    """Return what was found with points that ran away back where they began; its norms are written over.
+
+    They are those that have left to where fewer of their views agree, or so far away that no view would notice. If one
+    was there already, no view is left to it.
+    """
+    if found.state is None:
+        return found
+    state, norms, gate = found.state, found.norms, tracks.outlier_px or np.inf
     whole, point = selection.whole, selection.observations.point
     doubted, agreeing, away, began, leapt = _doubted(selection, state, norms, gate, kernels)
     rows = doubted.take(point).nonzero()[0]
     if not len(rows):
-        return state
+        return found
     point = point.take(rows)
     before = native_kernels.residual_norms(whole, changed(state, points=whole.start.points), kernels, rows)
     support = np.bincount(point[before <= gate], minlength=whole.n_points)
     # A leap has to be borne out by more views than there were.
     better = support + leapt > agreeing
     back, lost = doubted & ~began & (better | away), doubted & began & away
-    returned = back.take(point)
-    norms[rows[returned]] = before[returned]
+    went = back.take(point)
+    norms[rows[went]] = before[went]
     norms[rows[lost.take(point)]] = np.inf
     points = state.points.copy()
     points[back] = whole.start.points[back]
-    return changed(state, points=points)
+    return found._replace(state=changed(state, points=points))
 
 
 def _doubted(

@@ -71,7 +71,7 @@ def moving(problem: Problem, norms: FloatArray, unrefined: BoolArray, kernels: s
         return found
     doubted = part_of(problem, rows, found)
     places, _ = consensus.triangulate(triangulation.rays_of(doubted, kernels), doubted.n_points, _BOUND, kernels)
-    at = changed(doubted.start, points=np.nan_to_num(places.points))
+    at = changed(doubted.start, points=np.where(np.isnan(places.points), 0.0, places.points))
     again = native_kernels.residual_norms(doubted, at, kernels)
     again[_mismatches(doubted, again, kernels)] = np.inf
     found[found] = _leaves_more_than_noise(doubted, again, off, kernels)

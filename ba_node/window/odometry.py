@@ -92,8 +92,9 @@ class Steps:
 
 def ties(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray:
     """Return which keyframes of a problem, oldest first, are tied to the next one, (n_kf - 1,)."""
-    near = np.diff(scene.places()[keyframes]) <= _MAX_GAP
-    return np.asarray(config.enabled & near & (np.diff(scene.sessions_of(keyframes)) == 0))
+    place = scene.places()[keyframes]
+    near = config.enabled & (place[1:] - place[:-1] <= _MAX_GAP)
+    return np.asarray(near & (np.diff(scene.sessions_of(keyframes)) == 0) if scene.constraints.seams else near)
 
 
 def factors(

@@ -76,6 +76,26 @@ def test_a_keyframe_is_solved_waits_or_is_not_known() -> None:
         assert abs(abs(float(ours.orientation @ theirs.orientation)) - 1.0) < 1e-12
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_poses_do_not_wait_for_a_check_that_is_made_elsewhere(elsewhere: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that is made at once may hold the solve, and comes before it."""
+    backend, events = Backend(Config()), list[str]()
+    if elsewhere:
+        backend.setup.elsewhere = lambda _: None
+
+    def look(*_: object) -> str:
+        events.append("look")
+        return ""
+
+    monkeypatch.setattr(backend.setup, "look", look)
+    for measurement in joined(groups()[:3]):
+        backend.add(measurement)
+    backend.flush()
+    estimate = backend.solve(on_poses=lambda _: events.append("poses"))
+    assert estimate is not None and estimate.report.status.usable, "poses were taken"
+    assert events == (["poses", "look"] if elsewhere else ["look", "poses"])
+
+
 @pytest.mark.slow
 def test_everything_is_solved_in_one_call_as_in_three() -> None:
     one, three = Played(messages()), Played(messages())

@@ -214,3 +214,18 @@ def test_eliminating_keyframes_is_refused(make_problem: Make) -> None:
     problem = with_factors(make_problem)
     with pytest.raises(ConfigError, match="schur = cameras"):
         solver.solve(problem, dataclasses.replace(SolverOptions(), schur="cameras"))
+
+
+def test_what_is_remembered_of_a_window_is_not_taken_for_another(make_problem: Make) -> None:
+    """The same steps with other keyframes fixed, and other steps with the same, couple other pairs."""
+    problem = with_factors(make_problem, fixed=1)
+    other = np.roll(problem.fixed, 2)
+    steps = tuple(one for one in problem.factors if isinstance(one, RelativePoses))
+    fewer = tuple(one.take(np.arange(len(one) - 1), np.arange(problem.n_keyframes)) for one in steps)
+    for factors, fixed in ((steps, problem.fixed), (steps, other), (fewer, problem.fixed), (steps, problem.fixed)):
+        found = FactorSum(factors, fixed)
+        number = np.cumsum(~fixed) - 1
+        ends = np.concatenate([one.keyframes for one in factors])
+        free = number[np.sort(ends[~fixed[ends].any(axis=1)], axis=1)]
+        expected = np.unique(free, axis=0)
+        np.testing.assert_array_equal(np.stack([found.rows, found.columns], axis=1), expected)

@@ -13,7 +13,7 @@ from ba_node import native
 from ba_node.config import SolverOptions
 from ba_node.core import cameras, geometry, objective, triangulation
 from ba_node.core.problem import Cameras, Observations, Problem, State
-from ba_node.core.triangulation import errors, parallax, rays_of, triangulate
+from ba_node.core.triangulation import Rays, errors, parallax, rays_of, triangulate
 
 both = pytest.mark.parametrize(
     "backend",
@@ -193,3 +193,24 @@ def test_pieces_of_many_observations_give_the_same_to_rounding(monkeypatch: pyte
     for field in dataclasses.fields(whole):
         np.testing.assert_allclose(getattr(pieces, field.name), getattr(whole, field.name), rtol=1e-13, atol=1e-15)
     np.testing.assert_allclose(errors(pieces, problem.start.points), error, rtol=1e-9)
+
+
+def test_a_point_does_not_depend_on_those_it_is_worked_on_with() -> None:
+    """Points of 2 to 40 views, in any order: each as if it were alone, to the last bit."""
+    if native.kernels is None:
+        pytest.skip("no C++ kernels built")
+    rng = np.random.default_rng(8)
+    views = rng.integers(2, 40, 100)
+    point = np.repeat(np.arange(100), views)
+    place = rng.uniform([-2, -2, 5], [2, 2, 10], (100, 3))
+    centre = rng.uniform(-1.0, 1.0, (len(point), 3))
+    away = place[point] - centre + rng.normal(0.0, 0.02, (len(point), 3))
+    direction = away / np.linalg.norm(away, axis=1, keepdims=True)
+    none = np.full(len(point), np.nan)
+    rays = Rays(point, centre, direction, np.full(len(point), 500.0), none, none)
+    together = triangulate(rays, 100)
+    for k in range(100):
+        own = rays.part(point == k)
+        alone = triangulate(dataclasses.replace(own, point=np.zeros(len(own.point), np.intp)), 1)
+        for all_of_them, one in zip(vars(together).values(), vars(alone).values(), strict=True):
+            np.testing.assert_array_equal(all_of_them[k], one[0], err_msg=f"point {k} of {views[k]} views")

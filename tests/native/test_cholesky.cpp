@@ -75,6 +75,17 @@ TEST(sparse_cholesky_solves_bands_arrows_and_full_systems) {
   }
 }
 
+TEST(no_order_takes_fewer_operations_than_one_that_fills_nothing) {
+  // A band, and an arrow to the last keyframe.
+  const Fill band = find_fill(matrices::Blocks<6>(matrices::dense(9, 6, 2, false, 1), 9).pattern, kNoLimits);
+  for (std::int32_t k = 0; k < 9; ++k) CHECK(band.order[k] == k);
+  CHECK(band.blocks == 9 + 8 + 7);
+  CHECK_NEAR(band.products, 7 * 5 + 2, 0);
+  const Fill arrow = find_fill(matrices::Blocks<6>(matrices::dense(9, 6, 0, true, 1), 9).pattern, kNoLimits);
+  CHECK(arrow.blocks == 9 + 8);
+  CHECK_NEAR(arrow.products, 8 * 2, 0);
+}
+
 TEST(sparse_cholesky_factors_again_with_other_numbers) {
   const matrices::Blocks<6> first(matrices::dense(8, 6, 2, true, 1), 8);
   const std::vector<double> s = matrices::dense(8, 6, 2, true, 2), x = matrices::vector(48, 3);

@@ -102,3 +102,10 @@ def test_steps_give_the_scale() -> None:
     assert gauge.step_ratio(2.5 * path, path) == pytest.approx(2.5, rel=1e-12)
     assert gauge.step_ratio(path, np.zeros_like(path)) == 1.0
     assert gauge.step_ratio(np.zeros_like(path), path) == 1.0
+
+
+def test_steps_that_tie_all_to_an_old_keyframe_need_no_look_at_the_views() -> None:
+    """Nothing else is held, whatever is seen; with one tie less all is looked at, for the same."""
+    views = chain(range(5))
+    for tied in ([0, 1, 2, 3], [0, 1, 2]):
+        assert choose(problem_of(5, views), old=[0], tied=tied) == ([0], [-1] * 5), f"tied {tied}"

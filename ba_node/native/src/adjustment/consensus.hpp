@@ -174,9 +174,15 @@ inline void consensus(const RaysView& rays, std::int64_t n_points, double gate, 
   // A point that lost views by it keeps those it had.
   std::vector<std::int64_t> gained(n_points);
   for (std::int64_t o = 0; o < rays.n_rays; ++o) gained[rays.point[o]] += near[o] - static_cast<int>(agrees[o]);
-  for (std::int64_t o = 0; o < rays.n_rays; ++o)
-    if (gained[rays.point[o]] >= 0) agrees[o] = near[o];
-  Triangulator(rays, n_points, agrees).run(points, parallax, measured);
+  // Few points have other rays than before.
+  std::vector<char> changed(n_points);
+  for (std::int64_t o = 0; o < rays.n_rays; ++o) {
+    const std::int64_t p = rays.point[o];
+    if (gained[p] < 0 || static_cast<bool>(near[o]) == agrees[o]) continue;
+    changed[p] = 1;
+    agrees[o] = near[o];
+  }
+  Triangulator(rays, n_points, agrees).run(points, parallax, measured, changed.data());
 }
 
 }  // namespace ba::BA_TARGET

@@ -70,25 +70,26 @@ class Triangulator {
   }
 
   // points, m: (n_points, 3), NaN for neither two rays nor a measured distance; parallax, rad, and whether a distance
-  // was measured: (n_points,).
-  void run(double* points, double* parallax, bool* measured) {
-    const auto n_points = static_cast<std::int64_t>(begin_.size()) - 1;
-    for (std::int64_t p = 0; p < n_points; p += kPoints) {
-      const int count = static_cast<int>(std::min<std::int64_t>(kPoints, n_points - p));
-      std::int64_t most = 0;
-      for (int l = 0; l < count; ++l) most = std::max(most, begin_[p + l + 1] - begin_[p + l]);
+  // was measured: (n_points,). Of the points that ``wanted`` marks; null for all.
+  void run(double* points, double* parallax, bool* measured, const char* wanted = nullptr) {
+    const std::vector<std::int64_t> order = by_views(wanted);
+    const auto n = static_cast<std::int64_t>(order.size());
+    for (std::int64_t first = 0; first < n; first += kPoints) {
+      const std::int64_t* some = order.data() + first;
+      const int count = static_cast<int>(std::min<std::int64_t>(kPoints, n - first));
       // A view that is none has no weight.
-      views_.assign(most, View{});
+      views_.assign(views_of(some[count - 1]), View{});
       n_views_ = Register{};
-      for (int l = 0; l < count; ++l) measured[p + l] = take(p + l, l);
+      for (int l = 0; l < count; ++l) measured[some[l]] = take(some[l], l);
       Register at[3] = {};
       midpoints(at);
       const Register widest = largest_chords();
       for (int l = 0; l < count; ++l) {
-        const bool known = n_views_[l] >= 2.0 || measured[p + l];
+        const std::int64_t p = some[l];
+        const bool known = n_views_[l] >= 2.0 || measured[p];
         for (int i = 0; i < 3; ++i)
-          points[3 * (p + l) + i] = known ? at[i][l] + origin_[i][l] : std::numeric_limits<double>::quiet_NaN();
-        parallax[p + l] = 2.0 * std::asin(std::min(0.5 * widest[l], 1.0));
+          points[3 * p + i] = known ? at[i][l] + origin_[i][l] : std::numeric_limits<double>::quiet_NaN();
+        parallax[p] = 2.0 * std::asin(std::min(0.5 * widest[l], 1.0));
       }
     }
   }
@@ -102,6 +103,23 @@ class Triangulator {
   struct Equations {
     Register a[3][3], b[3];
   };
+
+  std::int64_t views_of(std::int64_t p) const { return begin_[p + 1] - begin_[p]; }
+
+  // The points that are wanted, those with fewer views first: all lanes wait for the one with most.
+  std::vector<std::int64_t> by_views(const char* wanted) const {
+    const auto n_points = static_cast<std::int64_t>(begin_.size()) - 1;
+    std::int64_t most = 0;
+    for (std::int64_t p = 0; p < n_points; ++p) most = std::max(most, views_of(p));
+    // Where those of so many views begin. Sorting by std would be compiled for this target and linked for all.
+    std::vector<std::int64_t> place(most + 2);
+    for (std::int64_t p = 0; p < n_points; ++p) place[views_of(p) + 1] += wanted == nullptr || wanted[p];
+    for (std::int64_t k = 0; k <= most; ++k) place[k + 1] += place[k];
+    std::vector<std::int64_t> order(place[most + 1]);
+    for (std::int64_t p = 0; p < n_points; ++p)
+      if (wanted == nullptr || wanted[p]) order[place[views_of(p)]++] = p;
+    return order;
+  }
 
   // Gathers the views of a point in its lane, with centres relative to their mean: keeps digits far from the origin.
   // Returns whether a distance was measured.

@@ -67,8 +67,21 @@ Ints views_of_landmarks(const Column<std::int64_t>& last, const Column<std::int6
 }
 
 Ints distinct_landmarks(const py::object& table, const Ints& begin, const Ints& end, Column<std::int64_t> scratch) {
-  const auto landmark = column_of<std::int32_t>(table, "landmark");
-  return ints(distinct(landmark.data(), rows_view(begin), end.data(), scratch.mutable_data()));
+  const TableView view = TableArrays(table).view();
+  const auto previous = column_of<std::int64_t>(table, "previous");
+  const RowsView from = rows_view(begin);
+  // After a rest these lines have left the caches, and whoever asks who sees what gathers its views next, by landmark.
+  for (std::int64_t k = 0; k < from.n; ++k) {
+    const std::int64_t first = from.row[k], last = end.data()[k];
+    fetch_ahead(previous.data(), first, last);
+    fetch_ahead(view.keyframe, first, last);
+    fetch_ahead(view.camera, first, last);
+    fetch_ahead(view.outlier, first, last);
+    fetch_ahead(view.uv, 2 * first, 2 * last);
+    fetch_ahead(view.sigma, first, last);
+    fetch_ahead(view.depth, first, last);
+  }
+  return ints(distinct(view.landmark, from, end.data(), scratch.mutable_data()));
 }
 
 py::tuple inliers_by_keyframe(const py::object& table, const Ints& rows, Column<std::int64_t> scratch) {

@@ -106,8 +106,9 @@ Fill find_fill(const Rows32& upper, const FillLimits& limits) {
   const Neighbours near = neighbours(upper);
   std::vector<std::int32_t> in_turn(near.size());
   for (std::size_t i = 0; i < in_turn.size(); ++i) in_turn[i] = static_cast<std::int32_t>(i);
-  Fill least = eliminate(near, {}, limits);
   Fill turn = eliminate(near, in_turn, limits);
+  if (turn.complete && turn.blocks == static_cast<std::int64_t>(upper.index.size())) return turn;
+  Fill least = eliminate(near, {}, limits);
   const bool better = turn.complete && (!least.complete || turn.products <= least.products);
   return better ? turn : least;
 }
