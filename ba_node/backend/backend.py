@@ -304,10 +304,6 @@ class Backend:
         scene, copies, config, wanted = self.scene, [self.scene.clone()], self.config, self.extras
         return lambda: full.take_snapshot(copies.pop(), config, wanted, scene)
 
-    def is_current(self, optimization: full.Optimization) -> bool:
-        """Return True if a solve of everything is of the current map."""
-        return optimization.scene is self.scene
-
     def merge(
         self, optimization: full.Optimization, first: Callable[[], None] = lambda: None, *, grown: bool = False
     ) -> tuple[Estimate, int] | None:
