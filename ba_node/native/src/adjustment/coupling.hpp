@@ -53,6 +53,16 @@ class Coupling {
     }
   }
 
+  // Z of a batch whose points all have the edges of the first, by lane: z[18 k + 6 c + r] is row r of column c of their
+  // edge k. Add Z y to sums[6 k + r].
+  void edges_by_lane(std::int64_t batch, V8* z, V8* sums) const {
+    if (l_.has_depth || l_.has_rigs) {
+      edges_of_lanes<true>(batch, z, sums);
+    } else {
+      edges_of_lanes<false>(batch, z, sums);
+    }
+  }
+
   // Add E p to sums for p of the points of a batch.
   void add_coupling(std::int64_t batch, const V8 (&p)[3], Column<D>* sums) const {
     const V8* x = &equations_.point[3 * batch];
@@ -129,6 +139,26 @@ class Coupling {
     }
   }
 
+  template <bool kGeneral>
+  void edges_of_lanes(std::int64_t batch, V8* z, V8* sums) const {
+    const V8(&x)[3] = *reinterpret_cast<const V8(*)[3]>(&equations_.point[3 * batch]);
+    const Packed& li = inverse_l(batch);
+    const V8* y = scaled_gradient(batch);
+    V8 c[6] = {}, f[D == 9 ? 9 : 1] = {};
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
+      couple<kGeneral>(slot, c, f);
+      if (l_.slot_edge[kLanes * slot] < 0) continue;
+      V8 columns[3][8], ninth[8];
+      scale(li, x, c, f, columns, ninth);
+      for (int r = 0; r < 6; ++r) {
+        sums[r] += columns[0][r] * y[0] + columns[1][r] * y[1] + columns[2][r] * y[2];
+        for (int col = 0; col < 3; ++col) z[6 * col + r] = columns[col][r];
+      }
+      z += 18;
+      sums += 6;
+    }
+  }
+
   // sum a a' (packed) and, where intrinsics are free, sum i a' over the rows of the observations of an edge so far.
   template <bool kGeneral>
   [[gnu::always_inline]] void couple(std::int64_t slot, V8 (&c)[6], V8* f) const {
@@ -168,11 +198,32 @@ class Coupling {
     }
   }
 
-  // Z of the edges that end in a slot, z[edge]: with E = (x x C; C; F), its columns from those of C L^-T and F L^-T.
+  // Z of the edges that end in a slot, z[edge].
   [[gnu::always_inline]] void store_edges(std::int64_t slot, const Packed& li, const V8 (&x)[3], const V8 (&c)[6],
                                           const V8* f, Edge<D>* z) const {
-    const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
     V8 columns[3][8], ninth[8] = {};
+    scale(li, x, c, f, columns, ninth);
+#pragma GCC unroll 3
+    for (int col = 0; col < 3; ++col) {
+      if constexpr (D == 6) {
+        columns[col][6] = columns[col][0];
+        columns[col][7] = columns[col][1];
+      }
+      transpose(columns[col]);
+    }
+    if constexpr (D == 9) transpose(ninth);
+    const std::int32_t* edge = &l_.slot_edge[kLanes * slot];
+    for (int l = 0; l < kLanes; ++l) {
+      if (edge[l] < 0) continue;
+      for (int col = 0; col < 3; ++col) z[edge[l]].a[col] = columns[col][l];
+      if constexpr (D == 9) z[edge[l]].b = ninth[l];
+    }
+  }
+
+  // The columns of Z, of E = (x x C; C; F): from those of C L^-T and F L^-T. ninth: row 8 of each column, if any.
+  [[gnu::always_inline]] static void scale(const Packed& li, const V8 (&x)[3], const V8 (&c)[6], const V8* f,
+                                           V8 (&columns)[3][8], V8 (&ninth)[8]) {
+    const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
 #pragma GCC unroll 3
     for (int i = 0; i < 3; ++i) {
       V8 w[3];
@@ -192,21 +243,7 @@ class Coupling {
       }
     }
 #pragma GCC unroll 3
-    for (int col = 0; col < 3; ++col) {
-      pose_row(x, columns[col] + 3, columns[col]);
-      if constexpr (D == 6) {
-        columns[col][6] = columns[col][0];
-        columns[col][7] = columns[col][1];
-      }
-      transpose(columns[col]);
-    }
-    if constexpr (D == 9) transpose(ninth);
-    const std::int32_t* edge = &l_.slot_edge[kLanes * slot];
-    for (int l = 0; l < kLanes; ++l) {
-      if (edge[l] < 0) continue;
-      for (int col = 0; col < 3; ++col) z[edge[l]].a[col] = columns[col][l];
-      if constexpr (D == 9) z[edge[l]].b = ninth[l];
-    }
+    for (int col = 0; col < 3; ++col) pose_row(x, columns[col] + 3, columns[col]);
   }
 
   // Register `reg` of the records of a slot, each number by lane.
