@@ -22,31 +22,37 @@ namespace ba::BA_TARGET {
 template <int D>
 constexpr bool kByLanes = D == 6 && sizeof(Register) == sizeof(V8);
 
-// s -= the sum over lanes of x y' over n batches, each `stride` after the one before.
-template <int D>
-void subtract_lanes(Block<D>& s, const V8* x, const V8* y, std::int64_t n, std::int64_t stride) {
-  for (int first = 0; first < 6; first += 3) {
-    V8 sums[3][6] = {};
-    const V8 *a = x, *b = y + first;
-    for (std::int64_t k = 0; k < n; ++k, a += stride, b += stride) {
+// Columns c0 to c0 + 2 of s, from row r0 on, less the sum over lanes of x y' over n batches, each `stride` after the
+// one before.
+template <int c0, int r0, int D>
+[[gnu::always_inline]] inline void subtract_columns(Block<D>& s, const V8* x, const V8* y, std::int64_t n,
+                                                    std::int64_t stride) {
+  V8 sums[3][6] = {};
+  for (std::int64_t k = 0; k < n; ++k, x += stride, y += stride) {
 #pragma GCC unroll 3
-      for (int i = 0; i < 3; ++i) {
-        const V8 factor[3] = {b[6 * i], b[6 * i + 1], b[6 * i + 2]};
+    for (int i = 0; i < 3; ++i) {
+      const V8* b = y + 6 * i + c0;
+      const V8 factor[3] = {b[0], b[1], b[2]};
 #pragma GCC unroll 6
-        for (int r = 0; r < 6; ++r) {
-          const V8 row = a[6 * i + r];
+      for (int r = r0; r < 6; ++r) {
+        const V8 row = x[6 * i + r];
 #pragma GCC unroll 3
-          for (int c = 0; c < 3; ++c) sums[c][r] += row * factor[c];
-        }
+        for (int c = 0; c < 3; ++c) sums[c][r] += row * factor[c];
       }
     }
-#pragma GCC unroll 3
-    for (int c = 0; c < 3; ++c) {
-      double* to = &s.v[kStride6 * (first + c)];
-      const V8 column = load(to) - lane_sums(sums[c]);
-      std::memcpy(to, &column, sizeof(column));
-    }
   }
+#pragma GCC unroll 3
+  for (int c = 0; c < 3; ++c) {
+    double* to = &s.v[kStride6 * (c0 + c)];
+    const V8 column = load(to) - lane_sums(sums[c]);
+    std::memcpy(to, &column, sizeof(column));
+  }
+}
+
+// What is above the diagonal, from what is below it.
+inline void mirror(Block<6>& s) {
+  for (int c = 0; c < 6; ++c)
+    for (int r = 0; r < c; ++r) set_entry(s, r, c, entry(s, c, r));
 }
 
 template <int D>
@@ -78,8 +84,15 @@ class AlikeBatches {
         const std::int32_t* block = &block_[run.first_block];
         for (std::int64_t a = 0; a < m; ++a) {
           sums[columns_of(run.begin)[a]].a += lane_sums(*reinterpret_cast<const V8(*)[6]>(of_gradient + D * a));
-          for (std::int64_t b = a; b < m; ++b)
-            subtract_lanes(blocks[*block++], z + kNumbers * a, z + kNumbers * b, n, stride);
+          const V8* x = z + kNumbers * a;
+          // Of a block on the diagonal what is above it is mirrored in the end.
+          subtract_columns<0, 0>(blocks[*block], x, x, n, stride);
+          subtract_columns<3, 3>(blocks[*block++], x, x, n, stride);
+          for (std::int64_t b = a + 1; b < m; ++b) {
+            const V8* y = z + kNumbers * b;
+            subtract_columns<0, 0>(blocks[*block], x, y, n, stride);
+            subtract_columns<3, 0>(blocks[*block++], x, y, n, stride);
+          }
         }
       }
     }

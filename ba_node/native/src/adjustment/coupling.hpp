@@ -21,7 +21,8 @@ class Coupling {
   Coupling(const Layout& layout, const Equations<D>& equations) : l_(layout), equations_(equations) {
     inverse_l_.resize(6 * l_.n_batches);
     scaled_gradient_.resize(3 * l_.n_batches);
-    step_.resize(l_.n_free);
+    step_.resize(l_.n_free + 1);
+    clear(&step_[l_.n_free], 1);
     find_columns();
   }
 
@@ -85,7 +86,7 @@ class Coupling {
       transpose(out);
       for (int l = 0; l < kLanes; ++l) {
         const std::int32_t column = column_of_lane(kLanes * slot + l);
-        if (column < 0) continue;
+        if (column == l_.n_free) continue;
         sums[column].a += out[l];
         if constexpr (D == 9) sums[column].b += ninth[l];
       }
@@ -98,12 +99,19 @@ class Coupling {
     V8 z[3] = {};
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       V8 s[8], t[8], q[3], last{};
-      for (int l = 0; l < kLanes; ++l) {
-        const std::int32_t column = column_of_lane(kLanes * slot + l);
-        s[l] = column < 0 ? V8{} : step_[column].a;
-        if constexpr (D == 9) last[l] = column < 0 ? 0.0 : step_[column].b;
+      const std::int32_t* image = &l_.slot_image[kLanes * slot];
+      // Where there is no observation its record is zero.
+      if (l_.has_one_image(slot)) {
+        const Column<D>& step = step_[image_column_[image[0]]];
+#pragma GCC unroll 8
+        for (int i = 0; i < (D == 9 ? 8 : 6); ++i) s[i] = splat(step.a[i]);
+        if constexpr (D == 9) last = splat(step.b);
+      } else {
+#pragma GCC unroll 8
+        for (int l = 0; l < kLanes; ++l) s[l] = step_[image_column_[image[l]]].a;
+        if constexpr (D == 9) last = each([&](int l) { return step_[image_column_[image[l]]].b; });
+        transpose(s);
       }
-      transpose(s);
       q[0] = s[1] * x[2] - s[2] * x[1] + s[3];
       q[1] = s[2] * x[0] - s[0] * x[2] + s[4];
       q[2] = s[0] * x[1] - s[1] * x[0] + s[5];
@@ -254,14 +262,14 @@ class Coupling {
     transpose(t);
   }
 
-  // The free keyframe of a lane, or -1.
+  // The free keyframe of a lane, or n_free.
   std::int32_t column_of_lane(std::int64_t at) const {
-    return l_.inverse_sigma[at] != 0.0 ? image_column_[l_.slot_image[at]] : -1;
+    return l_.inverse_sigma[at] != 0.0 ? image_column_[l_.slot_image[at]] : static_cast<std::int32_t>(l_.n_free);
   }
 
-  // Which free keyframe each image is of.
+  // Which free keyframe each image is of; n_free if of none.
   void find_columns() {
-    image_column_.assign(l_.images.size(), -1);
+    image_column_.assign(l_.images.size(), static_cast<std::int32_t>(l_.n_free));
     const std::int64_t none = kLanes * l_.n_slots(), lists = static_cast<std::int64_t>(l_.list_begin.size()) - 1;
     for (std::int64_t list = 0; list < lists; ++list)
       for (std::int64_t i = l_.list_begin[list]; i < l_.list_begin[list + 1]; ++i)
@@ -273,7 +281,7 @@ class Coupling {
   const Equations<D>& equations_;
   std::vector<std::int32_t> image_column_;
   Buffer<V8> inverse_l_, scaled_gradient_;
-  Buffer<Column<D>> step_;
+  Buffer<Column<D>> step_;  // the last is zero
 };
 
 }  // namespace ba::BA_TARGET

@@ -20,6 +20,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 
 #include "adjustment/types.hpp"
 #include "parallel/memory.hpp"
@@ -81,6 +82,14 @@ class Layout {
   std::int64_t n_sections() const { return static_cast<std::int64_t>(sections.size()) - 1; }
   // How many lists the observations of each keyframe are in.
   std::int64_t n_lists() const { return n_obs >= kMinListedApart * n_free ? n_sections() : 1; }
+  // Whether all lanes of a slot have the same image.
+  bool has_one_image(std::int64_t slot) const {
+    std::uint64_t pairs[kLanes / 2];
+    std::memcpy(pairs, &slot_image[kLanes * slot], sizeof(pairs));
+    std::uint64_t differ = pairs[0] ^ (pairs[0] << 32 | pairs[0] >> 32);
+    for (int i = 1; i < kLanes / 2; ++i) differ |= pairs[0] ^ pairs[i];
+    return differ == 0;
+  }
   // Lanes of a batch that are points, not padding.
   int lanes(std::int64_t batch) const {
     return static_cast<int>(std::min<std::int64_t>(kLanes, n_points - kLanes * batch));

@@ -5,6 +5,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <limits>
 #include <memory>
@@ -19,8 +20,29 @@
 
 namespace ba::BA_TARGET {
 
+// The same of up to 64 free keyframes, each a bit.
+inline Rows32 coupled_by_bits(const Layout& l, const CoupledPairs& factors) {
+  std::array<std::uint64_t, 64> met{};
+  const auto bit = [](std::int32_t k) { return std::uint64_t{1} << k; };
+  for (std::size_t p = 0; p + 1 < l.point_edge.size(); ++p) {
+    std::uint64_t seen_by = 0;
+    for (std::int32_t e = l.point_edge[p]; e < l.point_edge[p + 1]; ++e) seen_by |= bit(l.edge_column[e]);
+    for (std::int32_t e = l.point_edge[p]; e < l.point_edge[p + 1]; ++e) met[l.edge_column[e]] |= seen_by;
+  }
+  for (std::size_t k = 0; k < factors.size(); ++k) met[factors.row[k]] |= bit(factors.column[k]);
+  Rows32 upper;
+  for (std::int32_t i = 0; i < l.n_free; ++i) {
+    upper.index.push_back(i);
+    for (std::int32_t j = i + 1; j < l.n_free; ++j)
+      if (met[i] & bit(j)) upper.index.push_back(j);
+    upper.close_row();
+  }
+  return upper;
+}
+
 // Pairs (i, j >= i) of free keyframes that share a point or a factor, the diagonal first in each row.
 inline Rows32 coupled(const Layout& l, const CoupledPairs& factors) {
+  if (l.n_free <= 64) return coupled_by_bits(l, factors);
   Rows32 upper;
   std::vector<std::int32_t> met_by(l.n_free, -1);
   std::size_t next = 0;
@@ -101,7 +123,11 @@ class SparseSchur {
       add_partials(blocks_.data(), n_blocks(), n_blocks() * task / kSumTasks, n_blocks() * (task + 1) / kSumTasks);
     });
     add_partials(sums_.data(), l_.n_free, 0, l_.n_free);
-    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
+    for (std::int64_t k = 0; k < l_.n_free; ++k) {
+      Block<D>& block = blocks_[pattern_.start[k]];
+      if constexpr (kByLanes<D>) mirror(block);
+      add_diagonal(k, block);
+    }
     for (std::size_t k = 0; k < place_of_pair_.size(); ++k) add(blocks_[place_of_pair_[k]], pairs[k]);
   }
 
