@@ -66,6 +66,7 @@ class Coupling {
 
   // Add E p to sums for p of the points of a batch.
   void add_coupling(std::int64_t batch, const V8 (&p)[3], Column<D>* sums) const {
+    const auto none = static_cast<std::int32_t>(l_.n_free);
     const V8* x = &equations_.point[3 * batch];
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       V8 t[8], h[3], out[8] = {}, ninth{};
@@ -84,9 +85,10 @@ class Coupling {
       }
       pose_row(x, h, out);
       transpose(out);
+      // Where there is no observation its record is zero.
       for (int l = 0; l < kLanes; ++l) {
-        const std::int32_t column = column_of_lane(kLanes * slot + l);
-        if (column == l_.n_free) continue;
+        const std::int32_t column = image_column_[l_.slot_image[kLanes * slot + l]];
+        if (column == none) continue;
         sums[column].a += out[l];
         if constexpr (D == 9) sums[column].b += ninth[l];
       }
@@ -260,11 +262,6 @@ class Coupling {
 #pragma GCC unroll 8
     for (int l = 0; l < kLanes; ++l) t[l] = record[l * equations_.registers];
     transpose(t);
-  }
-
-  // The free keyframe of a lane, or n_free.
-  std::int32_t column_of_lane(std::int64_t at) const {
-    return l_.inverse_sigma[at] != 0.0 ? image_column_[l_.slot_image[at]] : static_cast<std::int32_t>(l_.n_free);
   }
 
   // Which free keyframe each image is of; n_free if of none.

@@ -153,32 +153,20 @@ class Rows {
 
   template <Lens kLens>
   [[gnu::always_inline]] void gather(std::int64_t slot, Images& out) const {
-    const std::int32_t* image = &l_.slot_image[kLanes * slot];
-    const auto put = [&](auto columns_of) {
-      V8 r[8];
-      columns_of(0, r);
-      for (int i = 0; i < 8; ++i) out.rotation[i] = r[i];
-      columns_of(8, r);
-      out.rotation[8] = r[0];
-      for (int i = 0; i < 3; ++i) out.translation[i] = r[1 + i];
-      for (int i = 0; i < 4; ++i) out.cameras.param[i] = r[4 + i];
-      if constexpr (kLens != Lens::kPinhole) {
-        columns_of(16, r);
-        for (int i = 0; i < 8; ++i) out.cameras.param[4 + i] = r[i];
-      }
-      if constexpr (kLens == Lens::kMixed) {
-        columns_of(24, r);
-        out.cameras.fisheye = r[0];
-      }
-    };
-    if (l_.has_one_image(slot)) {
-      const double* numbers = &image_[stride_ * image[0]];
-      put([&](int offset, V8(&r)[8]) {
-#pragma GCC unroll 8
-        for (int i = 0; i < kLanes; ++i) r[i] = splat(numbers[offset + i]);
-      });
-    } else {
-      put([&](int offset, V8(&r)[8]) { columns(image, offset, r); });
+    V8 r[8];
+    columns(slot, 0, r);
+    for (int i = 0; i < 8; ++i) out.rotation[i] = r[i];
+    columns(slot, 8, r);
+    out.rotation[8] = r[0];
+    for (int i = 0; i < 3; ++i) out.translation[i] = r[1 + i];
+    for (int i = 0; i < 4; ++i) out.cameras.param[i] = r[4 + i];
+    if constexpr (kLens != Lens::kPinhole) {
+      columns(slot, 16, r);
+      for (int i = 0; i < 8; ++i) out.cameras.param[4 + i] = r[i];
+    }
+    if constexpr (kLens == Lens::kMixed) {
+      columns(slot, 24, r);
+      out.cameras.fisheye = r[0];
     }
   }
 
@@ -265,9 +253,17 @@ class Rows {
     }
   }
 
-  [[gnu::always_inline]] void columns(const std::int32_t* image, int offset, V8 (&r)[8]) const {
+  // Eight numbers of the images of a slot.
+  [[gnu::always_inline]] void columns(std::int64_t slot, int offset, V8 (&r)[8]) const {
+    const std::int32_t* image = &l_.slot_image[kLanes * slot];
+    const double* numbers = &image_[offset];
+    if (l_.has_one_image(slot)) {
 #pragma GCC unroll 8
-    for (int l = 0; l < kLanes; ++l) r[l] = load(&image_[stride_ * image[l] + offset]);
+      for (int i = 0; i < kLanes; ++i) r[i] = splat(numbers[stride_ * image[0] + i]);
+      return;
+    }
+#pragma GCC unroll 8
+    for (int l = 0; l < kLanes; ++l) r[l] = load(numbers + stride_ * image[l]);
     transpose(r);
   }
 
