@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "adjustment/coupling.hpp"
@@ -20,21 +21,21 @@ namespace ba::BA_TARGET {
 
 // Whether that pays: it needs 22 registers of eight, and blocks of 9 x 9 leave few lanes empty as they are.
 template <int D>
-constexpr bool kByLanes = D == 6 && sizeof(Register) == sizeof(V8);
+constexpr bool kByLanes = D == 6 && kWhole;
 
-// Columns c0 to c0 + 2 of s, from row r0 on, less the sum over lanes of x y' over n batches, each `stride` after the
-// one before.
-template <int c0, int r0, int D>
+// Three columns of s from kColumn on, from row kRow on, less the sum over lanes of x y' over n batches, each `stride`
+// after the one before.
+template <int kColumn, int kRow, int D>
 [[gnu::always_inline]] inline void subtract_columns(Block<D>& s, const V8* x, const V8* y, std::int64_t n,
                                                     std::int64_t stride) {
   V8 sums[3][6] = {};
   for (std::int64_t k = 0; k < n; ++k, x += stride, y += stride) {
 #pragma GCC unroll 3
     for (int i = 0; i < 3; ++i) {
-      const V8* b = y + 6 * i + c0;
+      const V8* b = y + 6 * i + kColumn;
       const V8 factor[3] = {b[0], b[1], b[2]};
 #pragma GCC unroll 6
-      for (int r = r0; r < 6; ++r) {
+      for (int r = kRow; r < 6; ++r) {
         const V8 row = x[6 * i + r];
 #pragma GCC unroll 3
         for (int c = 0; c < 3; ++c) sums[c][r] += row * factor[c];
@@ -43,7 +44,7 @@ template <int c0, int r0, int D>
   }
 #pragma GCC unroll 3
   for (int c = 0; c < 3; ++c) {
-    double* to = &s.v[kStride6 * (c0 + c)];
+    double* to = &s.v[kStride6 * (kColumn + c)];
     const V8 column = load(to) - lane_sums(sums[c]);
     std::memcpy(to, &column, sizeof(column));
   }

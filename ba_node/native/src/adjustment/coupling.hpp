@@ -103,7 +103,7 @@ class Coupling {
       V8 s[8], t[8], q[3], last{};
       const std::int32_t* image = &l_.slot_image[kLanes * slot];
       // Where there is no observation its record is zero.
-      if (l_.has_one_image(slot)) {
+      if (kWhole && l_.has_one_image(slot)) {
         const Column<D>& step = step_[image_column_[image[0]]];
 #pragma GCC unroll 8
         for (int i = 0; i < (D == 9 ? 8 : 6); ++i) s[i] = splat(step.a[i]);
@@ -159,7 +159,8 @@ class Coupling {
       couple<kGeneral>(slot, c, f);
       if (l_.slot_edge[kLanes * slot] < 0) continue;
       V8 columns[3][8], ninth[8];
-      scale(li, x, c, f, columns, ninth);
+      scale(li, c, f, columns, ninth);
+      for (int col = 0; col < 3; ++col) pose_row(x, columns[col] + 3, columns[col]);
       for (int r = 0; r < 6; ++r) {
         sums[r] += columns[0][r] * y[0] + columns[1][r] * y[1] + columns[2][r] * y[2];
         for (int col = 0; col < 3; ++col) z[6 * col + r] = columns[col][r];
@@ -212,9 +213,10 @@ class Coupling {
   [[gnu::always_inline]] void store_edges(std::int64_t slot, const Packed& li, const V8 (&x)[3], const V8 (&c)[6],
                                           const V8* f, Edge<D>* z) const {
     V8 columns[3][8], ninth[8] = {};
-    scale(li, x, c, f, columns, ninth);
+    scale(li, c, f, columns, ninth);
 #pragma GCC unroll 3
     for (int col = 0; col < 3; ++col) {
+      pose_row(x, columns[col] + 3, columns[col]);
       if constexpr (D == 6) {
         columns[col][6] = columns[col][0];
         columns[col][7] = columns[col][1];
@@ -230,9 +232,10 @@ class Coupling {
     }
   }
 
-  // The columns of Z, of E = (x x C; C; F): from those of C L^-T and F L^-T. ninth: row 8 of each column, if any.
-  [[gnu::always_inline]] static void scale(const Packed& li, const V8 (&x)[3], const V8 (&c)[6], const V8* f,
-                                           V8 (&columns)[3][8], V8 (&ninth)[8]) {
+  // C L^-T and F L^-T: with E = (x x C; C; F), of the columns of Z what is below the rows of the rotation. ninth: row 8
+  // of each, if any.
+  [[gnu::always_inline]] static void scale(const Packed& li, const V8 (&c)[6], const V8* f, V8 (&columns)[3][8],
+                                           V8 (&ninth)[8]) {
     const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
 #pragma GCC unroll 3
     for (int i = 0; i < 3; ++i) {
@@ -252,8 +255,6 @@ class Coupling {
         for (int col = 0; col < 3; ++col) (i < 2 ? columns[col][6 + i] : ninth[col]) = w[col];
       }
     }
-#pragma GCC unroll 3
-    for (int col = 0; col < 3; ++col) pose_row(x, columns[col] + 3, columns[col]);
   }
 
   // Register `reg` of the records of a slot, each number by lane.

@@ -15,6 +15,7 @@
 // - record:  what is kept of an observation where the problem is linearised: its rows of the Jacobian, by registers.
 // - section: a quarter of the batches of a problem that is not small. Sections take about as long as one another.
 // - chunk:   neighbouring batches of a section that one thread works on, the unit of every loop over points.
+// - run:     neighbouring batches all of whose points are seen by the same free keyframes.
 // - strip:   neighbouring batches whose blocks Z stay in the nearer caches while S is summed.
 #pragma once
 

@@ -257,7 +257,7 @@ class Rows {
   [[gnu::always_inline]] void columns(std::int64_t slot, int offset, V8 (&r)[8]) const {
     const std::int32_t* image = &l_.slot_image[kLanes * slot];
     const double* numbers = &image_[offset];
-    if (l_.has_one_image(slot)) {
+    if (kWhole && l_.has_one_image(slot)) {
 #pragma GCC unroll 8
       for (int i = 0; i < kLanes; ++i) r[i] = splat(numbers[stride_ * image[0] + i]);
       return;

@@ -272,7 +272,12 @@ class SparseSchur {
     const std::int32_t *column = l_.edge_column.data(), i = column[e], end = l_.edge_end[e];
     const Left<D> left(z[e]);
     Block<D>* row = blocks + pattern_.start[i];
-    for (std::int32_t f = e; f < end; ++f) subtract_product(row[place_in_row(i, column[f])], left, z[f]);
+    if (place_of_[i] == kSearched) {
+      for (std::int32_t f = e; f < end; ++f) subtract_product(row[place_in_row(i, column[f])], left, z[f]);
+      return;
+    }
+    const std::int32_t* place = place_.data() + place_of_[i];
+    for (std::int32_t f = e; f < end; ++f) subtract_product(row[place[column[f]]], left, z[f]);
   }
 
   // Where in row i the block of column j is.

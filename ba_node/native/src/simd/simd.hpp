@@ -107,6 +107,10 @@ using V8 = Twice<Twice<Native2, Native2Mask>, TwiceMask<Native2Mask>>;
 using Mask = TwiceMask<TwiceMask<Native2Mask>>;
 #endif
 
+// Whether eight lanes are one register. Where they are two there are half as many to work with, and what is chosen
+// between goes through memory.
+constexpr bool kWhole = sizeof(Register) == sizeof(V8);
+
 // Register by register: a copy of the whole goes through memory.
 template <class V>
 struct Loaded {
