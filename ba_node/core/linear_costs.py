@@ -42,9 +42,9 @@ _WORTH_A_TRY = 15
 # And only where the map is so many tracks long at most: on longer ones PCG ends after a step or two by a residual of
 # which the weak modes are next to nothing, and iteration after iteration gains next to nothing too.
 _TRIED_STRETCHES = 4.0
-# Up to so many unknowns S is factored as a dense matrix, in a few microseconds at most; to count what else there is
-# takes longer. At these sizes a try of PCG is never worth it.
-FEW_UNKNOWNS = 64
+# Up to so many unknowns S is factored as a dense matrix, in 20 microseconds at most; to count what else there is takes
+# longer. At these sizes a try of PCG is never worth it.
+FEW_UNKNOWNS = 128
 # No factor may take more memory than this.
 MAX_BYTES = 4.8e9
 

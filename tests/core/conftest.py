@@ -28,6 +28,7 @@ class Spec:
     noise_px: float = 0.5
     start_error: float = 0.01
     seen_share: float = 0.7
+    track: int = 0  # points are seen by so many keyframes in a row, and by no others; 0: by any
     spacing_m: float = 0.4
     seed: int = 0
 
@@ -43,6 +44,10 @@ def make(spec: Spec) -> tuple[Problem, State]:
     n_cam = len(cams.model)
     seen = rng.random((spec.points, spec.keyframes, n_cam)) < spec.seen_share
     seen[:, :2] = True
+    if spec.track:
+        first = np.arange(spec.points) * (spec.keyframes - spec.track + 1) // spec.points
+        ahead = np.arange(spec.keyframes) - first[:, None]
+        seen[...] = ((ahead >= 0) & (ahead < spec.track))[:, :, None]
     point, keyframe, camera = np.nonzero(seen)
     n = len(point)
     unmeasured = Observations(keyframe, camera, point, np.zeros((n, 2)), np.ones(n), np.empty(0), np.empty(0))

@@ -27,6 +27,9 @@ SHAPES = {
     "own intrinsics": {"free_intrinsics": True},
     "nothing fixed": {"fixed": 0},
     "most fixed": {"fixed": 4},
+    # Batches of eight points that are seen by the same keyframes, in runs of several, of one and of none.
+    "tracks": {"distorted": False, "track": 3, "points": 125},
+    "stereo tracks": {"stereo": True, "depth": True, "track": 4, "points": 83, "keyframes": 7},
 }
 
 

@@ -257,7 +257,7 @@ def test_a_factor_beyond_the_limit_is_never_the_cheapest(cameras: int, reach: in
 
 
 @built
-@pytest.mark.parametrize(("keyframes", "is_counted"), [(10, False), (11, True)])
+@pytest.mark.parametrize(("keyframes", "is_counted"), [(21, False), (22, True)])
 def test_what_each_way_costs_is_not_counted_for_few_unknowns(
     keyframes: int, is_counted: bool, make_problem: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,11 +15,12 @@ using namespace ba;
 
 namespace {
 
-// Keyframes along a line, the first fixed, that observe every point 4 to 8 m ahead; noise of a pixel, start off.
+// Keyframes along a line, the first fixed, of which so many in a row observe each point, 4 to 8 m ahead; noise of a
+// pixel, start off.
 struct Scene {
   static constexpr std::int64_t kKeyframes = 6, kPoints = 150;
 
-  Scene() {
+  explicit Scene(std::int64_t track = kKeyframes) {
     matrices::Numbers numbers(1);
     for (std::int64_t k = 0; k < kKeyframes; ++k) {
       for (int i = 0; i < 9; ++i) rotation.push_back(i % 4 == 0 ? 1.0 : 0.0);
@@ -28,7 +29,8 @@ struct Scene {
     }
     for (std::int64_t p = 0; p < kPoints; ++p) {
       const double x[3] = {2 * numbers.next(), 2 * numbers.next(), 6 + 2 * numbers.next()};
-      for (std::int64_t k = 0; k < kKeyframes; ++k) {
+      const std::int64_t first = p * (kKeyframes - track + 1) / kPoints;
+      for (std::int64_t k = first; k < first + track; ++k) {
         keyframe.push_back(k);
         camera.push_back(0);
         point.push_back(p);
@@ -117,8 +119,9 @@ TEST(any_number_of_threads_gives_the_same_bits) {
   }
 }
 
-TEST(all_linear_solvers_agree) {
-  const Scene scene;
+namespace {
+
+void check_linear_solvers(const Scene& scene) {
   const std::unique_ptr<Kernel> kernel = scene.kernel(2);
   kernel->linearise(scene.state());
   kernel->damp(true, 1e-2);
@@ -140,3 +143,9 @@ TEST(all_linear_solvers_agree) {
   for (double value : rhs) largest = std::max(largest, std::abs(value));
   CHECK_NEAR(matrices::distance(product, rhs) / largest, 0, 1e-10);
 }
+
+}  // namespace
+
+TEST(all_linear_solvers_agree) { check_linear_solvers(Scene()); }
+
+TEST(all_linear_solvers_agree_on_tracks) { check_linear_solvers(Scene(3)); }

@@ -31,6 +31,13 @@ TEST(lanes_are_loaded_and_set_in_order) {
   CHECK_NEAR(sum(loaded), 31, 0);
 }
 
+TEST(lanes_of_six_are_summed_at_once) {
+  V8 x[6];
+  for (int i = 0; i < 6; ++i) x[i] = numbers(1 + 10 * i, 0.25 * i);
+  const V8 sums = lane_sums(x);
+  for (int i = 0; i < 8; ++i) CHECK_NEAR(sums[i], i < 6 ? 8 * (1 + 10 * i) + 0.25 * i * 28 : 0, 0);
+}
+
 TEST(arithmetic_goes_lane_by_lane) {
   const V8 a = numbers(1, 1), b = numbers(-3, 0.5);
   V8 c = a;

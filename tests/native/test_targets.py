@@ -36,6 +36,8 @@ PROBLEMS = {
     "distorted": Spec(start_error=0.02),
     "depth": Spec(depth=True, stereo=True, start_error=0.02),
     "own intrinsics": Spec(free_intrinsics=True, start_error=0.02),
+    "tracks": Spec(distorted=False, track=3, points=125, start_error=0.02),
+    "stereo tracks": Spec(stereo=True, depth=True, track=4, points=83, keyframes=7, start_error=0.02),
 }
 Quantities = dict[str, np.ndarray]
 

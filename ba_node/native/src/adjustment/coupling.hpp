@@ -21,7 +21,8 @@ class Coupling {
   Coupling(const Layout& layout, const Equations<D>& equations) : l_(layout), equations_(equations) {
     inverse_l_.resize(6 * l_.n_batches);
     scaled_gradient_.resize(3 * l_.n_batches);
-    step_.resize(l_.n_free);
+    step_.resize(l_.n_free + 1);
+    clear(&step_[l_.n_free], 1);
     find_columns();
   }
 
@@ -53,8 +54,19 @@ class Coupling {
     }
   }
 
+  // Z of a batch whose points all have the edges of the first, by lane: z[18 k + 6 c + r] is row r of column c of their
+  // edge k. Add Z y to sums[6 k + r].
+  void edges_by_lane(std::int64_t batch, V8* z, V8* sums) const {
+    if (l_.has_depth || l_.has_rigs) {
+      edges_of_lanes<true>(batch, z, sums);
+    } else {
+      edges_of_lanes<false>(batch, z, sums);
+    }
+  }
+
   // Add E p to sums for p of the points of a batch.
   void add_coupling(std::int64_t batch, const V8 (&p)[3], Column<D>* sums) const {
+    const auto none = static_cast<std::int32_t>(l_.n_free);
     const V8* x = &equations_.point[3 * batch];
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       V8 t[8], h[3], out[8] = {}, ninth{};
@@ -73,9 +85,10 @@ class Coupling {
       }
       pose_row(x, h, out);
       transpose(out);
+      // Where there is no observation its record is zero.
       for (int l = 0; l < kLanes; ++l) {
-        const std::int32_t column = column_of_lane(kLanes * slot + l);
-        if (column < 0) continue;
+        const std::int32_t column = image_column_[l_.slot_image[kLanes * slot + l]];
+        if (column == none) continue;
         sums[column].a += out[l];
         if constexpr (D == 9) sums[column].b += ninth[l];
       }
@@ -88,12 +101,19 @@ class Coupling {
     V8 z[3] = {};
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       V8 s[8], t[8], q[3], last{};
-      for (int l = 0; l < kLanes; ++l) {
-        const std::int32_t column = column_of_lane(kLanes * slot + l);
-        s[l] = column < 0 ? V8{} : step_[column].a;
-        if constexpr (D == 9) last[l] = column < 0 ? 0.0 : step_[column].b;
+      const std::int32_t* image = &l_.slot_image[kLanes * slot];
+      // Where there is no observation its record is zero.
+      if (kWhole && l_.has_one_image(slot)) {
+        const Column<D>& step = step_[image_column_[image[0]]];
+#pragma GCC unroll 8
+        for (int i = 0; i < (D == 9 ? 8 : 6); ++i) s[i] = splat(step.a[i]);
+        if constexpr (D == 9) last = splat(step.b);
+      } else {
+#pragma GCC unroll 8
+        for (int l = 0; l < kLanes; ++l) s[l] = step_[image_column_[image[l]]].a;
+        if constexpr (D == 9) last = each([&](int l) { return step_[image_column_[image[l]]].b; });
+        transpose(s);
       }
-      transpose(s);
       q[0] = s[1] * x[2] - s[2] * x[1] + s[3];
       q[1] = s[2] * x[0] - s[0] * x[2] + s[4];
       q[2] = s[0] * x[1] - s[1] * x[0] + s[5];
@@ -126,6 +146,27 @@ class Coupling {
     for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
       couple<kGeneral>(slot, c, f);
       store_edges(slot, li, x, c, f, z);
+    }
+  }
+
+  template <bool kGeneral>
+  void edges_of_lanes(std::int64_t batch, V8* z, V8* sums) const {
+    const V8(&x)[3] = *reinterpret_cast<const V8(*)[3]>(&equations_.point[3 * batch]);
+    const Packed& li = inverse_l(batch);
+    const V8* y = scaled_gradient(batch);
+    V8 c[6] = {}, f[D == 9 ? 9 : 1] = {};
+    for (std::int64_t slot = l_.slot_begin[batch]; slot < l_.slot_begin[batch + 1]; ++slot) {
+      couple<kGeneral>(slot, c, f);
+      if (l_.slot_edge[kLanes * slot] < 0) continue;
+      V8 columns[3][8], ninth[8];
+      scale(li, c, f, columns, ninth);
+      for (int col = 0; col < 3; ++col) pose_row(x, columns[col] + 3, columns[col]);
+      for (int r = 0; r < 6; ++r) {
+        sums[r] += columns[0][r] * y[0] + columns[1][r] * y[1] + columns[2][r] * y[2];
+        for (int col = 0; col < 3; ++col) z[6 * col + r] = columns[col][r];
+      }
+      z += 18;
+      sums += 6;
     }
   }
 
@@ -168,29 +209,11 @@ class Coupling {
     }
   }
 
-  // Z of the edges that end in a slot, z[edge]: with E = (x x C; C; F), its columns from those of C L^-T and F L^-T.
+  // Z of the edges that end in a slot, z[edge].
   [[gnu::always_inline]] void store_edges(std::int64_t slot, const Packed& li, const V8 (&x)[3], const V8 (&c)[6],
                                           const V8* f, Edge<D>* z) const {
-    const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
     V8 columns[3][8], ninth[8] = {};
-#pragma GCC unroll 3
-    for (int i = 0; i < 3; ++i) {
-      V8 w[3];
-      const V8* a = full[i];
-      w[0] = a[0] * li[0];
-      w[1] = a[0] * li[1] + a[1] * li[2];
-      w[2] = a[0] * li[3] + a[1] * li[4] + a[2] * li[5];
-#pragma GCC unroll 3
-      for (int col = 0; col < 3; ++col) columns[col][3 + i] = w[col];
-      if constexpr (D == 9) {
-        const V8* b = f + 3 * i;
-        w[0] = b[0] * li[0];
-        w[1] = b[0] * li[1] + b[1] * li[2];
-        w[2] = b[0] * li[3] + b[1] * li[4] + b[2] * li[5];
-#pragma GCC unroll 3
-        for (int col = 0; col < 3; ++col) (i < 2 ? columns[col][6 + i] : ninth[col]) = w[col];
-      }
-    }
+    scale(li, c, f, columns, ninth);
 #pragma GCC unroll 3
     for (int col = 0; col < 3; ++col) {
       pose_row(x, columns[col] + 3, columns[col]);
@@ -209,6 +232,31 @@ class Coupling {
     }
   }
 
+  // C L^-T and F L^-T: with E = (x x C; C; F), of the columns of Z what is below the rows of the rotation. ninth: row 8
+  // of each, if any.
+  [[gnu::always_inline]] static void scale(const Packed& li, const V8 (&c)[6], const V8* f, V8 (&columns)[3][8],
+                                           V8 (&ninth)[8]) {
+    const V8 full[3][3] = {{c[0], c[1], c[3]}, {c[1], c[2], c[4]}, {c[3], c[4], c[5]}};
+#pragma GCC unroll 3
+    for (int i = 0; i < 3; ++i) {
+      V8 w[3];
+      const V8* a = full[i];
+      w[0] = a[0] * li[0];
+      w[1] = a[0] * li[1] + a[1] * li[2];
+      w[2] = a[0] * li[3] + a[1] * li[4] + a[2] * li[5];
+#pragma GCC unroll 3
+      for (int col = 0; col < 3; ++col) columns[col][3 + i] = w[col];
+      if constexpr (D == 9) {
+        const V8* b = f + 3 * i;
+        w[0] = b[0] * li[0];
+        w[1] = b[0] * li[1] + b[1] * li[2];
+        w[2] = b[0] * li[3] + b[1] * li[4] + b[2] * li[5];
+#pragma GCC unroll 3
+        for (int col = 0; col < 3; ++col) (i < 2 ? columns[col][6 + i] : ninth[col]) = w[col];
+      }
+    }
+  }
+
   // Register `reg` of the records of a slot, each number by lane.
   [[gnu::always_inline]] void read_lanes(std::int64_t slot, int reg, V8 (&t)[8]) const {
     const V8* record = &equations_.record[kLanes * slot * equations_.registers + reg];
@@ -217,14 +265,9 @@ class Coupling {
     transpose(t);
   }
 
-  // The free keyframe of a lane, or -1.
-  std::int32_t column_of_lane(std::int64_t at) const {
-    return l_.inverse_sigma[at] != 0.0 ? image_column_[l_.slot_image[at]] : -1;
-  }
-
-  // Which free keyframe each image is of.
+  // Which free keyframe each image is of; n_free if of none.
   void find_columns() {
-    image_column_.assign(l_.images.size(), -1);
+    image_column_.assign(l_.images.size(), static_cast<std::int32_t>(l_.n_free));
     const std::int64_t none = kLanes * l_.n_slots(), lists = static_cast<std::int64_t>(l_.list_begin.size()) - 1;
     for (std::int64_t list = 0; list < lists; ++list)
       for (std::int64_t i = l_.list_begin[list]; i < l_.list_begin[list + 1]; ++i)
@@ -236,7 +279,7 @@ class Coupling {
   const Equations<D>& equations_;
   std::vector<std::int32_t> image_column_;
   Buffer<V8> inverse_l_, scaled_gradient_;
-  Buffer<Column<D>> step_;
+  Buffer<Column<D>> step_;  // the last is zero
 };
 
 }  // namespace ba::BA_TARGET

@@ -278,7 +278,12 @@ class Equations {
     };
     const double* points = reinterpret_cast<const double*>(point.data());
     const std::int32_t* of_lane = &l_.listed_point[first];
-    for (int i = 0; i < 3; ++i) x[i] = each([=](int l) { return points[of_lane[l] + kLanes * i]; });
+    // Often they are the lanes of a batch.
+    const bool is_batch =
+        kWhole && l_.listed[first + kLanes - 1] - l_.listed[first] == kLanes - 1 && of_lane[0] % kLanes == 0;
+    for (int i = 0; i < 3; ++i)
+      x[i] = is_batch ? load(points + of_lane[0] + kLanes * i)
+                      : each([=](int l) { return points[of_lane[l] + kLanes * i]; });
     read(0);
     r[0] = t[6];
     r[1] = t[7];

@@ -15,11 +15,13 @@
 // - record:  what is kept of an observation where the problem is linearised: its rows of the Jacobian, by registers.
 // - section: a quarter of the batches of a problem that is not small. Sections take about as long as one another.
 // - chunk:   neighbouring batches of a section that one thread works on, the unit of every loop over points.
+// - run:     neighbouring batches all of whose points are seen by the same free keyframes.
 // - strip:   neighbouring batches whose blocks Z stay in the nearer caches while S is summed.
 #pragma once
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 
 #include "adjustment/types.hpp"
 #include "parallel/memory.hpp"
@@ -81,6 +83,14 @@ class Layout {
   std::int64_t n_sections() const { return static_cast<std::int64_t>(sections.size()) - 1; }
   // How many lists the observations of each keyframe are in.
   std::int64_t n_lists() const { return n_obs >= kMinListedApart * n_free ? n_sections() : 1; }
+  // Whether all lanes of a slot have the same image.
+  bool has_one_image(std::int64_t slot) const {
+    std::uint64_t pairs[kLanes / 2];
+    std::memcpy(pairs, &slot_image[kLanes * slot], sizeof(pairs));
+    std::uint64_t differ = pairs[0] ^ (pairs[0] << 32 | pairs[0] >> 32);
+    for (int i = 1; i < kLanes / 2; ++i) differ |= pairs[0] ^ pairs[i];
+    return differ == 0;
+  }
   // Lanes of a batch that are points, not padding.
   int lanes(std::int64_t batch) const {
     return static_cast<int>(std::min<std::int64_t>(kLanes, n_points - kLanes * batch));

@@ -144,6 +144,13 @@ template <Lens kLens, bool kDerivatives>
   out.uv[1] = fy * db + c.param[3];
   if constexpr (kDerivatives) {
     const V8 sx = fx * iz, sy = fy * iz;
+    if constexpr (kLens == Lens::kPinhole) {
+      out.d_x[0][0] = sx;
+      out.d_x[0][2] = -sx * a;
+      out.d_x[1][1] = sy;
+      out.d_x[1][2] = -sy * b;
+      return;
+    }
     out.d_x[0][0] = sx * jaa;
     out.d_x[0][1] = sx * jab;
     out.d_x[0][2] = -sx * (jaa * a + jab * b);

@@ -153,20 +153,19 @@ class Rows {
 
   template <Lens kLens>
   [[gnu::always_inline]] void gather(std::int64_t slot, Images& out) const {
-    const std::int32_t* image = &l_.slot_image[kLanes * slot];
     V8 r[8];
-    columns(image, 0, r);
+    columns(slot, 0, r);
     for (int i = 0; i < 8; ++i) out.rotation[i] = r[i];
-    columns(image, 8, r);
+    columns(slot, 8, r);
     out.rotation[8] = r[0];
     for (int i = 0; i < 3; ++i) out.translation[i] = r[1 + i];
     for (int i = 0; i < 4; ++i) out.cameras.param[i] = r[4 + i];
     if constexpr (kLens != Lens::kPinhole) {
-      columns(image, 16, r);
+      columns(slot, 16, r);
       for (int i = 0; i < 8; ++i) out.cameras.param[4 + i] = r[i];
     }
     if constexpr (kLens == Lens::kMixed) {
-      columns(image, 24, r);
+      columns(slot, 24, r);
       out.cameras.fisheye = r[0];
     }
   }
@@ -203,9 +202,10 @@ class Rows {
     if constexpr (kDerivatives) {
       for (int c = 0; c < 3; ++c) {
         for (int row = 0; row < 2; ++row) {
-          out.d_point[row][c] = scale * (q.d_x[row][0] * im.rotation[c] + q.d_x[row][1] * im.rotation[3 + c] +
-                                         q.d_x[row][2] * im.rotation[6 + c]);
-          out.d_intrinsics[row][c] = scale * q.d_intrinsics[row][c];
+          V8 d = q.d_x[row][row] * im.rotation[3 * row + c] + q.d_x[row][2] * im.rotation[6 + c];
+          if constexpr (kLens != Lens::kPinhole) d += q.d_x[row][1 - row] * im.rotation[3 * (1 - row) + c];
+          out.d_point[row][c] = scale * d;
+          if constexpr (kLens != Lens::kPinhole) out.d_intrinsics[row][c] = scale * q.d_intrinsics[row][c];
         }
         if constexpr (kDepth) out.d_point[2][c] = depth_scale * im.rotation[6 + c];
       }
@@ -253,9 +253,17 @@ class Rows {
     }
   }
 
-  [[gnu::always_inline]] void columns(const std::int32_t* image, int offset, V8 (&r)[8]) const {
+  // Eight numbers of the images of a slot.
+  [[gnu::always_inline]] void columns(std::int64_t slot, int offset, V8 (&r)[8]) const {
+    const std::int32_t* image = &l_.slot_image[kLanes * slot];
+    const double* numbers = &image_[offset];
+    if (kWhole && l_.has_one_image(slot)) {
 #pragma GCC unroll 8
-    for (int l = 0; l < kLanes; ++l) r[l] = load(&image_[stride_ * image[l] + offset]);
+      for (int i = 0; i < kLanes; ++i) r[i] = splat(numbers[stride_ * image[0] + i]);
+      return;
+    }
+#pragma GCC unroll 8
+    for (int l = 0; l < kLanes; ++l) r[l] = load(numbers + stride_ * image[l]);
     transpose(r);
   }
 

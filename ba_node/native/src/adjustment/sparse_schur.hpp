@@ -5,10 +5,13 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <vector>
 
+#include "adjustment/alike.hpp"
 #include "adjustment/coupling.hpp"
 #include "adjustment/layout.hpp"
 #include "linalg/block_fill.hpp"
@@ -17,8 +20,29 @@
 
 namespace ba::BA_TARGET {
 
+// The same of up to 64 free keyframes, each a bit.
+inline Rows32 coupled_by_bits(const Layout& l, const CoupledPairs& factors) {
+  std::array<std::uint64_t, 64> met{};
+  const auto bit = [](std::int32_t k) { return std::uint64_t{1} << k; };
+  for (std::size_t p = 0; p + 1 < l.point_edge.size(); ++p) {
+    std::uint64_t seen_by = 0;
+    for (std::int32_t e = l.point_edge[p]; e < l.point_edge[p + 1]; ++e) seen_by |= bit(l.edge_column[e]);
+    for (std::int32_t e = l.point_edge[p]; e < l.point_edge[p + 1]; ++e) met[l.edge_column[e]] |= seen_by;
+  }
+  for (std::size_t k = 0; k < factors.size(); ++k) met[factors.row[k]] |= bit(factors.column[k]);
+  Rows32 upper;
+  for (std::int32_t i = 0; i < l.n_free; ++i) {
+    upper.index.push_back(i);
+    for (std::int32_t j = i + 1; j < l.n_free; ++j)
+      if (met[i] & bit(j)) upper.index.push_back(j);
+    upper.close_row();
+  }
+  return upper;
+}
+
 // Pairs (i, j >= i) of free keyframes that share a point or a factor, the diagonal first in each row.
 inline Rows32 coupled(const Layout& l, const CoupledPairs& factors) {
+  if (l.n_free <= 64) return coupled_by_bits(l, factors);
   Rows32 upper;
   std::vector<std::int32_t> met_by(l.n_free, -1);
   std::size_t next = 0;
@@ -48,18 +72,16 @@ class SparseSchur {
  public:
   SparseSchur(const Layout& l, const CoupledPairs& factors, int threads) : l_(l), pattern_(coupled(l, factors)) {
     cut_points();
+    index_rows();
+    alike_ = std::make_unique<AlikeBatches<D>>(
+        l_, cut_, threads, [this](std::int32_t i, std::int32_t j) { return pattern_.start[i] + place_in_row(i, j); });
     order_edges();
     scratch_.resize(most_edges_ * threads);
     blocks_.resize(n_blocks() * n_partials());
     diagonal_.resize(l_.n_free * n_partials());
     sums_.resize(l_.n_free * n_partials());
-    index_rows();
-    for (std::size_t k = 0; k < factors.size(); ++k) {
-      const std::int32_t* index = pattern_.index.data();
-      const std::int32_t *first = index + pattern_.start[factors.row[k]],
-                         *stop = index + pattern_.start[factors.row[k] + 1];
-      place_of_pair_.push_back(std::lower_bound(first, stop, factors.column[k]) - index);
-    }
+    for (std::size_t k = 0; k < factors.size(); ++k)
+      place_of_pair_.push_back(pattern_.start[factors.row[k]] + place_in_row(factors.row[k], factors.column[k]));
   }
 
   const Rows32& pattern() const { return pattern_; }
@@ -87,16 +109,25 @@ class SparseSchur {
       Column<D>* sums = &sums_[partial * l_.n_free];
       clear(blocks, n_blocks());
       clear(sums, l_.n_free);
-      each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
-        sum_edges(e, z, blocks);
-        each_of(e, [&](std::int32_t f) { add_scaled(f, z, coupling, sums); });
+      alike_->sum(partial, thread, coupling, blocks, sums);
+      const auto by_edges = [this](std::int64_t batch) { return !alike_->has(batch); };
+      each_strip(partial, coupling, thread, by_edges, [&](std::int64_t strip, const Edge<D>* z) {
+        for (std::int64_t at = first_edge(strip_[strip]); at < order_end_[strip]; ++at) {
+          const std::int32_t e = order_[at];
+          sum_edges(e, z, blocks);
+          for (std::int32_t f = e; f < std::min(e + kRowsAtOnce, l_.edge_end[e]); ++f) add_scaled(f, z, coupling, sums);
+        }
       });
     });
     pool.each(n_partials() > 1 ? kSumTasks : 0, [&](std::int64_t task, int) {
       add_partials(blocks_.data(), n_blocks(), n_blocks() * task / kSumTasks, n_blocks() * (task + 1) / kSumTasks);
     });
     add_partials(sums_.data(), l_.n_free, 0, l_.n_free);
-    for (std::int64_t k = 0; k < l_.n_free; ++k) add_diagonal(k, blocks_[pattern_.start[k]]);
+    for (std::int64_t k = 0; k < l_.n_free; ++k) {
+      Block<D>& block = blocks_[pattern_.start[k]];
+      if constexpr (kByLanes<D>) mirror(block);
+      add_diagonal(k, block);
+    }
     for (std::size_t k = 0; k < place_of_pair_.size(); ++k) add(blocks_[place_of_pair_[k]], pairs[k]);
   }
 
@@ -111,11 +142,12 @@ class SparseSchur {
       Column<D>* sums = &sums_[partial * l_.n_free];
       clear(blocks, l_.n_free);
       clear(sums, l_.n_free);
-      each_strip(partial, coupling, thread, [&](std::int32_t e, const Edge<D>* z) {
-        each_of(e, [&](std::int32_t f) {
-          subtract_product(blocks[l_.edge_column[f]], Left<D>(z[f]), z[f]);
-          add_scaled(f, z, coupling, sums);
-        });
+      const auto all = [](std::int64_t) { return true; };
+      each_strip(partial, coupling, thread, all, [&](std::int64_t strip, const Edge<D>* z) {
+        for (std::int64_t e = first_edge(strip_[strip]); e < first_edge(strip_[strip + 1]); ++e) {
+          subtract_product(blocks[l_.edge_column[e]], Left<D>(z[e]), z[e]);
+          add_scaled(e, z, coupling, sums);
+        }
       });
     });
     add_partials(diagonal_.data(), l_.n_free, 0, l_.n_free);
@@ -153,7 +185,8 @@ class SparseSchur {
   }
 
   // Cut the batches into strips, and put the edges of each in the order of their rows: a row stays in the nearest cache
-  // while all edges of the strip add to it. Of a point every kRowsAtOnce-th edge stands for those after it.
+  // while all edges of the strip add to it. Of a point every kRowsAtOnce-th edge stands for those after it. Those of
+  // batches that are alike are not among them.
   void order_edges() {
     const std::int64_t fit = kStripBytes / static_cast<std::int64_t>(sizeof(Edge<D>));
     for (std::int64_t partial = 0; partial < n_partials(); ++partial) {
@@ -174,7 +207,7 @@ class SparseSchur {
     for (std::int64_t p = 0; p + 1 < static_cast<std::int64_t>(l_.point_edge.size()); ++p) {
       for (std::int32_t e = l_.point_edge[p]; e < l_.point_edge[p + 1]; ++e) {
         while (e >= begin[strip + 1]) ++strip;
-        if ((e - l_.point_edge[p]) % kRowsAtOnce == 0) strip_of[e] = strip;
+        if ((e - l_.point_edge[p]) % kRowsAtOnce == 0 && !alike_->has(p / kLanes)) strip_of[e] = strip;
         place_of_gradient_[e] = static_cast<std::int32_t>(p / kLanes * 3 * kLanes + p % kLanes);
       }
     }
@@ -185,25 +218,19 @@ class SparseSchur {
 
   std::int64_t first_edge(std::int64_t batch) const { return l_.point_edge[kLanes * batch]; }
 
-  // Call sum(e, z) for the edges e of a partial sum that stand for kRowsAtOnce of a point; z[e]: their Z.
-  template <class Sum>
-  void each_strip(std::int64_t partial, const Coupling<D>& coupling, int thread, Sum sum) {
+  // Call sum(strip, z) for the strips of a partial sum; z[e]: Z of their edges, in the batches that `wanted` tells.
+  template <class Wanted, class Sum>
+  void each_strip(std::int64_t partial, const Coupling<D>& coupling, int thread, Wanted wanted, Sum sum) {
     for (std::int64_t strip = partial_strip_[partial]; strip < partial_strip_[partial + 1]; ++strip) {
-      const std::int64_t begin = first_edge(strip_[strip]);
-      Edge<D>* z = &scratch_[thread * most_edges_] - begin;
-      for (std::int64_t i = strip_[strip]; i < strip_[strip + 1]; ++i) coupling.edges_of(i, z);
-      for (std::int64_t at = begin; at < order_end_[strip]; ++at) sum(order_[at], z);
+      Edge<D>* z = &scratch_[thread * most_edges_] - first_edge(strip_[strip]);
+      for (std::int64_t i = strip_[strip]; i < strip_[strip + 1]; ++i)
+        if (wanted(i)) coupling.edges_of(i, z);
+      sum(strip, z);
     }
   }
 
-  // Call f for the edges that e stands for.
-  template <class F>
-  void each_of(std::int32_t e, F f) const {
-    for (std::int32_t i = e; i < std::min(e + kRowsAtOnce, l_.edge_end[e]); ++i) f(i);
-  }
-
   // What an edge adds to Z y, y = L^-1 gp.
-  void add_scaled(std::int32_t e, const Edge<D>* z, const Coupling<D>& coupling, Column<D>* sums) const {
+  void add_scaled(std::int64_t e, const Edge<D>* z, const Coupling<D>& coupling, Column<D>* sums) const {
     const double* y = reinterpret_cast<const double*>(coupling.scaled_gradient(0)) + place_of_gradient_[e];
     Column<D>& sum = sums[l_.edge_column[e]];
     sum.a += z[e].a[0] * y[0] + z[e].a[1] * y[kLanes] + z[e].a[2] * y[2 * kLanes];
@@ -246,13 +273,18 @@ class SparseSchur {
     const Left<D> left(z[e]);
     Block<D>* row = blocks + pattern_.start[i];
     if (place_of_[i] == kSearched) {
-      const std::int32_t *first = &pattern_.index[pattern_.start[i]], *stop = &pattern_.index[pattern_.start[i + 1]];
-      for (std::int32_t f = e; f < end; ++f)
-        subtract_product(row[std::lower_bound(first, stop, column[f]) - first], left, z[f]);
+      for (std::int32_t f = e; f < end; ++f) subtract_product(row[place_in_row(i, column[f])], left, z[f]);
       return;
     }
     const std::int32_t* place = place_.data() + place_of_[i];
     for (std::int32_t f = e; f < end; ++f) subtract_product(row[place[column[f]]], left, z[f]);
+  }
+
+  // Where in row i the block of column j is.
+  std::int64_t place_in_row(std::int64_t i, std::int32_t j) const {
+    if (place_of_[i] != kSearched) return place_[place_of_[i] + j];
+    const std::int32_t *first = &pattern_.index[pattern_.start[i]], *stop = &pattern_.index[pattern_.start[i + 1]];
+    return std::lower_bound(first, stop, j) - first;
   }
 
   // Where in its row a block is, by column from the diagonal to the last, unless that is too long for what it holds.
@@ -274,6 +306,7 @@ class SparseSchur {
   const Layout& l_;
   Rows32 pattern_;
   std::vector<std::int64_t> cut_;
+  std::unique_ptr<AlikeBatches<D>> alike_;
   Buffer<Block<D>> blocks_, diagonal_;               // of each partial sum; the sums are in the first
   Buffer<Column<D>> sums_;                           // the same
   std::vector<std::int64_t> strip_, partial_strip_;  // first batch of each strip; first strip of each partial sum

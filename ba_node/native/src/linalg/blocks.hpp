@@ -170,7 +170,7 @@ BA_INLINE void subtract_product(Block<9>& s, const Left<9>& x, const Edge<9>& y)
 }
 
 // Whether there are registers enough for two products with one factor in common: what is loaded of it serves both.
-constexpr bool kProductsByTwo = sizeof(Register) == sizeof(V8);
+constexpr bool kProductsByTwo = kWhole;
 
 // s -= x z', t -= y z'.
 #if defined(__AVX512F__)

@@ -107,6 +107,10 @@ using V8 = Twice<Twice<Native2, Native2Mask>, TwiceMask<Native2Mask>>;
 using Mask = TwiceMask<TwiceMask<Native2Mask>>;
 #endif
 
+// Whether eight lanes are one register. Where they are two there are half as many to work with, and what is chosen
+// between goes through memory.
+constexpr bool kWhole = sizeof(Register) == sizeof(V8);
+
 // Register by register: a copy of the whole goes through memory.
 template <class V>
 struct Loaded {
@@ -302,6 +306,30 @@ BA_INLINE void transpose(Native8 (&r)[8]) {
     r[i + 4] = BA_SHUFFLE(Native8Mask, q[i], q[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
   }
 }
+
+// The sum of the lanes of each, by lane; the last two lanes are zero.
+#if defined(__AVX512F__)
+BA_INLINE Native8 lane_sums(const Native8 (&x)[6]) {
+  Native8 pair[4] = {};
+#pragma GCC unroll 3
+  for (int i = 0; i < 3; ++i)
+    pair[i] = BA_SHUFFLE(Native8Mask, x[2 * i], x[2 * i + 1], 0, 8, 2, 10, 4, 12, 6, 14) +
+              BA_SHUFFLE(Native8Mask, x[2 * i], x[2 * i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
+  Native8 four[2];
+#pragma GCC unroll 2
+  for (int i = 0; i < 2; ++i)
+    four[i] = BA_SHUFFLE(Native8Mask, pair[2 * i], pair[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13) +
+              BA_SHUFFLE(Native8Mask, pair[2 * i], pair[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
+  return BA_SHUFFLE(Native8Mask, four[0], four[1], 0, 1, 2, 3, 8, 9, 10, 11) +
+         BA_SHUFFLE(Native8Mask, four[0], four[1], 4, 5, 6, 7, 12, 13, 14, 15);
+}
+#else
+BA_INLINE V8 lane_sums(const V8 (&x)[6]) {
+  V8 out{};
+  for (int i = 0; i < 6; ++i) out[i] = sum(x[i]);
+  return out;
+}
+#endif
 
 // By four blocks: those off the diagonal change places.
 template <class H, class M, int N>
