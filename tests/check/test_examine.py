@@ -7,13 +7,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ba_node.check import intrinsics, units
+from ba_node.check import units
 from ba_node.check.examine import examine
 from ba_node.check.ids import check_ids
 from ba_node.check.tracks import Tracks, tracks_of
@@ -320,48 +319,6 @@ def test_what_is_given_counts_where_consensus_finds_nothing_better() -> None:
     found = examine(tracks)
     assert not found.findings, found.summary()
     assert "camera 1 is where the rig says" in found.sound
-
-
-@pytest.mark.parametrize(("factor", "slightly"), [(1.06, True), (0.93, True), (1.17, False), (0.81, False)])
-def test_a_focal_length_that_is_far_off_has_to_leave_clearly_less(factor: float, slightly: bool) -> None:
-    """On a straight street both halves of the tracks found one that was 17 % off, for 1 % of the loss."""
-    scene = Scene(Config().scene)
-    for measurement in spoiled("sound", "stereo", seed=59).measurements:
-        scene.add(measurement)
-    tracks = tracks_of(scene)
-    assert tracks is not None
-    params = tracks.cameras.params.copy()
-    params[:, :2] *= factor
-    free: Any = SimpleNamespace(params=params, sigma=np.full(3, 0.002))
-    model = intrinsics._named(tracks, free)
-    assert model is not None
-    assert intrinsics._is_lower(1.030, 1.036, 2240, model.focal_alone) == slightly
-    # A loss that is flat finds others by chance: 12 % off at 3.7 standard errors, for 1 % of the loss.
-    coarse: Any = SimpleNamespace(params=params, sigma=np.full(3, abs(np.log(factor)) / 3.7))
-    assert (intrinsics._named(tracks, coarse) is None) == slightly
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rig", ["mono", "stereo", "rgbd"])
-def test_focal_length_that_is_a_tenth_short_is_named(rig: str) -> None:
-    scene = Scene(Config().scene)
-    for measurement in spoiled("focal_off", rig, 0.9, seed=162, path="loop").measurements:
-        scene.add(measurement)
-    tracks = tracks_of(scene)
-    assert tracks is not None
-    assert re.search(r"focal length off by a factor of about 0\.(8[7-9]|9[0-3])", examine(tracks).causes())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
-def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
-    """By 60 and 36 px: steps point 10 degrees beside the front-end's, all to the same side."""
-    scene = Scene(Config().scene)
-    for measurement in spoiled("roi_ignored", rig, 60.0, seed=613).measurements:
-        scene.add(measurement)
-    tracks = tracks_of(scene)
-    assert tracks is not None
-    assert re.search("region of interest", examine(tracks).summary())
 
 
 @pytest.mark.slow

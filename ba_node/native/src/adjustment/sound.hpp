@@ -50,14 +50,14 @@ inline bool is_sound(const ProblemView& p, const StateView& s) {
 }
 
 // Relative poses of keyframes: n of them.
-struct StepsView {
+struct StepFactorsView {
   std::int64_t n;
   const std::int64_t* keyframes;                // (n, 2)
   const double *rotation, *translation, *root;  // (n, 3, 3), (n, 3), (n, 6, 6)
 };
 
 // Whether they are finite, of different keyframes that exist, and rotations to within `most`, as core/factors.py asks.
-inline bool are_sound(const StepsView& steps, std::int64_t n_keyframes, double most) {
+inline bool are_sound(const StepFactorsView& steps, std::int64_t n_keyframes, double most) {
   for (std::int64_t k = 0; k < steps.n; ++k) {
     const std::int64_t first = steps.keyframes[2 * k], second = steps.keyframes[2 * k + 1];
     const double* r = steps.rotation + 9 * k;

@@ -12,6 +12,7 @@
 #include <utility>
 #include <vector>
 
+#include "adjustment/sound.hpp"
 #include "bindings/arrays.hpp"
 #include "bindings/window.hpp"
 
@@ -131,6 +132,21 @@ py::object shared_pixels(const std::pair<Array<std::uint64_t>, Array<std::uint64
   return py::make_tuple(shared, same);
 }
 
+// most: as are_sound.
+bool are_sound_steps(const py::object& steps, std::int64_t n_keyframes, double most) {
+  const Ints keyframes = array_of<std::int64_t>(steps, "keyframes");
+  const Doubles rotation = array_of<double>(steps, "rotation"), translation = array_of<double>(steps, "translation"),
+                root = array_of<double>(steps, "root_information");
+  return are_sound({keyframes.shape(0), keyframes.data(), rotation.data(), translation.data(), root.data()},
+                   n_keyframes, most);
+}
+
+// most: variances of blocks that are scaled to a unit diagonal.
+py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double most) {
+  const auto [sigma_m, sigma_rad] = loosest(blocks.data(), positions.data(), blocks.shape(0), most);
+  return py::make_tuple(sigma_m, sigma_rad);
+}
+
 }  // namespace
 
 void bind_steps(py::module_& m) {
@@ -142,6 +158,8 @@ void bind_steps(py::module_& m) {
   m.def("shared_pixels", &shared_pixels);
   m.def("rows_of_points", &rows_of_points);
   m.def("medians_off", &medians_off_of);
+  m.def("are_sound", &are_sound_steps);
+  m.def("loosest", &loosest_of);
 }
 
 }  // namespace ba

@@ -364,21 +364,6 @@ bool is_sound_problem(const py::object& problem) {
   return unless_short(view.n_obs, [&] { return is_sound(view, start); });
 }
 
-// most: as are_sound.
-bool are_sound_steps(const py::object& steps, std::int64_t n_keyframes, double most) {
-  const Ints keyframes = array_of<std::int64_t>(steps, "keyframes");
-  const Doubles rotation = array_of<double>(steps, "rotation"), translation = array_of<double>(steps, "translation"),
-                root = array_of<double>(steps, "root_information");
-  return are_sound({keyframes.shape(0), keyframes.data(), rotation.data(), translation.data(), root.data()},
-                   n_keyframes, most);
-}
-
-// most: variances of blocks that are scaled to a unit diagonal.
-py::tuple loosest_of(const Doubles& blocks, const Doubles& positions, double most) {
-  const auto [sigma_m, sigma_rad] = loosest(blocks.data(), positions.data(), blocks.shape(0), most);
-  return py::make_tuple(sigma_m, sigma_rad);
-}
-
 }  // namespace
 
 void bind_window(py::module_& m) {
@@ -389,8 +374,6 @@ void bind_window(py::module_& m) {
   m.def("explained", &explained);
   m.def("agreed", &agreed);
   m.def("is_sound", &is_sound_problem);
-  m.def("are_sound", &are_sound_steps);
-  m.def("loosest", &loosest_of);
   m.def("seem_to_move", &seem_to_move);
   m.def("residual_norms_of", &residual_norms_of);
   m.def("are_sane_tracks", &are_sane_tracks);
