@@ -120,6 +120,10 @@ def tell(report: Mapping[str, Any]) -> None:
         ("tracks", f"{report['tracks']} with {report['observations']} observations"),
         ("scale of", report["scale_from"]),
     ]
+    if report["stood_images"]:
+        rows.append(
+            ("stood still", f"in {report['stood_images']} of {report['images']} images, {report['stood_s']:.1f} s")
+        )
     if turn is not None and any(turn[:2]):
         yaw, roll = f"{turn[0]:.2f} +- {turn[2]:.2f} px of yaw", f"{turn[1]:.2f} +- {turn[3]:.2f} of roll"
         rows.append(("second camera", f"turned by {yaw}, {roll} against the rig; corrected"))

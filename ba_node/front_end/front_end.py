@@ -121,6 +121,16 @@ class FrontEnd:
         return alignment.turn, alignment.sigma
 
     @property
+    def alone(self) -> bool:
+        """Return True if the scale is free: one camera is followed, without odometry and without measured depths."""
+        return self._session is not None and self._session.alone
+
+    @property
+    def waits(self) -> bool:
+        """Return True while one camera alone has not moved enough for a map to begin."""
+        return self._session is not None and not self._session.has_begun
+
+    @property
     def counts(self) -> dict[str, int]:
         """Return how many images were left out or lost, by cause."""
         return dict(sorted(self._watch.counts.items()))

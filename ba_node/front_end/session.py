@@ -20,7 +20,7 @@ from ba_node.front_end.tracking import Content, Found, Tracker
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
-# Features have moved by less than this since the last keyframe (median): nothing moves, px.
+# Features have moved by less than this (median): nothing moves, px.
 _STANDS_PX = 0.5
 # One camera alone begins once features have moved this far by its motion (median), px.
 _START_PX = 20.0
@@ -49,6 +49,7 @@ class Session:
         self._odometry = odometry  # at the last image that had a pose
         self.step: Step | None = None  # to the last keyframe as images alone see it, where there is an odometry
         self.keyframes = 0
+        self._rest = (0, np.empty(0, np.uint64), np.empty((0, 2)))  # since when nothing moves; ids of features, where
         self._known_id = 0  # points up to this id were told as guesses
 
     def begin(self, frame: Frame) -> Content:
@@ -184,7 +185,18 @@ class Session:
                 uncertain = covariance.of_tracked(found.covariance, fixed_from_camera)
         if odometry is not None and not self._ideal.baseline and images.depth_m is None:
             pose = odometry
-        return Tracked(state, self.number, images.stamp_ns, pose, uncertain)
+        since = None if state is State.LOST else self._still_since(images.stamp_ns)
+        return Tracked(state, self.number, images.stamp_ns, pose, uncertain, still_since_ns=since)
+
+    def _still_since(self, stamp_ns: int) -> int:
+        """Return the stamp of the first image since which features are where they were, as by now; ns."""
+        tracker = self.tracker
+        ids, uv = tracker.map.track_id[tracker.rows], tracker.uv
+        since, ids_then, uv_then = self._rest
+        _, i, j = np.intersect1d(ids, ids_then, return_indices=True)
+        if not len(i) or np.median(np.linalg.norm(uv[i] - uv_then[j], axis=1)) >= _STANDS_PX:
+            self._rest = since, _, _ = stamp_ns, ids, uv
+        return since
 
     def _measurements(self, stamp_ns: int, content: Content, pose: Transform) -> tuple[Measurement, ...]:
         """Return keyframe and tracks, in pixels of the raw images."""

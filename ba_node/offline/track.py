@@ -32,6 +32,8 @@ from ba_node.offline.images import ImageRequest, ImageSource, open_images
 from ba_node.offline.recording import record
 
 _TRUTH = "poses.txt"
+# Nothing moves for so long where the camera stands, ns.
+_STOOD_NS = 1_000_000_000
 
 
 class TrackError(ValueError):
@@ -96,6 +98,7 @@ class _Run:
         self.keyframes: list[Keyframe] = []
         self.measurements: list[tuple[int, Measurement]] = []
         self.states: Counter[str] = Counter()
+        self._still: dict[int, list[int]] = {}  # stamps of images in which nothing moves, by that of the first of them
         self.busy_s = 0.0
         self.scale_from = ""  # what lengths are those of
         self._clock = clock
@@ -113,7 +116,29 @@ class _Run:
             self.notes.append(left)
         if self.states[State.LOST.value]:
             self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
+        still = self._one_place()
+        if still:
+            self.notes.append(still)
         return self
+
+    def _one_place(self) -> str:
+        """Return in words that the camera did not move enough for a second keyframe; empty if it did."""
+        front_end, count = self._front_end, len(self.stamps)
+        if front_end is None or count < 2 or self.states[State.LOST.value]:
+            return ""
+        seen = f"{count} images ({(self.stamps[-1] - self.stamps[0]) / 1e9:.1f} s)"
+        if not self.keyframes and front_end.waits:
+            return (
+                f"the camera did not move enough in {seen} for a map to begin: one alone has to be carried along, as"
+                " turning tells no depth"
+            )
+        if len(self.keyframes) == 1 and self.states[State.STARTING.value] == 0:
+            far = f"{self.request.options.keyframe_parallax_px:g} px (keyframe_parallax_px)"
+            return (
+                f"the camera did not move enough in {seen} for a second keyframe: features stay within {far} of where"
+                " they were, and one keyframe gives nothing to refine"
+            )
+        return ""
 
     def _take(self, images: Images, odometry: Transform | None) -> None:
         """Track images."""
@@ -123,6 +148,8 @@ class _Run:
         self.busy_s += self._clock() - began
         if tracked.keyframe is not None and not self.scale_from:
             self.scale_from = _scale_of(images, odometry)
+        if tracked.still_since_ns is not None:
+            self._still.setdefault(tracked.still_since_ns, []).append(images.stamp_ns)
         self.stamps.append(images.stamp_ns)
         self.states[tracked.state.value] += 1
         self.notes += [note for note in tracked.notes if note not in self.notes]
@@ -169,6 +196,7 @@ class _Run:
         front_end = self._front_end
         assert front_end is not None
         turn = front_end.alignment
+        stood = [stamps for stamps in self._still.values() if stamps[-1] - stamps[0] >= _STOOD_NS]
         learned = None if turn is None or len(self.rig) < 2 else [*turn[0].tolist(), *turn[1].tolist()]
         return {
             "mode": self.source.mode,
@@ -179,6 +207,8 @@ class _Run:
             "tracks": len(np.unique(np.concatenate([one.track_id for one in tracks]))),
             "observations": sum(len(one.track_id) for one in tracks),
             "states": dict(self.states),
+            "stood_images": sum(len(stamps) for stamps in stood),
+            "stood_s": sum(stamps[-1] - stamps[0] for stamps in stood) / 1e9,
             "stereo_turn_px": learned,
             "time_per_image_s": self.busy_s / max(len(self.stamps), 1),
             "left_out": dict(self.source.counted),
