@@ -36,7 +36,7 @@ class Session:
         self.tracker = Tracker(ideal, options)
         self.lost = 0  # images in a row without a pose
         self.unseen = 0  # images without a pose since the last keyframe
-        self.alone = False  # one camera without odometry
+        self.scale = ""  # what tells lengths: measured, odometry, or free: one camera without either
         # What was taken until it is known how the second camera is turned: arguments of ``FrontEnd._track``.
         learns = options.stereo_align and ideal.baseline
         self.first_images: list[tuple[Images, Transform | None, float, bool]] | None = [] if learns else None
@@ -60,8 +60,8 @@ class Session:
 
     def first(self, images: Images, content: Content) -> Tracked:
         """Tell of the first image, a keyframe; one camera alone tells of it once it has moved."""
-        self.alone = not content.depths.measures and self._odometry is None
-        if not self.alone:
+        self.scale = "measured" if content.depths.measures else "free" if self._odometry is None else "odometry"
+        if self.scale != "free":
             return self._keyframe(images, content)
         self._waiting, self._waiting_ns = content, images.stamp_ns
         return self.told(State.STARTING, images)

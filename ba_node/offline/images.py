@@ -69,6 +69,7 @@ class ImageSource:
     counted: Counter[str] = field(default_factory=Counter)  # images left out, by reason
     notes: dict[str, str] = field(default_factory=dict)  # the last words on each reason
     warnings: dict[str, str] = field(default_factory=dict)  # what is wrong though no image was left out, by kind
+    unused_odometry: Callable[[], str] = str  # says in words which odometry there is that nobody asked for; empty: none
 
 
 @contextlib.contextmanager
@@ -98,6 +99,8 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
         return _paired(source, _messages(reader, source, topics, odometry, poses), poses)
 
     source = ImageSource(rig, mode, 0, read)
+    if not odometry.topic and request.poses is None:
+        source.unused_odometry = lambda: _unused_odometry(reader, rig.frame_id)
     source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
     if request.rig is None:
         source.warnings |= _changes(reader, [_info_of(reader, chosen[name]) for name in cameras_of(mode)], rig)
@@ -164,6 +167,25 @@ def _odometry_of(reader: BagReader, request: ImageRequest) -> _Odometry:
         there = ", ".join(name for name, kind in sorted(reader.topics.items()) if kind in (_ODOMETRY, _TF)) or "none"
         raise BagError(f"{reader.path}: odometry={topic}: no topic of {_ODOMETRY} or {_TF}; there are: {there}")
     return _Odometry(topic)
+
+
+def _unused_odometry(reader: BagReader, body: str) -> str:
+    """Return in words what of a recording would tell the scale of one camera; empty if nothing does plainly."""
+    there = {topic: "nav_msgs/Odometry" for topic, kind in sorted(reader.topics.items()) if kind == _ODOMETRY}
+    if not there:
+        tree = static_tree(reader)
+        for topic in (topic for topic, kind in reader.topics.items() if kind == _TF and topic.endswith("/tf")):
+            found = _Odometry(topic, _FIXED)
+            children = set[str]()
+            with contextlib.suppress(BagError):  # of a topic that nobody asked for
+                for _, _, _, data in reader.messages([topic]):
+                    children |= {child for _, child, _ in found.poses(reader.decode(topic, data))}
+            if any(child == body or tree.find(child, body) is not None for child in children):
+                there[topic] = f"transforms from {_FIXED}"
+    if not there:
+        return ""
+    named = ", ".join(f"{topic} ({kind})" for topic, kind in there.items())
+    return f"the recording has {named}: --topic odometry={next(iter(there))} takes the scale from it"
 
 
 def _parents(reader: BagReader, topic: str) -> set[str]:

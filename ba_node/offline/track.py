@@ -32,6 +32,7 @@ from ba_node.offline.images import ImageRequest, ImageSource, open_images
 from ba_node.offline.recording import record
 
 _TRUTH = "poses.txt"
+_FIRST_STEP = "the first step, 1 long"
 # Nothing moves for so long where the camera stands, ns.
 _STOOD_NS = 1_000_000_000
 
@@ -100,7 +101,7 @@ class _Run:
         self.states: Counter[str] = Counter()
         self._still: dict[int, list[int]] = {}  # stamps of images in which nothing moves, by that of the first of them
         self.busy_s = 0.0
-        self.scale_from = ""  # what lengths are those of
+        self._scales: dict[int, str] = {}  # what lengths are those of, by session
         self._clock = clock
         self._front_end: FrontEnd | None = None
         self._backend = Backend(request.config)
@@ -111,6 +112,8 @@ class _Run:
             self._take(images, odometry)
             progress(done, self.source.total)
         self.notes += self.source.warnings.values()
+        if _FIRST_STEP in self._scales.values():
+            self.notes += filter(None, [self.source.unused_odometry()])
         left = _left_out(self.source)
         if left:
             self.notes.append(left)
@@ -146,8 +149,8 @@ class _Run:
         front_end = self._front_end or self._begin(images)
         tracked = front_end.process(images, odometry)
         self.busy_s += self._clock() - began
-        if tracked.keyframe is not None and not self.scale_from:
-            self.scale_from = _scale_of(images, odometry)
+        if tracked.keyframe is not None:
+            self._scales.setdefault(tracked.session_id, _scale_of(images, front_end.scale))
         if tracked.still_since_ns is not None:
             self._still.setdefault(tracked.still_since_ns, []).append(images.stamp_ns)
         self.stamps.append(images.stamp_ns)
@@ -190,6 +193,12 @@ class _Run:
         for stamp_ns, measurement in self.measurements:
             yield topics[type(measurement)], stamp_ns, measurement
 
+    @property
+    def scale_from(self) -> str:
+        """Return in words what lengths are those of; where sessions differ, of each kind how many are so."""
+        kinds = Counter(self._scales[number] for number in dict.fromkeys(one.session_id for one in self.keyframes))
+        return "; ".join(f"{words} ({count} sessions)" if len(kinds) > 1 else words for words, count in kinds.items())
+
     def report(self) -> dict[str, Any]:
         """Return what there is to tell."""
         tracks = [one for _, one in self.measurements if isinstance(one, FeatureTracks)]
@@ -217,13 +226,11 @@ class _Run:
         }
 
 
-def _scale_of(images: Images, odometry: Transform | None) -> str:
-    """Return in words what the lengths of a map of such images are those of."""
-    if len(images.grey) > 1:
-        return "the baseline of the cameras"
-    if images.depth_m is not None:
-        return "measured depths"
-    return "the first step, 1 long" if odometry is None else "the odometry: one camera cannot tell whether it is right"
+def _scale_of(images: Images, scale: str) -> str:
+    """Return in words what the lengths of a map are those of, by ``FrontEnd.scale`` and its first images."""
+    if scale == "measured":
+        return "measured depths" if images.depth_m is not None else "the baseline of the cameras"
+    return _FIRST_STEP if scale == "free" else "the odometry: one camera cannot tell whether it is right"
 
 
 def _left_out(source: ImageSource) -> str:

@@ -7,12 +7,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from ba_node.cli.main import main
+from ba_node.core import geometry
 from ba_node.estimate import Transform
 from ba_node.io.rig_file import rig_yaml
 from tests.front_end import world
+from tests.messages.adapters import layouts
 
 pytest.importorskip("poselib", reason="needs poselib: pip install ba_node[front_end]")
 
@@ -52,3 +55,45 @@ def test_a_camera_that_never_moves(
     source = folder(tmp_path / "source", 5 * world.drive(1), sides)
     assert main(["track", str(source), str(tmp_path / "out.mcap"), *FEW]) == code
     assert words in capsys.readouterr().err
+
+
+def test_the_same_picture_twice_has_no_baseline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = folder(tmp_path / "source", world.drive(8))
+    for file in (source / "left").iterdir():
+        (source / "right" / file.name).write_bytes(file.read_bytes())
+    assert main(["track", str(source), str(tmp_path / "out.mcap"), *FEW]) == 3
+    text, errors = capsys.readouterr()
+    assert "first step, 1 long" in text and "the scale is free" in text and "baseline" not in text
+    assert "are the same picture" in errors
+
+
+def one_camera(path: Path, poses: list[Transform]) -> Path:
+    """Write a recording of one camera, and of an odometry beside it."""
+    kind, (fx, fy, cx, cy), (width, height) = "sensor_msgs/msg/Image", world.rig(1).intrinsics[0], world.SIZE
+    info = layouts.make(
+        layouts.CAMERA_INFO, header=layouts.header(1, "cam"), width=width, height=height, distortion_model="plumb_bob",
+        d=np.zeros(5), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1]), r=np.eye(3).ravel(),
+        p=np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
+    )  # fmt: skip
+    sent = [layouts.Sent("/camera_info", layouts.CAMERA_INFO, info, 1)]
+    for i, pose in enumerate(poses):
+        stamp = 10**9 + i * world.STEP_NS
+        image = layouts.make(
+            kind, header=layouts.header(stamp, "cam"), width=width, height=height, encoding="mono8", step=width,
+            data=world.render(world.rig(1), 0, pose).grey.ravel(),
+        )  # fmt: skip
+        odometry = layouts.odometry(stamp, "odom", pose.translation, geometry.quaternion_from_matrix(pose.rotation))
+        sent.append(layouts.Sent("/odom", layouts.ODOMETRY, odometry, stamp))
+        sent.append(layouts.Sent("/image_raw", kind, image, stamp))
+    return layouts.write(path, sent)
+
+
+def test_an_odometry_in_the_recording_is_named_where_the_scale_is_free(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["track", str(one_camera(tmp_path / "bag", world.drive(16, 0.1, 0.004))), str(tmp_path / "out.mcap"), *FEW]
+    assert main(words) == 0
+    assert "/odom (nav_msgs/Odometry): --topic odometry=/odom takes the scale from it" in capsys.readouterr().out
+    assert main([*words, "--topic", "odometry=/odom"]) == 0
+    text = capsys.readouterr().out
+    assert "the odometry: one camera cannot tell" in text and "takes the scale" not in text
