@@ -33,6 +33,7 @@ from ba_node.measurements import CameraRig
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import IMAGE_TYPES, INPUT_TYPES
 from ba_node.offline.image_folder import Picture, find_pictures
+from ba_node.offline.image_times import of_another, of_odometry
 from ba_node.offline.rig import rig_of_recording, static_tree
 
 _INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
@@ -269,7 +270,9 @@ def _paired(
     source.counted.update(streams.counted)
     for name, apart_ns in streams.apart_ns.items():
         if apart_ns:
-            source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+            when = of_another(came[MODES[source.mode][0]], came[name])
+            nearest = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+            source.notes[f"no {name}"] = f"{when}; {nearest}" if when else nearest
     first, *others = came
     for name in others:
         alone, nearest_ns = _alone(came[first], came[name])
@@ -277,6 +280,8 @@ def _paired(
         if alone:
             source.counted[f"{name} alone"] = alone
             source.notes[f"{name} alone"] = f"the nearest of {first} is {nearest_ns / 1e6:+.1f} ms off"
+    if poses is not None and source.counted["no odometry"]:
+        source.notes["no odometry"] = of_odometry(came[first], poses.span_ns) or source.notes["no odometry"]
     if poses is not None and poses.sparse:
         source.warnings["sparse odometry"] = poses.sparse
 

@@ -28,6 +28,7 @@ from ba_node.front_end.images import read_mask
 from ba_node.front_end.streams import OdometryBuffer
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.offline.image_times import far_off
 from ba_node.offline.images import ImageRequest, ImageSource, open_images
 from ba_node.offline.recording import record
 
@@ -74,7 +75,7 @@ def track(
             why = "; ".join(run.notes) or "no image could be used"
             raise TrackError(f"{path}: no keyframe came of {source.total} images: {why}")
         truth = _truth(path, source, run)
-        count = record(out, run.timeline(), truth)
+        count = record(out, run.timeline(), truth, as_it_came=True)
         return run.report() | {"source": path.name, "messages": count, "truth": truth is not None}
 
 
@@ -119,9 +120,8 @@ class _Run:
             self.notes.append(left)
         if self.states[State.LOST.value]:
             self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
-        still = self._one_place()
-        if still:
-            self.notes.append(still)
+        told = self._front_end is not None and "ahead" in self._front_end.counts
+        self.notes += filter(None, ["" if told else far_off(self.stamps), self._one_place()])
         return self
 
     def _one_place(self) -> str:

@@ -13,7 +13,9 @@ import pytest
 from ba_node.cli.main import main
 from ba_node.core import geometry
 from ba_node.estimate import Transform
+from ba_node.io.bag_reader import BagReader
 from ba_node.io.rig_file import rig_yaml
+from ba_node.measurements import Keyframe
 from tests.front_end import world
 from tests.messages.adapters import layouts
 
@@ -67,8 +69,8 @@ def test_the_same_picture_twice_has_no_baseline(tmp_path: Path, capsys: pytest.C
     assert "are the same picture" in errors
 
 
-def one_camera(path: Path, poses: list[Transform]) -> Path:
-    """Write a recording of one camera, and of an odometry beside it."""
+def one_camera(path: Path, poses: list[Transform], ahead: range = range(0)) -> Path:
+    """Write a recording of one camera and of an odometry beside it, whose stamps of some images are far ahead."""
     kind, (fx, fy, cx, cy), (width, height) = "sensor_msgs/msg/Image", world.rig(1).intrinsics[0], world.SIZE
     info = layouts.make(
         layouts.CAMERA_INFO, header=layouts.header(1, "cam"), width=width, height=height, distortion_model="plumb_bob",
@@ -77,14 +79,14 @@ def one_camera(path: Path, poses: list[Transform]) -> Path:
     )  # fmt: skip
     sent = [layouts.Sent("/camera_info", layouts.CAMERA_INFO, info, 1)]
     for i, pose in enumerate(poses):
-        stamp = 10**9 + i * world.STEP_NS
+        stamp = 10**9 + i * world.STEP_NS + 10**15 * (i in ahead)
         image = layouts.make(
             kind, header=layouts.header(stamp, "cam"), width=width, height=height, encoding="mono8", step=width,
             data=world.render(world.rig(1), 0, pose).grey.ravel(),
         )  # fmt: skip
         odometry = layouts.odometry(stamp, "odom", pose.translation, geometry.quaternion_from_matrix(pose.rotation))
-        sent.append(layouts.Sent("/odom", layouts.ODOMETRY, odometry, stamp))
-        sent.append(layouts.Sent("/image_raw", kind, image, stamp))
+        sent.append(layouts.Sent("/odom", layouts.ODOMETRY, odometry, 10**9 * i))
+        sent.append(layouts.Sent("/image_raw", kind, image, 10**9 * i))
     return layouts.write(path, sent)
 
 
@@ -97,3 +99,20 @@ def test_an_odometry_in_the_recording_is_named_where_the_scale_is_free(
     assert main([*words, "--topic", "odometry=/odom"]) == 0
     text = capsys.readouterr().out
     assert "the odometry: one camera cannot tell" in text and "takes the scale" not in text
+
+
+def test_tracks_are_written_in_the_order_of_tracking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Stamps that run ahead for some images and go back: each session comes once, and the sound one is the result."""
+    source, out = tmp_path / "bag", tmp_path / "tracks.mcap"
+    one_camera(source, world.drive(24), ahead=range(10, 14))
+    assert main(["track", str(source), str(out), "--topic", "odometry=/odom", *FEW]) == 3
+    assert "4 of 24 images have stamps" in capsys.readouterr().err
+    with BagReader(out) as reader:
+        came = [(at, one) for _, at, one in reader.measurements()]
+    keyframes = [one for _, one in came if isinstance(one, Keyframe)]
+    assert [one.session_id for one in keyframes] == sorted(one.session_id for one in keyframes)
+    assert keyframes[-1].session_id == 2 and keyframes[-1].stamp_ns < 10**10 < max(one.stamp_ns for one in keyframes)
+    assert [at for at, _ in came] == sorted(at for at, _ in came)
+    assert main(["replay", str(out), "--out", str(tmp_path / "run"), "--no-report"]) in (0, 3)
+    text, errors = capsys.readouterr()
+    assert "session_1" in text and "restarts" not in errors and "stale" not in errors
