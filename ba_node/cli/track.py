@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar("track", "images") as progress:
         report = track(args.source, args.out, request(args), time.process_time, progress)
     tell(report)
+    warn(report)
     print(f"written to {args.out}")
     write_result(args.json, report)
     return ATTENTION if attention(report) else 0
@@ -129,5 +130,9 @@ def tell(report: Mapping[str, Any]) -> None:
         rows.append(("second camera", f"turned by {yaw}, {roll} against the rig; corrected"))
     rows += [("note", note) for note in report["notes"] if note.startswith(_HARMLESS)]
     print(facts(rows))
+
+
+def warn(report: Mapping[str, Any], of: str = "") -> None:
+    """Say what has to be looked at, a line each."""
     for note in attention(report):
-        print(f"ba: warning: {note}", file=sys.stderr)
+        print(f"ba: warning: {of}{note}", file=sys.stderr)

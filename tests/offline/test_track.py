@@ -114,7 +114,9 @@ def test_an_odometry_in_millimetres_is_said_last_and_in_the_report(
     assert (
         main(["run", str(source), "--out", str(out), "--no-report", "--odometry", str(tmp_path / "odometry.tum")]) == 3
     )
-    last = capsys.readouterr().err.splitlines()[-1]
+    errors = capsys.readouterr().err
+    last = errors.splitlines()[-1]
+    assert errors.count(last.removeprefix("ba: warning: tracking: ")) == 1
     assert last.startswith("ba: warning: tracking: the odometry's steps are") and "millimetres" in last
     told = json.loads((out / "report.json").read_text())["tracking"]
     assert told["causes"]["odometry_unit"] >= 1 and told["states"] == {"tracking": 24}

@@ -116,3 +116,16 @@ def test_tracks_are_written_in_the_order_of_tracking(tmp_path: Path, capsys: pyt
     assert main(["replay", str(out), "--out", str(tmp_path / "run"), "--no-report"]) in (0, 3)
     text, errors = capsys.readouterr()
     assert "session_1" in text and "restarts" not in errors and "stale" not in errors
+
+
+def test_what_is_wrong_with_the_images_is_said_once_and_last(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = folder(tmp_path / "source", 5 * world.drive(1))
+    words = ["run", str(source), "--out", str(tmp_path / "out"), "--no-report", *FEW]
+    assert main(words) == 3
+    errors = capsys.readouterr().err
+    assert errors.splitlines()[-1].startswith("ba: warning: tracking: the camera did not move enough")
+    assert errors.count("the camera did not move") == 1
+    assert main([*words, "--set", "solver.none=1"]) == 2  # what comes after tracking fails
+    assert capsys.readouterr().err.count("ba: warning: tracking: the camera did not move") == 1
