@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,25 +50,27 @@ def run(args: argparse.Namespace) -> int:
     codes = [track.ATTENTION if track.attention(report) else 0]
     parameters = [word for name in args.set for word in ("--set", name)]
     parameters += ["--params", str(args.params)] if args.params else []
-    print("\ncheck")
-    codes.append(_call(check, [str(tracks), *parameters]))
-    print("\nreplay")
     page = ["--no-report"] if args.no_report else []
-    codes.append(_call(replay, [str(tracks), "--out", str(args.out), "--final-optimize", *page, *parameters]))
+    try:
+        print("\ncheck")
+        codes.append(_call(check, [str(tracks), *parameters]))
+        print("\nreplay")
+        codes.append(_call(replay, [str(tracks), "--out", str(args.out), "--final-optimize", *page, *parameters]))
+    finally:
+        # Last, as all that was said before stands on it.
+        track.warn(report, "tracking: ")
     # Too little to check is no fault of what was tracked.
     codes[1] = 0 if codes[1] == check.TOO_LITTLE else codes[1]
-    _tell_again(args.out / "report.json", report)
+    _keep(args.out / "report.json", report)
     by_name = dict(zip(("track", "check", "replay"), codes, strict=True))
     write_result(args.json, {"track": report, "exit_codes": by_name})
     return max(codes, key=lambda code: (code == 2, code))
 
 
-def _tell_again(path: Path, tracked: Mapping[str, Any]) -> None:
-    """Say last, and in report.json, what was wrong with the images, as all after them stands on it."""
+def _keep(path: Path, tracked: Mapping[str, Any]) -> None:
+    """Write into report.json, too, what was wrong with the images."""
     from ba_node.io.files import write_json  # noqa: PLC0415
 
-    for note in track.attention(tracked):
-        print(f"ba: warning: tracking: {note}", file=sys.stderr)
     if path.is_file():
         told = {name: tracked[name] for name in ("mode", "images", "states", "left_out", "causes", "notes")}
         write_json(path, json.loads(path.read_text()) | {"tracking": told})

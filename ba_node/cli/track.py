@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EXAMPLE = "ba track drive.mcap tracks.mcap\n  ba track kitti/sequences/07 tracks.mcap --track max_features=500"
 ATTENTION = 3
 # What is said and is no fault.
-_HARMLESS = ("one camera without odometry", "the second camera is turned")
+_HARMLESS = ("one camera without odometry", "the recording has /", "the second camera is turned")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar("track", "images") as progress:
         report = track(args.source, args.out, request(args), time.process_time, progress)
     tell(report)
+    warn(report)
     print(f"written to {args.out}")
     write_result(args.json, report)
     return ATTENTION if attention(report) else 0
@@ -120,10 +121,18 @@ def tell(report: Mapping[str, Any]) -> None:
         ("tracks", f"{report['tracks']} with {report['observations']} observations"),
         ("scale of", report["scale_from"]),
     ]
+    if report["stood_images"]:
+        rows.append(
+            ("stood still", f"in {report['stood_images']} of {report['images']} images, {report['stood_s']:.1f} s")
+        )
     if turn is not None and any(turn[:2]):
         yaw, roll = f"{turn[0]:.2f} +- {turn[2]:.2f} px of yaw", f"{turn[1]:.2f} +- {turn[3]:.2f} of roll"
         rows.append(("second camera", f"turned by {yaw}, {roll} against the rig; corrected"))
     rows += [("note", note) for note in report["notes"] if note.startswith(_HARMLESS)]
     print(facts(rows))
+
+
+def warn(report: Mapping[str, Any], of: str = "") -> None:
+    """Say what has to be looked at, a line each."""
     for note in attention(report):
-        print(f"ba: warning: {note}", file=sys.stderr)
+        print(f"ba: warning: {of}{note}", file=sys.stderr)

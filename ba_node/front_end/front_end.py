@@ -121,6 +121,16 @@ class FrontEnd:
         return alignment.turn, alignment.sigma
 
     @property
+    def scale(self) -> str:
+        """Return what tells lengths: ``measured`` (depths, a baseline), ``odometry``, ``free``; or nothing yet."""
+        return "" if self._session is None else self._session.scale
+
+    @property
+    def waits(self) -> bool:
+        """Return True while one camera alone has not moved enough for a map to begin."""
+        return self._session is not None and not self._session.has_begun
+
+    @property
     def counts(self) -> dict[str, int]:
         """Return how many images were left out or lost, by cause."""
         return dict(sorted(self._watch.counts.items()))
@@ -184,7 +194,7 @@ class FrontEnd:
         sure = self._watch.believes(images.stamp_ns, last_ns, self._notes)
         gap_s = 0.0 if last_ns is None or not sure else (images.stamp_ns - last_ns) / 1e9
         self._stamp_ns = images.stamp_ns if sure else last_ns
-        if session is not None and session.alone and odometry is not None:
+        if session is not None and session.scale == "free" and odometry is not None:
             self._end("an odometry is there now, whose scale it has")
         told = self._track(usable, odometry, gap_s, sure)
         return self._settled(told, (usable, odometry, gap_s, sure))
@@ -284,7 +294,7 @@ class FrontEnd:
         self._watch.clear("empty")
         self._session = session
         told = session.first(images, content)
-        if session.alone:
+        if session.scale == "free":
             self._watch.say("alone", _ALONE, self._notes)
         return told
 

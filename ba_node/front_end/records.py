@@ -59,6 +59,7 @@ class Tracked:
     keyframe: Keyframe | None = None  # set if the image was made a keyframe
     tracks: tuple[FeatureTracks, ...] = ()  # one a camera, the keyframe's
     guesses: LandmarkGuesses | None = None  # positions of points that are new with this keyframe, in the fixed frame
+    still_since_ns: int | None = None  # of the first image since which nothing has moved; None where none was tracked
     # Keyframes that became known together with this one, as when one camera alone has moved enough: earlier ones, each
     # followed by its tracks.
     earlier: tuple[Measurement, ...] = ()

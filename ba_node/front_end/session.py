@@ -20,7 +20,7 @@ from ba_node.front_end.tracking import Content, Found, Tracker
 from ba_node.measurements import FeatureTracks, Keyframe, LandmarkGuesses, Measurement
 
 _IDENTITY = Transform(np.eye(3), np.zeros(3))
-# Features have moved by less than this since the last keyframe (median): nothing moves, px.
+# Features have moved by less than this (median): nothing moves, px.
 _STANDS_PX = 0.5
 # One camera alone begins once features have moved this far by its motion (median), px.
 _START_PX = 20.0
@@ -36,7 +36,7 @@ class Session:
         self.tracker = Tracker(ideal, options)
         self.lost = 0  # images in a row without a pose
         self.unseen = 0  # images without a pose since the last keyframe
-        self.alone = False  # one camera without odometry
+        self.scale = ""  # what tells lengths: measured, odometry, or free: one camera without either
         # What was taken until it is known how the second camera is turned: arguments of ``FrontEnd._track``.
         learns = options.stereo_align and ideal.baseline
         self.first_images: list[tuple[Images, Transform | None, float, bool]] | None = [] if learns else None
@@ -49,6 +49,7 @@ class Session:
         self._odometry = odometry  # at the last image that had a pose
         self.step: Step | None = None  # to the last keyframe as images alone see it, where there is an odometry
         self.keyframes = 0
+        self._rest = (0, np.empty(0, np.uint64), np.empty((0, 2)))  # since when nothing moves; ids of features, where
         self._known_id = 0  # points up to this id were told as guesses
 
     def begin(self, frame: Frame) -> Content:
@@ -59,8 +60,8 @@ class Session:
 
     def first(self, images: Images, content: Content) -> Tracked:
         """Tell of the first image, a keyframe; one camera alone tells of it once it has moved."""
-        self.alone = not content.depths.measures and self._odometry is None
-        if not self.alone:
+        self.scale = "measured" if content.depths.measures else "free" if self._odometry is None else "odometry"
+        if self.scale != "free":
             return self._keyframe(images, content)
         self._waiting, self._waiting_ns = content, images.stamp_ns
         return self.told(State.STARTING, images)
@@ -184,7 +185,18 @@ class Session:
                 uncertain = covariance.of_tracked(found.covariance, fixed_from_camera)
         if odometry is not None and not self._ideal.baseline and images.depth_m is None:
             pose = odometry
-        return Tracked(state, self.number, images.stamp_ns, pose, uncertain)
+        since = None if state is State.LOST else self._still_since(images.stamp_ns)
+        return Tracked(state, self.number, images.stamp_ns, pose, uncertain, still_since_ns=since)
+
+    def _still_since(self, stamp_ns: int) -> int:
+        """Return the stamp of the first image since which features are where they were, as by now; ns."""
+        tracker = self.tracker
+        ids, uv = tracker.map.track_id[tracker.rows], tracker.uv
+        since, ids_then, uv_then = self._rest
+        _, i, j = np.intersect1d(ids, ids_then, return_indices=True)
+        if not len(i) or np.median(np.linalg.norm(uv[i] - uv_then[j], axis=1)) >= _STANDS_PX:
+            self._rest = since, _, _ = stamp_ns, ids, uv
+        return since
 
     def _measurements(self, stamp_ns: int, content: Content, pose: Transform) -> tuple[Measurement, ...]:
         """Return keyframe and tracks, in pixels of the raw images."""

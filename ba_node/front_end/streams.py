@@ -150,11 +150,14 @@ class OdometryBuffer:
     def __init__(self, keep: int = 2000) -> None:
         self._keep = keep
         self._widest_ns = 0  # between poses of which one between was asked for
+        self.span_ns: tuple[int, int] | None = None  # first and last stamp of all that came
         self._stamps: list[int] = []
         self._poses: list[Transform] = []
 
     def add(self, stamp_ns: int, pose: Transform) -> None:
         """Take in a pose, fixed frame from body; one that is older than the last is passed over."""
+        first, last = self.span_ns or (stamp_ns, stamp_ns)
+        self.span_ns = min(first, stamp_ns), max(last, stamp_ns)
         if self._stamps and stamp_ns <= self._stamps[-1]:
             if stamp_ns < self._stamps[-1] - 10**9:  # time has gone back
                 self._stamps.clear()

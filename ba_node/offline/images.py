@@ -33,6 +33,7 @@ from ba_node.measurements import CameraRig
 from ba_node.messages.factory import stamp_ns_from_message
 from ba_node.messages.topics import IMAGE_TYPES, INPUT_TYPES
 from ba_node.offline.image_folder import Picture, find_pictures
+from ba_node.offline.image_times import of_another, of_odometry
 from ba_node.offline.rig import rig_of_recording, static_tree
 
 _INFO, _RIG = INPUT_TYPES["camera_info"], INPUT_TYPES["camera_rig"]
@@ -69,6 +70,7 @@ class ImageSource:
     counted: Counter[str] = field(default_factory=Counter)  # images left out, by reason
     notes: dict[str, str] = field(default_factory=dict)  # the last words on each reason
     warnings: dict[str, str] = field(default_factory=dict)  # what is wrong though no image was left out, by kind
+    unused_odometry: Callable[[], str] = str  # says in words which odometry there is that nobody asked for; empty: none
 
 
 @contextlib.contextmanager
@@ -98,6 +100,8 @@ def _of_recording(reader: BagReader, request: ImageRequest) -> ImageSource:
         return _paired(source, _messages(reader, source, topics, odometry, poses), poses)
 
     source = ImageSource(rig, mode, 0, read)
+    if not odometry.topic and request.poses is None:
+        source.unused_odometry = lambda: _unused_odometry(reader, rig.frame_id)
     source.total = sum(1 for _ in reader.messages([chosen[MODES[mode][0]]]))
     if request.rig is None:
         source.warnings |= _changes(reader, [_info_of(reader, chosen[name]) for name in cameras_of(mode)], rig)
@@ -164,6 +168,25 @@ def _odometry_of(reader: BagReader, request: ImageRequest) -> _Odometry:
         there = ", ".join(name for name, kind in sorted(reader.topics.items()) if kind in (_ODOMETRY, _TF)) or "none"
         raise BagError(f"{reader.path}: odometry={topic}: no topic of {_ODOMETRY} or {_TF}; there are: {there}")
     return _Odometry(topic)
+
+
+def _unused_odometry(reader: BagReader, body: str) -> str:
+    """Return in words what of a recording would tell the scale of one camera; empty if nothing does plainly."""
+    there = {topic: "nav_msgs/Odometry" for topic, kind in sorted(reader.topics.items()) if kind == _ODOMETRY}
+    if not there:
+        tree = static_tree(reader)
+        for topic in (topic for topic, kind in reader.topics.items() if kind == _TF and topic.endswith("/tf")):
+            found = _Odometry(topic, _FIXED)
+            children = set[str]()
+            with contextlib.suppress(BagError):  # of a topic that nobody asked for
+                for _, _, _, data in reader.messages([topic]):
+                    children |= {child for _, child, _ in found.poses(reader.decode(topic, data))}
+            if any(child == body or tree.find(child, body) is not None for child in children):
+                there[topic] = f"transforms from {_FIXED}"
+    if not there:
+        return ""
+    named = ", ".join(f"{topic} ({kind})" for topic, kind in there.items())
+    return f"the recording has {named}: --topic odometry={next(iter(there))} takes the scale from it"
 
 
 def _parents(reader: BagReader, topic: str) -> set[str]:
@@ -247,7 +270,9 @@ def _paired(
     source.counted.update(streams.counted)
     for name, apart_ns in streams.apart_ns.items():
         if apart_ns:
-            source.notes[f"no {name}"] = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+            when = of_another(came[MODES[source.mode][0]], came[name])
+            nearest = f"the nearest is {apart_ns / 1e6:+.1f} ms off"
+            source.notes[f"no {name}"] = f"{when}; {nearest}" if when else nearest
     first, *others = came
     for name in others:
         alone, nearest_ns = _alone(came[first], came[name])
@@ -255,6 +280,8 @@ def _paired(
         if alone:
             source.counted[f"{name} alone"] = alone
             source.notes[f"{name} alone"] = f"the nearest of {first} is {nearest_ns / 1e6:+.1f} ms off"
+    if poses is not None and source.counted["no odometry"]:
+        source.notes["no odometry"] = of_odometry(came[first], poses.span_ns) or source.notes["no odometry"]
     if poses is not None and poses.sparse:
         source.warnings["sparse odometry"] = poses.sparse
 

@@ -31,12 +31,15 @@ def record(
     timeline: Iterable[tuple[str, int, Measurement]],
     truth: Poses | None = None,
     camera_info: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    as_it_came: bool = False,
 ) -> int:
     """Write a recording; return the number of messages.
 
     The timeline has topic (one of INPUT_TYPES), stamp in ns, measurement; the rig before the tracks. True poses are
     written beside the keyframes of their id. ``camera_info`` are fields of every CameraInfo that differ from what the
-    rig says, those of ``roi`` as a mapping.
+    rig says, those of ``roi`` as a mapping. Players and readers go by stamps, or ``as_it_came`` by the order of the
+    timeline: where stamps go back, times of recording go on.
 
     Raises:
         BagError: a message cannot be written.
@@ -44,17 +47,21 @@ def record(
     """
     rows = {} if truth is None else {int(keyframe): row for row, keyframe in enumerate(truth.keyframe_id)}
     messages, count = InputMessages(ROSBAGS_FACTORY), 0
+    last_ns = ahead_ns = 0  # time of recording of the last message; by how much those are ahead of stamps
     with BagWriter(path) as writer:
         for topic, stamp_ns, measurement in timeline:
             _, message = messages.of(measurement, stamp_ns)
+            if as_it_came:
+                ahead_ns += max(last_ns - stamp_ns - ahead_ns, 0)
+            last_ns = stamp_ns + ahead_ns
             if isinstance(measurement, CameraRig):
                 for info in message.cameras:
                     _set(info, camera_info)
             elif isinstance(measurement, Keyframe) and truth is not None:
                 pose = _true_pose(truth, rows[measurement.keyframe_id], measurement.frame_id)
-                writer.write(TRUTH_TOPIC, TRUTH_TYPE, pose, stamp_ns)
+                writer.write(TRUTH_TOPIC, TRUTH_TYPE, pose, last_ns)
                 count += 1
-            writer.write(topic, INPUT_TYPES[topic], message, stamp_ns, latched=isinstance(measurement, CameraRig))
+            writer.write(topic, INPUT_TYPES[topic], message, last_ns, latched=isinstance(measurement, CameraRig))
             count += 1
     return count
 

@@ -86,8 +86,13 @@ def _verdict(run: Run) -> str:
 
 
 def _pair(values: dict[str, Any], unit: str) -> str:
-    before, after = ("-" if values[key] is None else f"{values[key]:.3g}" for key in ("input", "refined"))
+    before, after = ("-" if values[key] is None else _short(values[key], unit) for key in ("input", "refined"))
     return f"{before} → {after} {unit}"
+
+
+def _short(value: float, unit: str) -> str:
+    """Return three digits of a number; of pixels next to nothing that they are, as nobody compares such."""
+    return "<0.001" if unit == "px" and 0.0 < value < 1e-3 else f"{value:.3g}"
 
 
 def _times(report: dict[str, Any], share: float) -> str:

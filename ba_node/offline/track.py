@@ -28,10 +28,14 @@ from ba_node.front_end.images import read_mask
 from ba_node.front_end.streams import OdometryBuffer
 from ba_node.io.trajectory import read_tum
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses, Measurement
+from ba_node.offline.image_times import far_off
 from ba_node.offline.images import ImageRequest, ImageSource, open_images
 from ba_node.offline.recording import record
 
 _TRUTH = "poses.txt"
+_FIRST_STEP = "the first step, 1 long"
+# Nothing moves for so long where the camera stands, ns.
+_STOOD_NS = 1_000_000_000
 
 
 class TrackError(ValueError):
@@ -71,7 +75,7 @@ def track(
             why = "; ".join(run.notes) or "no image could be used"
             raise TrackError(f"{path}: no keyframe came of {source.total} images: {why}")
         truth = _truth(path, source, run)
-        count = record(out, run.timeline(), truth)
+        count = record(out, run.timeline(), truth, as_it_came=True)
         return run.report() | {"source": path.name, "messages": count, "truth": truth is not None}
 
 
@@ -96,8 +100,9 @@ class _Run:
         self.keyframes: list[Keyframe] = []
         self.measurements: list[tuple[int, Measurement]] = []
         self.states: Counter[str] = Counter()
+        self._still: dict[int, list[int]] = {}  # stamps of images in which nothing moves, by that of the first of them
         self.busy_s = 0.0
-        self.scale_from = ""  # what lengths are those of
+        self._scales: dict[int, str] = {}  # what lengths are those of, by session
         self._clock = clock
         self._front_end: FrontEnd | None = None
         self._backend = Backend(request.config)
@@ -108,12 +113,35 @@ class _Run:
             self._take(images, odometry)
             progress(done, self.source.total)
         self.notes += self.source.warnings.values()
+        if _FIRST_STEP in self._scales.values():
+            self.notes += filter(None, [self.source.unused_odometry()])
         left = _left_out(self.source)
         if left:
             self.notes.append(left)
         if self.states[State.LOST.value]:
             self.notes.append(f"{self.states[State.LOST.value]} of {len(self.stamps)} images have no pose")
+        told = self._front_end is not None and "ahead" in self._front_end.counts
+        self.notes += filter(None, ["" if told else far_off(self.stamps), self._one_place()])
         return self
+
+    def _one_place(self) -> str:
+        """Return in words that the camera did not move enough for a second keyframe; empty if it did."""
+        front_end, count = self._front_end, len(self.stamps)
+        if front_end is None or count < 2 or self.states[State.LOST.value]:
+            return ""
+        seen = f"{count} images ({(self.stamps[-1] - self.stamps[0]) / 1e9:.1f} s)"
+        if not self.keyframes and front_end.waits:
+            return (
+                f"the camera did not move enough in {seen} for a map to begin: one alone has to be carried along, as"
+                " turning tells no depth"
+            )
+        if len(self.keyframes) == 1 and self.states[State.STARTING.value] == 0:
+            far = f"{self.request.options.keyframe_parallax_px:g} px (keyframe_parallax_px)"
+            return (
+                f"the camera did not move enough in {seen} for a second keyframe: features stay within {far} of where"
+                " they were, and one keyframe gives nothing to refine"
+            )
+        return ""
 
     def _take(self, images: Images, odometry: Transform | None) -> None:
         """Track images."""
@@ -121,8 +149,10 @@ class _Run:
         front_end = self._front_end or self._begin(images)
         tracked = front_end.process(images, odometry)
         self.busy_s += self._clock() - began
-        if tracked.keyframe is not None and not self.scale_from:
-            self.scale_from = _scale_of(images, odometry)
+        if tracked.keyframe is not None:
+            self._scales.setdefault(tracked.session_id, _scale_of(images, front_end.scale))
+        if tracked.still_since_ns is not None:
+            self._still.setdefault(tracked.still_since_ns, []).append(images.stamp_ns)
         self.stamps.append(images.stamp_ns)
         self.states[tracked.state.value] += 1
         self.notes += [note for note in tracked.notes if note not in self.notes]
@@ -163,12 +193,19 @@ class _Run:
         for stamp_ns, measurement in self.measurements:
             yield topics[type(measurement)], stamp_ns, measurement
 
+    @property
+    def scale_from(self) -> str:
+        """Return in words what lengths are those of; where sessions differ, of each kind how many are so."""
+        kinds = Counter(self._scales[number] for number in dict.fromkeys(one.session_id for one in self.keyframes))
+        return "; ".join(f"{words} ({count} sessions)" if len(kinds) > 1 else words for words, count in kinds.items())
+
     def report(self) -> dict[str, Any]:
         """Return what there is to tell."""
         tracks = [one for _, one in self.measurements if isinstance(one, FeatureTracks)]
         front_end = self._front_end
         assert front_end is not None
         turn = front_end.alignment
+        stood = [stamps for stamps in self._still.values() if stamps[-1] - stamps[0] >= _STOOD_NS]
         learned = None if turn is None or len(self.rig) < 2 else [*turn[0].tolist(), *turn[1].tolist()]
         return {
             "mode": self.source.mode,
@@ -179,6 +216,8 @@ class _Run:
             "tracks": len(np.unique(np.concatenate([one.track_id for one in tracks]))),
             "observations": sum(len(one.track_id) for one in tracks),
             "states": dict(self.states),
+            "stood_images": sum(len(stamps) for stamps in stood),
+            "stood_s": sum(stamps[-1] - stamps[0] for stamps in stood) / 1e9,
             "stereo_turn_px": learned,
             "time_per_image_s": self.busy_s / max(len(self.stamps), 1),
             "left_out": dict(self.source.counted),
@@ -187,13 +226,11 @@ class _Run:
         }
 
 
-def _scale_of(images: Images, odometry: Transform | None) -> str:
-    """Return in words what the lengths of a map of such images are those of."""
-    if len(images.grey) > 1:
-        return "the baseline of the cameras"
-    if images.depth_m is not None:
-        return "measured depths"
-    return "the first step, 1 long" if odometry is None else "the odometry: one camera cannot tell whether it is right"
+def _scale_of(images: Images, scale: str) -> str:
+    """Return in words what the lengths of a map are those of, by ``FrontEnd.scale`` and its first images."""
+    if scale == "measured":
+        return "measured depths" if images.depth_m is not None else "the baseline of the cameras"
+    return _FIRST_STEP if scale == "free" else "the odometry: one camera cannot tell whether it is right"
 
 
 def _left_out(source: ImageSource) -> str:

@@ -179,7 +179,7 @@ CASES = {
     "all_stamps_in_the_future": Case(all_of_the_future),
     "a_camera_that_begins_later": Case(without(0, 1, sides=("right",)), 3, "left out 2 images: no right/image_raw"),
     "black_images": Case(black(4, 5), 3, "shows nothing (black, or covered): the map stays as it is"),
-    "30_s_of_nothing": Case(pause),
+    "30_s_of_nothing": Case(pause, 3, "30.2 s without images before"),
 }
 # Without a scale of their own, or another one.
 OTHER_SCALE = {"unsynchronised_by_20_ms", "unsynchronised_by_60_ms"}

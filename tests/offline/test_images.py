@@ -175,6 +175,26 @@ def test_odometry_by_transforms(tmp_path: Path) -> None:
         read(layouts.write(tmp_path / "world", with_transforms("world")), topics={"odometry": "/tf"})
 
 
+def test_odometry_that_nobody_asked_for_is_named(tmp_path: Path) -> None:
+    """Nothing of transforms that do not lead from odom to the body."""
+
+    def told(name: str, messages: list[Sent], **request: Any) -> str:
+        with open_images(layouts.write(tmp_path / name, messages), ImageRequest(**request)) as source:
+            return source.unused_odometry()
+
+    pose = layouts.odometry(STEP_NS, "odom", [1, 0, 0], [0, 0, 0, 1])
+    bare = [info("/camera_info", "cam"), image("/image_raw", STEP_NS, 0)]
+    wheels = [*bare, Sent("/wheels/odom", layouts.ODOMETRY, pose, STEP_NS)]
+    assert told("bare", bare) == ""
+    words = "the recording has /wheels/odom (nav_msgs/Odometry): --topic odometry=/wheels/odom takes the scale from it"
+    assert told("wheels", wheels) == words
+    assert told("asked", wheels, topics={"odometry": "/wheels/odom"}) == ""
+    assert "/tf (transforms from odom): --topic odometry=/tf takes" in told("tf", with_transforms())
+    assert told("world", with_transforms("world")) == ""
+    loose = [one for one in with_transforms() if one.topic != "/tf_static"]
+    assert told("loose", loose) == ""
+
+
 def test_a_calibration_that_changes_is_said(tmp_path: Path) -> None:
     messages = [*stereo(), info("/left/camera_info", "left")]
     source, _ = read(layouts.write(tmp_path / "same", messages))

@@ -242,3 +242,14 @@ def test_residuals_are_drawn_on_the_image_where_there_is_one(folder: Path, tmp_p
     assert picture["source"].startswith("data:image/jpeg;base64,/9j/")
     own = (found.details["keyframe"] == found.details["shown_keyframe"]) & ~found.details["outlier"]
     assert len(arrows.data[0]["x"]) == 3 * np.count_nonzero(own) > 0
+
+
+def test_residuals_next_to_nothing_fit_into_a_tile(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "run")
+    report = json.loads((folder / "report.json").read_text())
+    report["median_px"] = {"input": 1.11e-5, "refined": 1.11e-5}
+    (tmp_path / "run" / "report.json").write_text(json.dumps(report))
+    write_report([tmp_path / "run"], tmp_path / REPORT)
+    page = (tmp_path / REPORT).read_text()
+    assert "<b>&lt;0.001 → &lt;0.001 px</b><span>median residual" in page
+    assert "e-05 →" not in page and ".tile b { display: block; font-size: 18px; font-weight" in page
