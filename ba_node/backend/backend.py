@@ -48,7 +48,6 @@ from ba_node.window import adjustment, full, guard, joining, precision, quality
 from ba_node.window.attempt import Following
 
 Work = adjustment.Adjustment | precision.Study  # what may run beside solves
-_REFUSED_KEPT = 1000
 
 
 class Backend:
@@ -58,7 +57,7 @@ class Backend:
         """Start with an empty map. ``clock`` (s) only fills ``solve_time_s``: no other is read."""
         self.map = CurrentMap(config, Scene(config.scene), 0)  # the current map
         self.solve_count = 0  # solves since the beginning
-        self.refused: deque[Keyframe] = deque(maxlen=_REFUSED_KEPT)  # the last keyframes that were turned away
+        self.refused: deque[Keyframe] = deque(maxlen=1000)  # the last keyframes that were turned away
         self.extras = Extras()  # what the next solve is to work out beside the estimate
         self.setup = SetUpWatch()  # the check of the set-up; while it gives a reason, every solve is held
         self.refusal = ""  # why the last solve of everything was held, in words; empty if it was not
@@ -181,7 +180,6 @@ class Backend:
         # What is found elsewhere comes later as it is: nobody waits for it to begin.
         wrong = "" if not checks else self.setup.reason(self.scene) if aside else self._look()
         self.solve_count += 1
-
         asked: list[Check | None] = []
 
         def taken(refinement: Refinement) -> None:
@@ -303,6 +301,10 @@ class Backend:
         """Return :meth:`begin_optimization` of a copy of the map as it is now, to be called once, on any thread."""
         scene, copies, config, wanted = self.scene, [self.scene.clone()], self.config, self.extras
         return lambda: full.take_snapshot(copies.pop(), config, wanted, scene)
+
+    def is_current(self, optimization: full.Optimization) -> bool:
+        """Return True if a solve of everything is of the current map."""
+        return optimization.scene is self.scene
 
     def merge(
         self, optimization: full.Optimization, first: Callable[[], None] = lambda: None, *, grown: bool = False

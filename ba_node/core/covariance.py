@@ -29,7 +29,8 @@ each kind of factor):
     sum psi^2 = sum v d (1 - 2 h d) + sum d^2 J Sigma J'
 
   with Sigma of all components together, pixels at their mean variance; the sigma that a factor states counts as two
-  rows more.
+  rows more. They are few, and what is left of them once pixels are taken out may come out as next to nothing by chance,
+  or as their loss hardly grows any more: v is at least what their scores show as they are.
 
 The keyframes' part needs S = B - E C^-1 E' of A alone (3.64-3.67): with C the points' blocks, and ``u = J_c - J_p C^-1
 E'`` of a row, the error of the keyframes is ``delta_c = -S^-1 sum u' psi``, and that of a point ``-C^-1 (sum J_p' psi +
@@ -142,7 +143,7 @@ def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, vari
     slopes = [np.maximum(rows.slope[of], 0.0) for of in members]
     moved = [np.asarray(rows.keyframes[of] @ roots) for of in members]
     n = len(groups)
-    matrix, total = np.zeros((n, n)), np.zeros(n)
+    matrix, total, shown = np.zeros((n, n)), np.zeros(n), np.zeros(n)
     for g, (of, d, j) in enumerate(zip(members, slopes, moved, strict=True)):
         mean = float(d.mean())
         matrix[g, g] = np.sum(d * (1.0 - 2.0 * leverage[of])) + _STATED * mean
@@ -151,10 +152,11 @@ def _add_factors(reduced: Reduced, roots: FloatArray, leverage: FloatArray, vari
                 (j * d[:, None] @ (moved[other].T * slopes[other]) @ moved[other]) * j * d[:, None]
             )
         score, scaled = rows.weight[of] * rows.residual[of], j * d[:, None]
+        shown[g] = np.mean(score * score) / max(mean, 1e-300)
         total[g] = np.sum(score * score) + _STATED * mean * mean - np.sum((scaled @ of_seen) * scaled)
     found = np.linalg.lstsq(matrix, total, rcond=None)[0]
-    for of, d, v in zip(members, slopes, found, strict=True):
-        variance[of] = max(float(v), _LEAST * float(d.mean())) * d
+    for of, d, v, least in zip(members, slopes, found, shown, strict=True):
+        variance[of] = max(float(v), float(least), _LEAST * float(d.mean())) * d
 
 
 def _jackknifed(score: FloatArray, slope: FloatArray, leverage: FloatArray) -> FloatArray:

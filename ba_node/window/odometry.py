@@ -20,8 +20,8 @@ So images decide where they see enough. Where these see little (no tracks, no pa
 turns on the spot), and for the scale of one camera, the steps do. The loss is Cauchy's: a step that contradicts the
 images by far, as where the front-end has jumped, pulls at nothing. Once the standard deviations are known to be right
 the loss is wider, for all steps that are not wild belong to that distribution, and keep tracks on moving objects from
-carrying a keyframe along. So it is in windows of one camera in any case: it is told no lengths but those of the steps,
-and a loss that most of them leave would weigh them by chance. It is widest in a young map that sees
+carrying a keyframe along. So it is in windows of one camera of which most keyframes see little: a dozen points tell it
+turns, but no lengths, and nobody is there to tell how precise the steps are. It is widest in a young map that sees
 much: nothing but the steps tells there what moves.
 Where much of what is seen moves, refined steps may follow it and tell nothing; there the standard deviations are those
 stated, and the loss is the widest too, but where depths are measured. Rotation and translation have a loss each, so
@@ -59,8 +59,8 @@ _TELLING, _NEARLY_ALL = 10.0, 0.9
 _LEAST_SHARE = 0.2
 # What refined steps are off by counts so many times where keyframes see little.
 _HALF_SEEN = 2.0
-# How many times as wide as stated the loss is once they have told, or with one camera; and before, where all keyframes
-# see much.
+# How many times as wide as stated the loss is once they have told, or where most see little to one camera; and before,
+# where all keyframes see much.
 _WIDE = 5.0
 _WIDEST = 20.0
 # More keyframes are no window: where loops bend a map the steps have to give way.
@@ -128,7 +128,8 @@ def factors(
         rotation, sigma_rad = turned.between(keyframes, first, first + 1)
         known = ~np.isnan(sigma_rad)
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
-    width = _WIDE if inflated is not None or (windowed and not problem.has_scale) else 1.0
+    few = not problem.has_scale and windowed and 2 * np.count_nonzero(many) < len(many)
+    width = _WIDE if few or inflated is not None else 1.0
     if inflated is None and (much_moves or many.all()):
         width = _WIDEST
     return steps.factors(free, width * config.loss_scale)

@@ -101,7 +101,7 @@ def test_everything_is_solved_in_one_call_as_in_three() -> None:
     one, three = Played(messages()), Played(messages())
     estimate = one.optimize()
     begun = three.begin_optimization()
-    assert isinstance(begun, Optimization) and begun.scene is three.scene
+    assert isinstance(begun, Optimization) and three.is_current(begun)
     begun.solve(three.config.solver)
     merged = three.merge(begun)
     assert estimate is not None and merged is not None
@@ -111,7 +111,7 @@ def test_everything_is_solved_in_one_call_as_in_three() -> None:
     assert statistics["keyframes"] + int(begun.selection.problem.fixed.sum()) == N
     assert statistics["objective_after"] <= statistics["objective_before"]
     three.reset()
-    assert begun.scene is not three.scene and three.merge(begun) is None
+    assert not three.is_current(begun) and three.merge(begun) is None
 
 
 def test_nothing_is_optimised_where_there_is_nothing() -> None:

@@ -138,7 +138,7 @@ class Optimize(Component):
         def watch(row: Iteration) -> bool:
             nonlocal out_of_time
             self.host.deferred.call(lambda: self._tell(goal, row, goal.elapsed_s))
-            if taken.scene is not backend.scene:  # another map took its place
+            if not backend.is_current(taken):
                 goal.stop = goal.stop or _GONE
             out_of_time = 0.0 < request.time_budget_s <= goal.elapsed_s
             return not (goal.stop or goal.answer.sent or out_of_time)
