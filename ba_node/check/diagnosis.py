@@ -74,11 +74,6 @@ class Diagnosis:
         """Return True if all that was found are usual mistakes."""
         return all(finding.usual for finding in self.findings)
 
-    @property
-    def settled(self) -> bool:
-        """Return True if nothing is left to be told by more tracks."""
-        return self.harmful or not self.untold
-
     def summary(self) -> str:
         """Return the outcome in a sentence."""
         if self.findings:

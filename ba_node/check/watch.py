@@ -32,7 +32,7 @@ _AGAIN = (15, 40, 90)
 # A session that ends with fewer is looked at once more with all of them.
 _FEW = 10
 _ONCE = frozenset({"pixels", "stamps"})
-# Looked for where there is doubt; and at few of these numbers too.
+# Looked for where there is doubt; and where all is looked at again, and at each number after that.
 _IN_DOUBT, _AT_FEW = frozenset({"onset"}), frozenset({"change"})
 # What solves say of tracks and poses while the set-up is wrong.
 _CONSEQUENCES = ("held", "moving", "stray", "ids_reused")
@@ -179,8 +179,8 @@ class SetUpWatch:
         if self._next < len(_AT) and count >= _AT[self._next]:
             again = any(_AT[self._next] <= at <= count for at in _AGAIN)
             self._next = next((i for i, at in enumerate(_AT) if at > count), len(_AT))
-            told = self._told & _ONCE if again else self._told - _AT_FEW if count > _AGAIN[-1] else self._told | _AT_FEW
-            self._check(scene, told | _IN_DOUBT, _NEWEST)
+            told = self._told & _ONCE if again else self._told | _AT_FEW
+            self._check(scene, (told - _AT_FEW if count > _AGAIN[-1] else told) | _IN_DOUBT, _NEWEST)
         elif self._doubted and self._looked < len(_SINCE) and count >= self._doubted + _SINCE[self._looked][0]:
             newest = _SINCE[self._looked][1] or count - self._doubted
             self._looked += 1
