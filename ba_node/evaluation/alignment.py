@@ -26,6 +26,8 @@ Kind = Literal["none", "se3", "sim3"]
 
 # A set whose second singular value is below this share of the first is a line as far as float64 can tell.
 _LINE = 1e-9
+# Beyond this float64 tells no tenth of a millimetre, and far beyond it LAPACK never ends.
+_FAR_M = 1e12
 
 
 class EvaluationError(ValueError):
@@ -51,8 +53,8 @@ def align(estimate: FloatArray, reference: FloatArray, kind: Kind) -> Alignment:
     ``kind`` is none (identity), se3 (rotation and translation) or sim3 (and scale).
 
     Raises:
-        EvaluationError: unknown kind, shapes that differ, numbers that are not finite, fewer than 3 points, or points
-            on one line or in one place, for which the rotation is not determined.
+        EvaluationError: unknown kind, shapes that differ, numbers that are not finite or beyond 1e12 m, fewer than
+            3 points, or points on one line or in one place, for which the rotation is not determined.
     """
     if kind not in get_args(Kind):
         raise EvaluationError(f"alignment {kind!r}: choose one of {', '.join(get_args(Kind))}")
@@ -82,9 +84,9 @@ def _check(estimate: FloatArray, reference: FloatArray) -> None:
             raise EvaluationError(
                 f"{name} has shape {points.shape}: expected ({len(estimate)}, 3), as many points in both"
             )
-        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(points) <= _FAR_M).all(axis=1))
         if len(bad):
-            raise EvaluationError(f"point {bad[0]} of the {name} is not finite: {points[bad[0]]}")
+            raise EvaluationError(f"point {bad[0]} of the {name} is not finite or beyond 1e12 m: {points[bad[0]]}")
 
 
 def _check_spread(centred: FloatArray, kind: Kind, name: str) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.core.geometry import quaternion_from_matrix
 from ba_node.estimate import Poses
 from ba_node.io.bag_files import SUFFIXES
@@ -36,6 +37,8 @@ TRUTH_TOPIC = "ground_truth/pose"
 _MAX_MESSAGES = 10**6
 # A KITTI file has no stamps: poses are numbered, a second apart.
 _SECOND_NS = 1_000_000_000
+# A rotation may be off an orthonormal one by this much: what four digits leave.
+_ORTHONORMAL = 1e-3
 
 
 def read_pair(estimate: Path, reference: Path, topic: str = "") -> tuple[Poses, Poses]:
@@ -75,7 +78,7 @@ def _read(path: Path, topic: str) -> tuple[Poses, bool]:
     columns = first_line(path)
     if "," in columns:
         return _read_table(path, ",", 8, "stamp[ns],x,y,z,qw,qx,qy,qz,... (EuRoC)"), True
-    if len(columns.split()) == 12:
+    if path.suffix == ".kitti" or len(columns.split()) == 12:
         return _read_table(path, None, 12, "the first three rows of a pose (KITTI)"), False
     return read_tum(path), True
 
@@ -99,9 +102,14 @@ def _read_table(path: Path, separator: str | None, width: int, expected: str) ->
             raise ValueError(f"{shown!r} is no row of numbers: expected {expected}") from None
         if len(values) < width or (separator is None and len(words) > width) or not np.isfinite(values).all():
             raise ValueError(f"expected {width} finite numbers: {expected}")
+        if separator is None:
+            _check_rotation(np.array(values).reshape(3, 4)[:, :3])
         return stamp_ns, values
 
-    stamps, rows = zip(*read_rows(path, row, separator), strict=True)
+    found = read_rows(path, row, separator)
+    if not found:
+        raise TrajectoryError(f"{path}: no pose in it: expected lines with {expected}")
+    stamps, rows = zip(*found, strict=True)
     values = np.array(rows)
     if separator:
         stamp_ns, position, orientation = np.array(stamps, np.int64), values[:, 1:4], values[:, [5, 6, 7, 4]]
@@ -112,6 +120,14 @@ def _read_table(path: Path, separator: str | None, width: int, expected: str) ->
     if (np.linalg.norm(orientation, axis=1) == 0.0).any():
         raise TrajectoryError(f"{path}: a quaternion is zero: expected {expected}")
     return numbered(stamp_ns, position, orientation)
+
+
+def _check_rotation(matrix: FloatArray) -> None:
+    off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if not off <= _ORTHONORMAL:
+        raise ValueError(f"its first three columns are no rotation: R R' is off the identity by {off:.2g}")
+    if np.linalg.det(matrix) < 0.0:
+        raise ValueError("its first three columns mirror space (determinant -1): expected a rotation")
 
 
 def _read_topic(path: Path, topic: str) -> Poses:

@@ -70,7 +70,7 @@ def read(
     if path.suffix == ".ply":
         return of_points(*read_ply(path))
     line = first_line(path)
-    is_table = "," in line or len(line.split()) in (8, 12)
+    is_table = path.suffix in (".tum", ".kitti", ".csv") or "," in line or len(line.split()) in (8, 12)
     return read_poses(path) if is_table else from_bal(read_bal(path))
 
 

@@ -94,6 +94,7 @@ def line(n: int) -> FloatArray:
         (cloud(1, 5), line(5), "5 points of the reference lie on one straight line"),
         (cloud(1, 5), cloud(1, 6), r"shape \(6, 3\)"),
         (cloud(1, 5), np.full((5, 3), np.nan), "point 0 of the reference is not finite"),
+        (1e160 * cloud(1, 5), cloud(1, 5), "point 0 of the estimate is not finite or beyond 1e12 m"),
     ],
 )
 def test_what_cannot_be_aligned_is_refused(estimate: FloatArray, reference: FloatArray, message: str) -> None:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ba_node.estimate import Estimate, Poses
+from ba_node.io.reference import read_poses
 from ba_node.io.trajectory import TrajectoryError, format_stamp, parse_stamp, read_tum, write_tum
 
 
@@ -82,3 +83,20 @@ def test_files_without_poses_are_errors(tmp_path: Path) -> None:
         read_tum(path)
     with pytest.raises(TrajectoryError, match="cannot be opened"):
         read_tum(tmp_path / "absent.tum")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0 " * 12, r"1: its first three columns are no rotation: R R' is off the identity by 1"),
+        ("2 0 0 0 0 2 0 0 0 0 2 0", r"R R' is off the identity by 3"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0", r"mirror space \(determinant -1\)"),
+        ("1 0 0 0 0 1 0 0 0 0 1", r"1: expected 12 finite numbers: the first three rows of a pose \(KITTI\)"),
+        ("# nothing", r"no pose in it: expected lines with the first three rows of a pose \(KITTI\)"),
+    ],
+)
+def test_rows_of_kitti_that_are_no_poses_are_named(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "poses.kitti"
+    path.write_text(text + "\n")
+    with pytest.raises(TrajectoryError, match=words):
+        read_poses(path)
