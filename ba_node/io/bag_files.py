@@ -21,6 +21,8 @@ PACKED = ".zstd"
 SUFFIXES = (*STORAGES, PACKED)
 MAX_PACKED_BYTES = 2**40
 _KNOWN = ("mcap", "sqlite3")
+# How rosbag2 numbers the parts of a recording.
+_NUMBERED = re.compile(r"_(\d{1,4})\.[^.]+$")
 
 
 class BagFiles(NamedTuple):
@@ -52,6 +54,7 @@ def _find_several(paths: Sequence[Path]) -> BagFiles:
     are_parts = _of_one_metadata(files)
     if not are_parts:
         _require_common_name(files)
+        warnings.extend(_gaps(files).items())
     return BagFiles(files, are_parts, dict(warnings))
 
 
@@ -86,6 +89,20 @@ def _base_name(path: Path) -> str:
     return re.sub(r"[-_.]?\d+$", "", name.removesuffix(Path(name).suffix))
 
 
+def _gaps(files: list[Path]) -> dict[str, str]:
+    """Return a warning if the numbers at the end of the names NAME_0, NAME_1, ... leave some out."""
+    found = [_NUMBERED.search(file.name.removesuffix(PACKED)) for file in files]
+    numbers = {int(match[1]) for match in found if match is not None}
+    if len(numbers) < len(files) or len({_base_name(file) for file in files}) > 1:
+        return {}
+    missing = [number for number in range(min(numbers), max(numbers)) if number not in numbers]
+    if not missing:
+        return {}
+    shown = _shown([f"number {number}" for number in missing])
+    text = f"{files[0].name} and its like: {shown} not among the {len(files)} files: results have gaps"
+    return {"missing_files": text}
+
+
 def _find_one(path: Path) -> BagFiles:
     if path.name == METADATA and path.is_file():
         path = path.parent
@@ -97,8 +114,9 @@ def _find_one(path: Path) -> BagFiles:
         except YamlError as error:
             files = _in_folder(path)
             text = f"{error}: all recordings in its folder are taken"
-            return BagFiles(files, False, {"metadata": text})
-    return BagFiles(_in_folder(path), False, {})
+            return BagFiles(files, False, {"metadata": text, **_gaps(files)})
+    files = _in_folder(path)
+    return BagFiles(files, False, _gaps(files))
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -193,6 +211,10 @@ def unpack_file(path: Path, folder: Path) -> Path:
         limit = limit_for(path.stat().st_size, growth=1000, always=16 * ALWAYS_ALLOWED_BYTES)
         with open_regular(path, MAX_PACKED_BYTES) as packed, target.open("xb") as out:
             out.writelines(pieces("zstd", packed, limit))
+            if not out.tell():
+                raise BagError(f"{path}: nothing comes out of its {path.stat().st_size} bytes: it is cut off, or empty")
+    except BagError:
+        raise
     except FileKindError as error:
         raise BagError(str(error)) from None
     except OSError as error:

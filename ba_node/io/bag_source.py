@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
+import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from ba_node.io import ros_types
 from ba_node.io.bag_topics import BagError, EmptyBagError, absolute
 from ba_node.io.files import FileKindError, open_regular
-from ba_node.io.mcap_index import BagIndex, Message, read_index, read_messages
+from ba_node.io.mcap_index import MAX_CHUNK_BYTES, BagIndex, Message, read_index, read_messages
 
 # Any recording; devices and pipes are refused.
 MAX_BYTES = 2**62
@@ -100,15 +101,20 @@ def _sqlite(path: Path, stack: contextlib.ExitStack) -> Source:
     """Open an SQLite file of rosbag2; those before Jazzy hold no definitions, so that ours are taken."""
     reader = Sqlite3Reader(path)
     try:
+        _check_tables(path)
         reader.open()
         stack.callback(reader.close)
         about = reader.metadata
         channels = [_sqlite_channel(connection) for connection in reader.connections]
+        query = "SELECT count(*) FROM messages WHERE topic_id NOT IN (SELECT id FROM topics)"
+        ((strays,),) = _query(reader, query)
     except Exception as error:  # a damaged database leads the library into errors of every kind
         raise BagError(f"not an SQLite recording of rosbag2, or damaged: {error}") from error
     if about.message_count == 0:
         raise EmptyBagError("no message can be read: it was closed before anything was recorded")
     problems = []
+    if strays:
+        problems.append(("corrupt", f"{strays} of {about.message_count} messages name a topic that it does not have"))
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         words = f"{journal.name} beside it holds messages that were not written into it: open it with sqlite3 once"
@@ -117,13 +123,38 @@ def _sqlite(path: Path, stack: contextlib.ExitStack) -> Source:
     return Source(channels, about.message_count, about.start_time, about.end_time - 1, problems, read)
 
 
+def _check_tables(path: Path) -> None:
+    """Raise ValueError unless what is read are tables whose content stands in the file, not made up as it is read."""
+    with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:
+        tables = "('messages', 'topics', 'message_definitions', 'schema')"
+        for name, kind, sql in database.execute(f"SELECT name, type, sql FROM sqlite_master WHERE name IN {tables}"):
+            columns = database.execute(f"PRAGMA table_xinfo({name})").fetchall()
+            if kind != "table" or str(sql).lower().startswith("create virtual") or any(c[-1] for c in columns):
+                raise ValueError(f"{name} is a view, or has columns that are reckoned: expected a table of values")
+
+
+def _query(reader: Sqlite3Reader, query: str, values: tuple[Any, ...] = ()) -> Any:
+    """Return an iterator over the rows that a query gives."""
+    assert reader.dbconn is not None
+    return reader.dbconn.cursor().execute(query, values)
+
+
 def _read_sqlite(
     reader: Sqlite3Reader, channels: Collection[int], report: Callable[[str, str], None]
 ) -> Iterator[Message]:
-    connections = [connection for connection in reader.connections if connection.id in channels]
+    # The library's own reading takes whatever size a message has, and sorts whole messages where times have no index.
+    query = (
+        "SELECT rowid, topic_id, timestamp, length(data) FROM messages"
+        f" WHERE topic_id IN ({','.join(map(str, channels))}) ORDER BY timestamp"
+    )
     try:
-        for connection, log_time, data in reader.messages(connections) if connections else ():
-            yield Message(connection.id, log_time, data)
+        for row, channel, log_time, size in _query(reader, query):
+            if size is not None and size > MAX_CHUNK_BYTES:
+                words = f"message {row} has {size >> 20} MB: expected {MAX_CHUNK_BYTES >> 20} MB at most"
+                report("corrupt", words)
+                continue
+            ((data,),) = _query(reader, "SELECT data FROM messages WHERE rowid = ?", (row,))
+            yield Message(channel, log_time, data)
     except Exception as error:  # as when it is opened
         report("corrupt", f"the database is damaged: {error}")
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,19 @@ def test_missing_parts_are_named(tmp_path: Path, single: Path, capsys: pytest.Ca
         pass
 
 
+def test_numbers_that_are_left_out_are_named(tmp_path: Path, single: Path) -> None:
+    paths = split(tmp_path / "bag", messages_of(single), 4)
+    words = r"part_0\.mcap and its like: number 1, number 2 not among the 2 files: results have gaps"
+    paths[1].unlink()
+    paths[2].unlink()
+    for given in ([paths[0], paths[3]], [tmp_path / "bag"]):
+        assert re.fullmatch(words, find_files(given).warnings["missing_files"])
+    # More than four digits may be a time of day, and one file has no gap.
+    for path, name in ((paths[0], "run_120000.mcap"), (paths[3], "run_121000.mcap")):
+        path.rename(tmp_path / name)
+    assert not find_files(sorted(tmp_path.glob("*.mcap"))).warnings
+
+
 def test_a_damaged_part_costs_itself(tmp_path: Path, single: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = split(tmp_path / "bag", messages_of(single), 3)
     paths[1].write_bytes(b"")
@@ -246,7 +260,7 @@ def test_packed_files_are_read_once(tmp_path: Path, single: Path) -> None:
     (tmp_path / "all.mcap").write_bytes(data)
     assert messages_of(tmp_path) == messages_of(single)
     (tmp_path / "all.mcap").unlink()
-    for broken, words in ((zstandard.compress(data)[:-100], "the file is empty"), (data, "cannot be unpacked")):
+    for broken, words in ((zstandard.compress(data)[:-100], "nothing comes out of its"), (data, "cannot be unpacked")):
         (tmp_path / "all.mcap.zstd").write_bytes(broken)
         with pytest.raises(BagError, match=rf"{tmp_path}/all\.mcap\.zstd: {words}"), BagReader(tmp_path):
             pass
