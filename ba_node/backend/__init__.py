@@ -10,6 +10,7 @@ from ba_node.backend.worse import is_worse
 from ba_node.check.diagnosis import Diagnosis, Row
 from ba_node.check.watch import Check
 from ba_node.core.calibration import Calibration
+from ba_node.scene.ingest import why_refused
 from ba_node.scene.map_content import MapContent, MapError
 from ba_node.window.adjustment import Adjustment
 from ba_node.window.full import Optimization
@@ -31,4 +32,5 @@ __all__ = [
     "Work",
     "can_examine",
     "is_worse",
+    "why_refused",
 ]

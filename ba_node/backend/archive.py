@@ -19,6 +19,8 @@ from ba_node.scene.tables import Column
 from ba_node.window.correction import MapCorrection
 
 _CORRECTION = {"rotation": Column(np.float64, (3, 3)), "translation": Column(np.float64, (3,))}
+# map from odom: between a front-end's poses and refined ones, and turned about the origin.
+_MAX_CORRECTION_M = 1e12
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def _correction_from(content: MapContent) -> MapCorrection:
     columns = content.columns("correction", _CORRECTION)
     require_rotations(columns["rotation"], "correction/rotation")
     translation = columns["translation"]
-    require_all(within(translation, np.finfo(float).max), "correction/translation", translation, "finite numbers")
+    require_all(within(translation, _MAX_CORRECTION_M), "correction/translation", translation, "at most 1e12 m")
     require(len(translation) in (0, 2, 3), f"correction: {len(translation)} transforms, expected 0, 2 or 3")
     transforms = tuple(Transform(np.array(r), np.array(t)) for r, t in zip(*columns.values(), strict=True))
     return MapCorrection(transforms, facts.fact("agreeing", int), facts.fact("stamp_ns", int))

@@ -39,7 +39,9 @@ _SHOWN = {"free": "best fit to the tracks, whatever is given"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("bag", nargs="+", metavar="RECORDING", help="a file, a folder, or a URL; repeatable")
+    parser.add_argument(
+        "bag", type=console.place, nargs="+", metavar="RECORDING", help="a file, a folder, or a URL; repeatable"
+    )
     console.add_fleet_options(parser)
     console.add_parameter_options(parser)
 

@@ -130,6 +130,17 @@ def require_mcap(path: Path) -> None:
         raise TargetError(f"{path}: recordings are written as .mcap: give a name that ends so")
 
 
+def place(text: str) -> str:
+    """Return the name of a file, a folder or a URL; an empty one, as of a variable that is not set, is none.
+
+    Raises:
+        ArgumentTypeError: it is empty, which would stand for the folder that one is in.
+    """
+    if not text:
+        raise argparse.ArgumentTypeError("an empty name: expected a file or folder")
+    return text
+
+
 def add_json_option(parser: argparse.ArgumentParser) -> None:
     """Declare the option that has a command's result written for programs, unless the command has one of its own."""
     if "--json" not in parser.format_usage():

@@ -42,9 +42,10 @@ def leave_to_parent() -> None:
 
 
 def begin() -> None:
-    """Take the signals over, until the process ends."""
+    """Take the signals over, until the process ends, and the standard streams where they are closed."""
     global _begun  # noqa: PLW0603  # signals are those of the whole process, too
     _begun = True
+    _open_closed_streams()
     for number in CODES:
         signal.signal(number, _end)
     # Whoever started this process may have held them back until now.
@@ -69,6 +70,18 @@ def leave(code: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         _quietly(stream.flush)
     os._exit(code)
+
+
+def _open_closed_streams() -> None:
+    """Open what of the standard streams is closed (``ba ... >&-``): else the next file takes its place."""
+    number = os.open(os.devnull, os.O_RDWR)
+    while number <= 2:
+        os.set_inheritable(number, True)
+        number = os.open(os.devnull, os.O_RDWR)
+    os.close(number)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115
 
 
 def _end(number: int, _frame: FrameType | None) -> None:

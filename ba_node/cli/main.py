@@ -8,6 +8,7 @@ Only the command that is asked for is imported: ``ba --help`` is not to wait for
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import sys
@@ -18,8 +19,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from ba_node import __version__
-from ba_node.cli import interrupts
-from ba_node.cli.console import CheckoutError, add_json_option, conclude, json_alone, require_folder, require_others
+from ba_node.cli import console, interrupts
 
 # What every command does, under its heading in ``ba --help``; each is a file of this folder, or below ``experiments``.
 GROUPS: dict[str, dict[str, str]] = {
@@ -91,6 +91,10 @@ _MESSAGES = ("ba_msgs", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", 
 class Parser(argparse.ArgumentParser):
     """Report a wrong command line as every other error: in one line."""
 
+    def __init__(self, *args: Any, **fields: Any) -> None:
+        super().__init__(*args, **fields)
+        self.register("type", Path, lambda text: Path(console.place(text)))
+
     def error(self, message: str) -> NoReturn:
         """Print the error and leave."""
         self.exit(USAGE_ERROR, f"ba: error: {message}; see {self.prog} --help\n")
@@ -105,7 +109,7 @@ def module_of(command: str) -> ModuleType:
     if command not in _EXPERIMENTS:
         return importlib.import_module(f"ba_node.cli.{command}")
     if not all((ROOT / name).is_file() for name in ("setup.py", "experiments/__init__.py")):
-        raise CheckoutError(f"{command} needs a checkout of the repository: experiments are not installed")
+        raise console.CheckoutError(f"{command} needs a checkout of the repository: experiments are not installed")
     if str(ROOT) not in sys.path:
         sys.path.append(str(ROOT))
     return importlib.import_module(f"experiments.{_EXPERIMENTS[command]}")
@@ -160,7 +164,7 @@ def build_parser(command: str) -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         module.add_arguments(sub)
-        add_json_option(sub)
+        console.add_json_option(sub)
     return parser
 
 
@@ -200,12 +204,12 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         args = build_parser(command).parse_args(arguments)
         asked = getattr(args, "json", None)
-        require_folder(asked)
-        require_others(args)
-        with json_alone(asked):
+        console.require_folder(asked)
+        console.require_others(args)
+        with console.json_alone(asked):
             code = module_of(args.command).run(args)
             if asked is not None:
-                conclude(args, code)
+                console.conclude(args, code)
         sys.stdout.flush()
         return code
     except BrokenPipeError:
@@ -220,7 +224,9 @@ def _run(argv: Sequence[str] | None) -> int:
             raise
         return _end(USAGE_ERROR, f"error: {error}: run this where ROS 2 is: after make setup in .venv, or sourced")
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
+        # Files name themselves when a disk is full.
+        unnamed = "standard output: " if error.errno == errno.ENOSPC else ""
+        where = f"{error.filename}: " if error.filename else unnamed
         return _end(USAGE_ERROR, f"error: {where}{error.strerror or error}")
     except ValueError as error:
         # The errors of this package that speak of its input are all ValueErrors of its own.

@@ -49,9 +49,15 @@ _ERRORS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "bag", nargs="+", metavar="BAG", help="recording: .mcap or .db3, a folder, files in any order, or a URL"
+        "bag",
+        type=console.place,
+        nargs="+",
+        metavar="BAG",
+        help="recording: .mcap or .db3, a folder, files in any order, or a URL",
     )
-    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the results; made if missing")
+    parser.add_argument(
+        "--out", type=console.place, required=True, metavar="DIR", help="folder for the results; made if missing"
+    )
     parser.add_argument("--each", action="store_true", help="every BAG is a recording by itself, whatever it is called")
     parser.add_argument(
         "--resume", action="store_true", help="of several, leave alone those whose results are there already"

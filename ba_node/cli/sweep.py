@@ -19,7 +19,7 @@ EXAMPLE = "ba sweep bags/*.mcap --out out/sweep --values window.max_keyframes=5,
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("bag", nargs="+", metavar="RECORDING", help="files, folders or URLs")
+    parser.add_argument("bag", type=console.place, nargs="+", metavar="RECORDING", help="files, folders or URLs")
     parser.add_argument(
         "--values", action="append", required=True, metavar="NAME=A,B,C", help="values of a parameter; repeatable"
     )

@@ -35,7 +35,7 @@ ATTENTION = 3
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("bag", nargs="*", metavar="RECORDING", help="files, folders or URLs")
+    parser.add_argument("bag", type=console.place, nargs="*", metavar="RECORDING", help="files, folders or URLs")
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--parameters",

@@ -101,7 +101,8 @@ def read_colmap(path: Path) -> ColmapModel:
     except ModelError:
         raise
     except _DAMAGE as error:
-        raise ModelError(f"{path}: cannot be read, the model is damaged: {' '.join(str(error).split())}") from None
+        text = f"a file of it is damaged, or does not fit the others (pycolmap: {' '.join(str(error).split())})"
+        raise ModelError(f"{path}: cannot be read: {text}: export it again") from None
 
 
 def _converted(path: Path, world: Any) -> ColmapModel:

@@ -23,6 +23,7 @@ read likewise.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -131,6 +132,9 @@ def _numbers(rows: Sequence[Mapping[Any, Any]], name: str, size: int) -> FloatAr
 
 def _from_kalibr(content: Mapping[Any, Any]) -> CameraRig:
     names = list(itertools.takewhile(content.__contains__, (f"cam{i}" for i in range(len(content)))))
+    more = sorted(name for name in map(str, content) if re.fullmatch(r"cam\d+", name) and name not in names)
+    if more:
+        raise RigError(f"{', '.join(more)} but no cam{len(names)}: cameras are numbered cam0, cam1, ... without a gap")
     rows = [content[name] for name in names]
     for name, row in zip(names, rows, strict=True):
         if row["camera_model"] != "pinhole" or row["distortion_model"] not in _KALIBR:
@@ -178,19 +182,31 @@ def _pose(row: Mapping[Any, Any], key: str, name: str) -> FloatArray:
     if key == "T_cn_cnm1" and name == "cam0":
         return np.eye(4)
     matrix = np.array(row[key], np.float64)
-    rigid = matrix.shape == (4, 4) and np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3)
-    if not rigid or np.linalg.det(matrix[:3, :3]) < 0.0:
-        raise RigError(f"{name}: {key} is no rigid transform of 4 x 4 numbers")
+    rigid = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and _is_rotation(matrix[:3, :3])
+    if not rigid or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise RigError(f"{name}: {key} is no rigid transform of 4 x 4 finite numbers, the last row being 0 0 0 1")
     return np.block([[geometry.nearest_rotation(matrix[:3, :3]), matrix[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def _is_rotation(matrix: FloatArray) -> bool:
+    return np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and float(np.linalg.det(matrix)) > 0.0
 
 
 def _info(content: Mapping[Any, Any], name: str) -> SimpleNamespace:
     """Return a camera_info file with the fields of the message."""
 
     def data(key: str, default: Sequence[float]) -> FloatArray:
-        return np.array(content.get(key, {"data": default})["data"], np.float64).reshape(-1)
+        entry = content.get(key, {"data": default})
+        if not isinstance(entry, Mapping) or "data" not in entry:
+            raise RigError(f"{name}: {key} = {entry}: expected a mapping with rows, cols and data")
+        return np.array(entry["data"], np.float64).reshape(-1)
 
-    size = int(content["image_width"]), int(content["image_height"])
+    size = content["image_width"], content["image_height"]
+    if not all(type(length) is int and length > 0 for length in size):
+        raise RigError(f"{name}: image_width, image_height = {size[0]}, {size[1]}: expected positive whole numbers")
+    r = data("rectification_matrix", np.eye(3).reshape(-1).tolist())
+    if r.size != 9 or not np.isfinite(r).all() or not _is_rotation(r.reshape(3, 3)):
+        raise RigError(f"{name}: rectification_matrix = {r.tolist()}: expected a rotation of 3 x 3 numbers")
     header = SimpleNamespace(frame_id=str(content.get("camera_name") or name))
     return SimpleNamespace(
         header=header,
@@ -198,7 +214,7 @@ def _info(content: Mapping[Any, Any], name: str) -> SimpleNamespace:
         height=size[1],
         k=data("camera_matrix", ()),
         d=data("distortion_coefficients", ()),
-        r=data("rectification_matrix", np.eye(3).reshape(-1).tolist()),
+        r=r,
         p=data("projection_matrix", [0.0] * 12),
         distortion_model=str(content.get("distortion_model", "")),
         binning_x=0,

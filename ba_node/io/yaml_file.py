@@ -36,13 +36,25 @@ class _Loader(yaml.SafeLoader):
                 raise YamlError(f"line {event.start_mark.line + 1}: a value of {len(event.value)} characters")
         return super().compose_node(parent, index)
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that comes twice, of which the first would be lost."""
+        seen: dict[str, int] = {}
+        for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    text = f"{key.value!r} is in line {seen[key.value]} already: put them together"
+                    raise YamlError(f"line {line}: {text}")
+                seen[key.value] = line
+        return super().construct_mapping(node, deep)
+
 
 def read_yaml(path: Path | str, raised: type[ValueError]) -> Any:
     """Return the content of a file.
 
     Raises:
         ``raised``: it cannot be opened, is no regular file or larger than 1 MB, is not YAML, is nested too deep, or has
-            aliases or a number without end; names the file.
+            aliases, a key twice or a number without end; names the file.
     """
     with opened(path, MAX_BYTES, raised) as stream:
         data = stream.read()

@@ -221,7 +221,7 @@ def cut(source: Path | Sequence[Path], target: Path, span: Span, progress: Progr
         if missing:
             raise BagError(f"{reader.path}: no topic {missing[0]}; there are: {', '.join(sorted(reader.topics))}")
         first = next((time_ns for _, time_ns, _ in reader.raw()), 0)
-        start, end = first + span.start_s * _NS, first + span.end_s * _NS
+        start, end = first + max(span.start_s, 0.0) * _NS, first + span.end_s * _NS
         held: dict[str, tuple[BagChannel, bytes]] = {}
         count, last = 0, int(min(max(start, 0.0), 2.0**63))
         with BagWriter(target) as writer:

@@ -7,9 +7,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from ba_node.backend import why_refused
 from ba_node.io.bag_reader import BagReader
 from ba_node.io.bag_topics import BagError
-from ba_node.io.rig_file import read_rig
+from ba_node.io.rig_file import RigError, read_rig
 from ba_node.measurements import CameraRig
 from ba_node.messages.conversion import measurement_from_message
 from ba_node.messages.factory import ConversionError
@@ -24,13 +25,18 @@ def load_rig(paths: Sequence[Path], *, rectified: bool = False, base: str = "") 
     """Return the rig in YAML files of any form, or in a recording.
 
     Raises:
-        RigError: a YAML file holds none.
+        RigError: a YAML file holds none, or a camera is one that node and replay turn away.
         BagError: the recording cannot be read, or holds none.
     """
     if all(path.suffix in _YAML for path in paths):
-        return read_rig(*paths, rectified=rectified)
-    with BagReader(paths) as reader:
-        return rig_of_recording(reader, rectified=rectified, base=base)
+        rig = read_rig(*paths, rectified=rectified)
+    else:
+        with BagReader(paths) as reader:
+            rig = rig_of_recording(reader, rectified=rectified, base=base)
+    refused = why_refused(rig)
+    if refused:
+        raise RigError(f"{', '.join(map(str, paths))}: {refused}")
+    return rig
 
 
 def static_tree(reader: BagReader) -> StaticTree:

@@ -223,10 +223,15 @@ def _check_fold(
     log.warn("distortion_folds", text=text)
 
 
+def why_refused(rig: CameraRig) -> str:
+    """Return why the cameras of a rig are turned away, in words; empty if they are not."""
+    log = RejectionLog()
+    return "" if rig_cameras(rig, log) is not None else log.notes[-1]
+
+
 def seen_from_first(rig: CameraRig) -> CameraRig:
     """Return a rig as it is seen from its first camera, which then is the body; unchanged where it cannot be used."""
-    n = len(rig)
-    if n == 0 or rig_cameras(rig, RejectionLog()) is None:
+    if why_refused(rig):
         return rig
     rotation = geometry.matrix_from_quaternion(rig.orientation)
     back = geometry.inverse(rotation[0], rig.position[0])

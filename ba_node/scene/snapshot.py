@@ -49,7 +49,11 @@ _PENDING_ROWS = {
     "sigma_px": Column(np.float64),
     "depth_m": Column(np.float64),
 }
-_FINITE = np.finfo(float).max
+# Nothing that was ever published lies farther out: a refined pose or point, a number of a camera, a stamp.
+_MAX_REFINED_M = 2 * ingest.MAX_POSITION_M
+_MAX_POINT_M = 1e15
+_MAX_PARAMETER = 1e9
+_STAMP_END_NS = 2**31 * 10**9
 
 
 def take(scene: Scene) -> MapContent:
@@ -111,28 +115,32 @@ def _cameras(content: MapContent, group: str) -> Cameras | None:
     found = content.columns(group, _CAMERAS)
     require(len(found["model"]), f"{group}: no camera in it")
     require_rotations(found["rotation"], f"{group}/rotation")
-    require_all(within(found["translation"], _FINITE), f"{group}/translation", found["translation"], "finite numbers")
+    translation, limit = found["translation"], _MAX_REFINED_M
+    require_all(within(translation, limit), f"{group}/translation", translation, f"at most {limit:g} m")
     known = np.array([int(model) for model in Model])
     require_all(np.isin(found["model"], known), f"{group}/model", found["model"], f"one of {known.tolist()}")
-    good = np.isfinite(found["params"]).all(axis=1) & (found["params"][:, :2] > 0).all(axis=1)
-    require_all(good, f"{group}/params", found["params"], "finite numbers with fx, fy > 0")
+    good = within(found["params"], _MAX_PARAMETER) & (found["params"][:, :2] > 0).all(axis=1)
+    require_all(good, f"{group}/params", found["params"], f"at most {_MAX_PARAMETER:g}, with fx, fy > 0")
     return Cameras(**{name: np.array(values) for name, values in found.items()})
 
 
 def _check_keyframes(found: Mapping[str, NDArray[Any]]) -> None:
     require_unique(found["keyframe_id"], "keyframes/keyframe_id")
+    stamp_ns = found["stamp_ns"]
+    good = (stamp_ns >= -_STAMP_END_NS) & (stamp_ns < _STAMP_END_NS)
+    require_all(good, "keyframes/stamp_ns", stamp_ns, "seconds of 32 bits, as messages have")
     for prefix in ("", "input_"):
         require_rotations(found[f"{prefix}rotation"], f"keyframes/{prefix}rotation")
         position = found[f"{prefix}position"]
-        limit = ingest.MAX_POSITION_M if prefix else _FINITE
-        require_all(within(position, limit), f"keyframes/{prefix}position", position, "finite numbers")
+        limit = ingest.MAX_POSITION_M if prefix else _MAX_REFINED_M
+        require_all(within(position, limit), f"keyframes/{prefix}position", position, f"at most {limit:g} m")
 
 
 def _check_landmarks(found: Mapping[str, NDArray[Any]]) -> None:
     require_unique(found["track_id"], "landmarks/track_id")
     for name in ("position", "guess"):
-        good = within(found[name], _FINITE) | ~found[f"has_{name}"]
-        require_all(good, f"landmarks/{name}", found[name], f"finite numbers where has_{name}")
+        good = within(found[name], _MAX_POINT_M) | ~found[f"has_{name}"]
+        require_all(good, f"landmarks/{name}", found[name], f"at most {_MAX_POINT_M:g} m where has_{name}")
 
 
 def _check_observations(found: Mapping[str, NDArray[Any]], n: Mapping[str, int], n_cameras: int) -> None:
@@ -142,10 +150,10 @@ def _check_observations(found: Mapping[str, NDArray[Any]], n: Mapping[str, int],
         within(found["uv"], ingest.MAX_PIXEL), "observations/uv", found["uv"], f"at most {ingest.MAX_PIXEL:g} px"
     )
     sigma, depth = found["sigma_px"], found["depth_m"]
-    require_all((sigma > 0) & np.isfinite(sigma), "observations/sigma_px", sigma, "a number > 0")
-    require_all(
-        np.isnan(depth) | ((depth > 0) & np.isfinite(depth)), "observations/depth_m", depth, "NaN or a number > 0"
-    )
+    good = (sigma > 0) & (sigma <= ingest.SIGMA_RANGE[1])
+    require_all(good, "observations/sigma_px", sigma, f"a number > 0, at most {ingest.SIGMA_RANGE[1]:g}")
+    good = np.isnan(depth) | ((depth > 0) & (depth <= ingest.DEPTH_RANGE_M[1]))
+    require_all(good, "observations/depth_m", depth, f"NaN or a number > 0, at most {ingest.DEPTH_RANGE_M[1]:g}")
     where = found["keyframe"].astype(np.int64) * max(n_cameras, 1) + found["camera"]
     require_unique(where * max(n["landmarks"], 1) + found["landmark"], "observations: keyframe, camera and landmark")
 

@@ -142,3 +142,19 @@ def test_an_interrupt_of_all_processes_is_one_line(bag: Path, tmp_path: Path) ->
     assert process.returncode == 130
     assert err.endswith("others too does not show\nba: interrupted\n"), err
     assert (tmp_path / "tuned.yaml").is_file()
+
+
+@pytest.mark.parametrize(("words", "code"), [(["info", "{bag}"], 0), (["info", "none.mcap"], 2)])
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_no_code(words: list[str], code: int, closed: str, bag: Path) -> None:
+    line = " ".join([*BA, *(word.format(bag=bag) for word in words), closed])
+    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == code, ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_full_standard_output_is_named(bag: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        line = [*BA, "info", str(bag)]
+        ended = subprocess.run(line, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stderr) == (2, "ba: error: standard output: No space left on device\n")

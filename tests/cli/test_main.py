@@ -228,3 +228,12 @@ def test_what_is_read_is_not_written_over(
     error = capsys.readouterr().err
     assert "that is read, and would be lost: write to another name" in error and error.count("\n") == 1
     assert all((tmp_path / name).read_bytes() == b"months of work" for name in names)
+
+
+def test_an_empty_name_is_no_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    """As of a variable of a script that is not set."""
+    for line in (["replay", "", "--out", "out"], ["info", ""]):
+        with pytest.raises(SystemExit) as left:
+            main(line)
+        assert left.value.code == 2
+        assert "an empty name: expected a file or folder" in capsys.readouterr().err

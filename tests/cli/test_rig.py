@@ -20,7 +20,7 @@ from ba_node.io.rig_file import read_rig
 from ba_node.ros import qos
 from ba_node.ros.message_factory import message_class
 from experiments.demo.domain import free_domain, isolation
-from tests.io.test_rig_file import CAMCHAIN
+from tests.io.test_rig_file import CAMCHAIN, INFO
 from tests.messages.adapters import layouts
 from tests.ros.harness import Peer
 
@@ -39,6 +39,26 @@ def test_it_is_shown(camchain: Path, capsys: pytest.CaptureFixture[str]) -> None
     shown = capsys.readouterr().out
     for words in ("body     imu", "752 x 480 px, fx 458.654", "0.110000 m from cam0", "plumb_bob [-0.283408,"):
         assert words in shown, shown
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ("plumb_bob", "banana", "banana"),
+        ("[0,0,0,0,0]", "[0,0,1]", "3"),
+        ("[0,0,0,0,0]", "[-90,0,0,0,0]", "folds over"),
+    ],
+)
+def test_cameras_that_a_replay_turns_away_are_no_rig(
+    right: str, wrong: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "info.yaml"
+    path.write_text(INFO)
+    assert main(["rig", str(path)]) == 0
+    path.write_text(INFO.replace(right, wrong))
+    assert main(["rig", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"ba: error: {path}: camera 0 ") and words in error
 
 
 def test_forms_become_one_another(camchain: Path, tmp_path: Path) -> None:

@@ -157,6 +157,8 @@ def test_a_bomb_ends_in_a_line_soon_and_small(tmp_path: Path, monkeypatch: pytes
     ("text", "words"),
     [
         ("a: &a [*a]\n", r"alias \*a: aliases are not read, as in ROS"),
+        ("a:\n  b: 1\n  c: 2\n  b: 3\n", r"line 4: 'b' is in line 2 already: put them together"),
+        ("{a: 1, a: 2}\n", r"line 1: 'a' is in line 1 already"),
         ("/**:\n  ros__parameters: hello\n", r"/\*\*: ros__parameters = 'hello': expected a mapping"),
         ("/**:\n  ros__parameters: [1, 2]\n", "expected a mapping"),
         ("[" * 5000, "nested too deep"),

@@ -48,6 +48,15 @@ cam1:
   resolution: [752, 480]
 """
 
+INFO = """
+image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [400,0,320,0,400,240,0,0,1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0,0,0,0,0]}
+rectification_matrix: {rows: 3, cols: 3, data: [1,0,0,0,1,0,0,0,1]}
+"""
+
 
 def a_rig(frame_id: str = "left") -> CameraRig:
     """Return a pair whose right camera is turned a little; the body is the left one."""
@@ -127,6 +136,13 @@ def test_three_cameras_have_no_camera_info() -> None:
         (CAMCHAIN.replace("radtan", "fov"), "pinhole-fov: expected pinhole with one of radtan, equidistant, none"),
         (CAMCHAIN.replace("camera_model: pinhole", "camera_model: omni"), "omni-radtan"),
         (CAMCHAIN.replace("[0.0, 1.0, 0.0, 0.01]", "[0.0, 2.0, 0.0, 0.01]"), "T_cam_imu is no rigid transform"),
+        (CAMCHAIN.replace("[0.0, 1.0, 0.0, -0.1]", "[0.0, 1.0, 0.0, .inf]"), "cam1: T_cam_imu is no rigid transform"),
+        (CAMCHAIN.replace("[0.0, 0.0, 0.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "the last row being 0 0 0 1"),
+        (CAMCHAIN.replace("cam1:", "cam7:"), "cam7 but no cam1: cameras are numbered cam0, cam1, ... without a gap"),
+        (INFO.replace("image_width: 640", "image_width: -640"), "image_width, image_height = -640, 480: expected"),
+        (INFO.replace("image_width: 640", "image_width: 640.5"), "= 640.5, 480: expected positive whole numbers"),
+        (INFO.replace("data: [1,0,0,0,1,0,0,0,1]", "data: [0,0,0,0,0,0,0,0,0]"), "rectification_matrix = .*a rotation"),
+        (INFO.replace("camera_matrix: {", "camera_matrix: 3 # {"), "camera_matrix = 3: expected a mapping with rows"),
         ("{", "not YAML"),
     ],
 )
