@@ -209,7 +209,8 @@ def middle_if_far(points: FloatArray) -> FloatArray:
     if not len(points):
         return np.zeros(3)
     middle = _median(points)
-    extent = float(_median(np.linalg.norm(points - middle, axis=1)))
+    with np.errstate(over="ignore"):  # a few may lie anywhere
+        extent = float(_median(np.linalg.norm(points - middle, axis=1)))
     return middle if float(np.linalg.norm(middle)) > _FAR * extent > 0.0 else np.zeros(3)
 
 
