@@ -28,7 +28,6 @@ import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -37,6 +36,7 @@ from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import columns, geometry, loss
 from ba_node.core.problem import KeyframeFactors, ProblemError, State
+from ba_node.kept import kept_property
 
 # A measured rotation may differ from an orthonormal one by this much.
 _ORTHONORMAL = 1e-6
@@ -206,7 +206,7 @@ class FactorSum:
         value = sum(self._add(kind, number, state, terms, known) for number, kind in enumerate(self._factors))
         return self._stepped(state, replace(terms, value=value))
 
-    @cached_property
+    @kept_property
     def _targets(self) -> list[tuple[list[_Sum], list[tuple[int, int, _Sum]]]]:
         """Return where the terms of each kind go: by place, and by the places of the lower and the higher keyframe."""
         targets = []

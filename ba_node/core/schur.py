@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -33,6 +32,7 @@ from ba_node.core import columns, dense_products
 from ba_node.core.factors import Pairs
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem
+from ba_node.kept import kept_property
 
 # S is formed while it takes at most this many block products an observation.
 _PRODUCTS_PER_OBSERVATION = 60.0
@@ -139,7 +139,7 @@ class Structure:
         moved += columns.times(lin.d_point, columns.take(step_p, self._row_point))
         return moved
 
-    @cached_property
+    @kept_property
     def _dense(self) -> dense_products.DenseProducts:
         return dense_products.DenseProducts(self.edge_point, self.edge_keyframe, self.size)
 
@@ -219,12 +219,12 @@ class ReducedSystem:
                 self._blocks[:, :, j] += np.multiply(equations.e[:, :, i], inverse[i, :, None], out=term)
         self.rhs = (structure.to_keyframes(self._blocks, self._scaled_gradient_p) - equations.gradient_c).ravel()
 
-    @cached_property
+    @kept_property
     def z(self) -> scipy.sparse.bsr_matrix:
         """Return Z as a block-sparse matrix."""
         return self._structure.edge_matrix(self._blocks)
 
-    @cached_property
+    @kept_property
     def z_t(self) -> scipy.sparse.bsr_matrix:
         """Return Z' as a block-sparse matrix."""
         return self._structure.edge_matrix_transposed(self._blocks)
