@@ -66,7 +66,7 @@ def edge_order(edge_point: IntArray, edge_keyframe: IntArray) -> IntArray:
     count = np.diff(start, append=len(edge_point))
     rank = np.empty_like(start)
     rank[np.lexsort((edge_keyframe[start + count - 1], edge_keyframe[start]))] = np.arange(len(start))
-    return np.argsort(np.repeat(rank, count), kind="stable")
+    return columns.order(np.repeat(rank, count), len(rank))
 
 
 class DenseProducts:

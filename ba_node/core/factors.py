@@ -229,14 +229,17 @@ class FactorSum:
         errors = _errors(kind, state, known, derivatives=True)
         residual, jacobian = kind.residuals(state, *errors[:1]), kind.jacobians(state, *errors)
         cost, weight = _weigh(kind, residual)
-        turned = np.swapaxes(jacobian * weight[:, None, None, None], -1, -2)
+        # All products at once: J'J of all places, beside it J'r.
+        both = np.concatenate([*jacobian.swapaxes(0, 1), residual[:, :, None]], axis=2)
+        products = np.swapaxes(both[:, :, :-1] * weight[:, None, None], 1, 2) @ both
         of_places, of_pairs = self._targets[number]
         for a, to in enumerate(of_places):
-            mine = turned[to.rows, a]
-            to.add(terms.gradient, (mine @ residual[to.rows, :, None])[..., 0])
-            to.add(terms.diagonal, mine @ jacobian[to.rows, a])
+            mine = products[to.rows, 6 * a : 6 * a + 6]
+            to.add(terms.gradient, mine[:, :, -1])
+            to.add(terms.diagonal, mine[:, :, 6 * a : 6 * a + 6])
         for low, high, to in of_pairs:
-            to.add(terms.pairs.blocks, turned[to.rows, low] @ jacobian[to.rows, high])
+            if len(to.rows):
+                to.add(terms.pairs.blocks, products[to.rows, 6 * low : 6 * low + 6, 6 * high : 6 * high + 6])
         return 0.5 * float(np.sum(cost))
 
     def _stepped(self, state: State, terms: FactorTerms) -> FactorTerms:
