@@ -102,7 +102,8 @@ def _best(rays: Rays, rows: IntArray, gate2: float) -> FloatArray:
 def _across2(direction: FloatArray, away: FloatArray) -> FloatArray:
     """Return the squared length of the vector product, coordinates in the first axis."""
     (dx, dy, dz), (ax, ay, az) = direction, away
-    total, term = dy * az, dz * ay
+    total: FloatArray = dy * az
+    term = dz * ay
     total -= term
     total *= total
     for a, b, c, d in ((dz, ax, dx, az), (dx, ay, dy, ax)):
