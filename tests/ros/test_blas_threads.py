@@ -7,7 +7,11 @@ import subprocess
 import sys
 
 # Imports what the node works with; says what BLAS was told, and which threads there are then.
-_SCRIPT = "import ba_node.ros, numpy, scipy.linalg, os; print(os.environ['OPENBLAS_NUM_THREADS'], *os.listdir('/proc/self/task'))"
+_SCRIPT = """
+import os
+import ba_node.ros, numpy, scipy.linalg
+print(os.environ["OPENBLAS_NUM_THREADS"], *os.listdir("/proc/self/task"))
+"""
 
 
 def told(given: dict[str, str]) -> tuple[str, int]:
