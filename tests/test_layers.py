@@ -20,6 +20,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "ba_node"
 RANK = {name: rank for rank, names in enumerate(LAYERS.values()) for name in names}
 # Who may use its neighbours in a layer, and which of them.
 SAME = {
+    "config": {"kept"},
     "estimate": {"measurements"},
     "scene": {"measurements"},
     "io": {"messages"},

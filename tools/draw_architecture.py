@@ -25,7 +25,7 @@ MADE_BY = "python -m tools.draw_architecture"
 # Lowest first; tests/test_layers.py holds the imports against them. The first room of a layer is on the way of a
 # keyframe.
 LAYERS: dict[str, tuple[str, ...]] = {
-    "config": ("native", "config", "licence", "arrays"),
+    "config": ("native", "config", "licence", "arrays", "kept"),
     "core": ("core",),
     "scene": ("scene", "measurements", "estimate"),
     "window": ("window", "check"),
@@ -33,7 +33,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "services": ("messages", "io", "evaluation", "front_end"),
     "tools": ("ros", "offline", "cli"),
 }
-UNSEEN = ("licence", "arrays")
+UNSEEN = ("licence", "arrays", "kept")
 
 
 class Step(NamedTuple):

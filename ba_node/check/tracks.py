@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from ba_node.arrays import FloatArray, IntArray
 from ba_node.check.two_view import Pose
 from ba_node.core import cameras as camera_models
 from ba_node.core.problem import Cameras
+from ba_node.kept import kept_property
 from ba_node.scene.scene import Scene
 
 Image = tuple[int, int]
@@ -48,7 +48,7 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.position)
 
-    @cached_property
+    @kept_property
     def ray(self) -> FloatArray:
         """Return X/Z and Y/Z, (n_obs, 2); NaN where there is none."""
         ray = camera_models.normalise(self.uv, self.cameras.model[self.camera], self.cameras.params[self.camera])
@@ -56,7 +56,7 @@ class Tracks:
             usable = np.asarray((ray * ray).sum(axis=1) <= _MAX_RAY**2)
         return np.where(usable[:, None], ray, np.nan)
 
-    @cached_property
+    @kept_property
     def images(self) -> dict[Image, IntArray]:
         """Return the rows of each image (keyframe, camera) that have a ray, by track."""
         rows = np.flatnonzero(np.isfinite(self.ray[:, 0]))

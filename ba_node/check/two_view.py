@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from ba_node.arrays import BoolArray, FloatArray
 from ba_node.core import geometry
+from ba_node.kept import kept_property
 
 # Fewest pairs of rays that an estimate is made from, and that must agree with it.
 MIN_PAIRS = 20
@@ -50,7 +51,7 @@ class Pair:
     def __len__(self) -> int:
         return len(self.a)
 
-    @cached_property
+    @kept_property
     def homogeneous(self) -> tuple[FloatArray, FloatArray]:
         """Return the rays as (X/Z, Y/Z, 1): (n, 3) each."""
         one = np.ones((len(self), 1))

@@ -12,8 +12,9 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from typing import Any, get_type_hints
+
+from ba_node.kept import kept_property
 
 Value = bool | int | float | str
 
@@ -59,7 +60,7 @@ class Parameter:
     tune: Tune | None = None  # where it is worth tuning; None if it is not, or chosen by name
     live: bool = True  # True if a change takes effect at the next solve, False if only at start
 
-    @cached_property
+    @kept_property
     def choices(self) -> tuple[str, ...]:
         """Return the names that it may be, empty if it is not chosen by name."""
         return tuple(choice.name for choice in self.allowed)

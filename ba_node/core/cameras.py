@@ -191,13 +191,17 @@ def project_jacobian(
     else:
         inverse_z = 1.0 / x_cam[:, 2:]
         base = x_cam[:, :2] * inverse_z
-        straight = not intrinsics and not params[:, DISTORTION].any()
-        distorted, jacobian, by_k12 = (
-            (base, np.eye(2)[None], base) if straight else _rational(base, params[:, DISTORTION])
-        )
-        for i in range(2):
-            np.multiply(jacobian[:, i], focal[:, i, None] * inverse_z, out=d_x[:, i, :2])
-        d_x[:, :, 2] = -(d_x[:, :, 0] * base[:, :1] + d_x[:, :, 1] * base[:, 1:])
+        distorted, by_k12 = base, base
+        if not intrinsics and not params[:, DISTORTION].any():
+            d_x[:, 0, 1] = d_x[:, 1, 0] = 0.0
+            for i in range(2):
+                np.multiply(focal[:, i], inverse_z[:, 0], out=d_x[:, i, i])
+                np.multiply(d_x[:, i, i], -base[:, i], out=d_x[:, i, 2])
+        else:
+            distorted, jacobian, by_k12 = _rational(base, params[:, DISTORTION])
+            for i in range(2):
+                np.multiply(jacobian[:, i], focal[:, i, None] * inverse_z, out=d_x[:, i, :2])
+            d_x[:, :, 2] = -(d_x[:, :, 0] * base[:, :1] + d_x[:, :, 1] * base[:, 1:])
     d_intrinsics = columns.empty(len(x_cam), 2, 3 if intrinsics else 0)
     if intrinsics:
         d_intrinsics[:, :, 0] = distorted

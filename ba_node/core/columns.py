@@ -60,9 +60,23 @@ def plus_diagonal(a: FloatArray, diagonal: FloatArray) -> FloatArray:
     return out
 
 
+def order(values: IntArray, n: int) -> IntArray:
+    """Return the order of values 0, 1, ..., n - 1, those that are equal as they come."""
+    # numpy sorts integers of 16 bits by their digits, in a seventh of the time.
+    return np.argsort(values.astype(np.uint16) if n <= 2**16 else values, kind="stable")
+
+
 def starts(values: IntArray) -> IntArray:
     """Return where each run of equal values begins."""
     return np.flatnonzero(np.diff(values, prepend=values[:1] - 1))
+
+
+def counts(begins: IntArray, n: int) -> IntArray:
+    """Return how many rows of n each run has, from where it begins: np.diff without its overhead."""
+    out = np.empty_like(begins)
+    np.subtract(begins[1:], begins[:-1], out=out[:-1])
+    out[-1:] = n - begins[-1:]
+    return out
 
 
 def sum_runs(array: FloatArray, begins: IntArray) -> FloatArray:
@@ -78,14 +92,25 @@ def sums(array: FloatArray, index: IntArray, n: int) -> FloatArray:
     return out
 
 
-def normal_equations(jacobian: FloatArray, residual: FloatArray, begins: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the sums of ``J'J`` and ``J'r`` over runs of rows (n, i, d) and (n, i): (n_runs, d, d), (n_runs, d)."""
+def squares(jacobian: FloatArray) -> list[FloatArray]:
+    """Return ``J'J`` of each block (n, i, d), the entries (n,) on and below its diagonal, row by row."""
+    return [_inner(jacobian[:, :, k], jacobian[:, :, j]) for k in range(jacobian.shape[2]) for j in range(k + 1)]
+
+
+def normal_equations(
+    jacobian: FloatArray, residual: FloatArray, begins: IntArray, known: list[FloatArray] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the sums of ``J'J`` and ``J'r`` over runs of rows (n, i, d) and (n, i): (n_runs, d, d), (n_runs, d).
+
+    ``known``: :func:`squares` of the rows, if they are.
+    """
     d = jacobian.shape[2]
     blocks, gradient = empty(len(begins), d, d), empty(len(begins), d)
+    entries = iter(squares(jacobian) if known is None else known)
     for k in range(d):
         gradient[:, k] = sum_runs(_inner(jacobian[:, :, k], residual), begins)
         for j in range(k + 1):
-            blocks[:, k, j] = blocks[:, j, k] = sum_runs(_inner(jacobian[:, :, k], jacobian[:, :, j]), begins)
+            blocks[:, k, j] = blocks[:, j, k] = sum_runs(next(entries), begins)
     return blocks, gradient
 
 

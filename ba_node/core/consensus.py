@@ -89,11 +89,29 @@ def _best(rays: Rays, rows: IntArray, gate2: float) -> FloatArray:
     away = np.concatenate([far, places[..., None] - centre[:, :, None]], axis=2)
     direction = direction[:, :, None]
     ahead = _dot(away, direction) > 0.0
-    across = np.stack([direction[i - 2] * away[i - 1] - direction[i - 1] * away[i - 2] for i in range(3)])
+    across2 = _across2(direction, away)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error2 = rays.px_per_rad[rows][:, None] ** 2 * _dot(across, across) / _dot(away, away)
-    error2 = np.where(ahead, np.minimum(error2, gate2), gate2)
-    return np.asarray(np.take_along_axis(error2, np.argmin(error2.sum(axis=2), axis=1)[:, None, None], axis=1)[:, 0])
+        across2 /= _dot(away, away)
+        across2 *= rays.px_per_rad[rows][:, None] ** 2
+        np.minimum(across2, gate2, out=across2)
+    across2[~ahead] = gate2
+    best = np.argmin(across2.sum(axis=2), axis=1)
+    return np.asarray(across2[np.arange(len(rows)), best])
+
+
+def _across2(direction: FloatArray, away: FloatArray) -> FloatArray:
+    """Return the squared length of the vector product, coordinates in the first axis."""
+    (dx, dy, dz), (ax, ay, az) = direction, away
+    total: FloatArray = dy * az
+    term = dz * ay
+    total -= term
+    total *= total
+    for a, b, c, d in ((dz, ax, dx, az), (dx, ay, dy, ax)):
+        side = a * b
+        side -= np.multiply(c, d, out=term)
+        side *= side
+        total += side
+    return total
 
 
 def _meetings(centre: FloatArray, direction: FloatArray) -> FloatArray:

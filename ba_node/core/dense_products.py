@@ -9,12 +9,12 @@ seen by the same keyframes come into the same batch, so that few of its blocks a
 from __future__ import annotations
 
 import itertools
-from functools import cached_property
 
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import columns
+from ba_node.kept import kept_property
 
 _BATCH = 128
 # OpenBLAS shares a larger product (rows x rows x columns) among its threads, and waits for a core that may be busy:
@@ -47,7 +47,7 @@ class _Batch:
             self.unknowns = (size * keyframes[:, None] + np.arange(size)).ravel()
         self.shape = size * len(keyframes), 3 * (int(point[-1]) + 1)
 
-    @cached_property
+    @kept_property
     def place(self) -> IntArray:
         """Return (3, d, n_edges) where the entries of their blocks belong in the dense matrix."""
         width = self.shape[1]
@@ -66,7 +66,7 @@ def edge_order(edge_point: IntArray, edge_keyframe: IntArray) -> IntArray:
     count = np.diff(start, append=len(edge_point))
     rank = np.empty_like(start)
     rank[np.lexsort((edge_keyframe[start + count - 1], edge_keyframe[start]))] = np.arange(len(start))
-    return np.argsort(np.repeat(rank, count), kind="stable")
+    return columns.order(np.repeat(rank, count), len(rank))
 
 
 class DenseProducts:
@@ -88,7 +88,7 @@ class DenseProducts:
             _Batch(slice(a, b), place[a:b] - place[a], edge_keyframe[a:b], size) for a, b in itertools.pairwise(bounds)
         ]
 
-    @cached_property
+    @kept_property
     def seconds(self) -> float:
         """Return about how long :meth:`outer` takes."""
         seconds = len(self._batches) * _BATCH_S

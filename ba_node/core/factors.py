@@ -28,7 +28,6 @@ import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -37,6 +36,7 @@ from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.core import columns, geometry, loss
 from ba_node.core.problem import KeyframeFactors, ProblemError, State
+from ba_node.kept import kept_property
 
 # A measured rotation may differ from an orthonormal one by this much.
 _ORTHONORMAL = 1e-6
@@ -206,7 +206,7 @@ class FactorSum:
         value = sum(self._add(kind, number, state, terms, known) for number, kind in enumerate(self._factors))
         return self._stepped(state, replace(terms, value=value))
 
-    @cached_property
+    @kept_property
     def _targets(self) -> list[tuple[list[_Sum], list[tuple[int, int, _Sum]]]]:
         """Return where the terms of each kind go: by place, and by the places of the lower and the higher keyframe."""
         targets = []
@@ -229,14 +229,17 @@ class FactorSum:
         errors = _errors(kind, state, known, derivatives=True)
         residual, jacobian = kind.residuals(state, *errors[:1]), kind.jacobians(state, *errors)
         cost, weight = _weigh(kind, residual)
-        turned = np.swapaxes(jacobian * weight[:, None, None, None], -1, -2)
+        # All products at once: J'J of all places, beside it J'r.
+        both = np.concatenate([*jacobian.swapaxes(0, 1), residual[:, :, None]], axis=2)
+        products = np.swapaxes(both[:, :, :-1] * weight[:, None, None], 1, 2) @ both
         of_places, of_pairs = self._targets[number]
         for a, to in enumerate(of_places):
-            mine = turned[to.rows, a]
-            to.add(terms.gradient, (mine @ residual[to.rows, :, None])[..., 0])
-            to.add(terms.diagonal, mine @ jacobian[to.rows, a])
+            mine = products[to.rows, 6 * a : 6 * a + 6]
+            to.add(terms.gradient, mine[:, :, -1])
+            to.add(terms.diagonal, mine[:, :, 6 * a : 6 * a + 6])
         for low, high, to in of_pairs:
-            to.add(terms.pairs.blocks, turned[to.rows, low] @ jacobian[to.rows, high])
+            if len(to.rows):
+                to.add(terms.pairs.blocks, products[to.rows, 6 * low : 6 * low + 6, 6 * high : 6 * high + 6])
         return 0.5 * float(np.sum(cost))
 
     def _stepped(self, state: State, terms: FactorTerms) -> FactorTerms:

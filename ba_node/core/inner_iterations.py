@@ -66,7 +66,7 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
     factors = objective.factors_value(state)
     before = 0.5 * float(np.sum(seen.cost)) + factors
     for step in range(steps + 1):
-        count = np.diff(start, append=len(rows))
+        count = columns.counts(start, len(rows))
         flat = _flatness(objective, seen, start)
         cost = columns.sum_runs(seen.cost, start)
         better = cost < best_cost[ids]
@@ -78,7 +78,8 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
             if flat is not None:
                 least = np.where(np.trace(flat, axis1=1, axis2=2) > 0.0, _MIN_GAIN_OUTLIER, _MIN_GAIN)
             active = better & ~(best_cost[ids] - cost < least * cost)
-        best[ids[better]], best_cost[ids[better]] = points[ids[better]], cost[better]
+        won = ids[better]
+        best[won], best_cost[won] = points[won], cost[better]
         if step == steps or not active.any():
             break
         c, gradient = columns.normal_equations(seen.d_point, seen.residual, start)
@@ -92,12 +93,14 @@ def iterate_points(objective: Objective, structure: Structure, state: State, ste
                 inverse = inverse_cholesky3(columns.plus_diagonal(c, diagonal))
                 scaled = columns.times(inverse, gradient)
         active &= np.sum(scaled * scaled, axis=1) > least_promise(objective.options) * cost
-        if not active.any():
+        going = active.nonzero()[0]
+        if not len(going):
             break
         points = best.copy()
-        points[ids[active]] -= columns.times(columns.transposed(inverse), scaled)[active]
-        ids, rows = ids[active], rows[np.repeat(active, count)]
-        start = np.cumsum(count[active]) - count[active]
+        ids, rows = ids.take(going), rows[np.repeat(active, count)]
+        points[ids] -= columns.times(columns.transposed(columns.take(inverse, going)), columns.take(scaled, going))
+        count = count.take(going)
+        start = np.cumsum(count) - count
         seen = objective.point_rows(dataclasses.replace(state, points=points), rows)
         damping *= 0.1
     after = 0.5 * float(np.sum(best_cost[np.isfinite(best_cost)])) + factors

@@ -37,6 +37,7 @@ class Linearisation:
     d_keyframe: FloatArray  # (n_obs, d, 6 or 9)
     d_point: FloatArray  # (n_obs, d, 3)
     factors: FactorTerms | None = None  # what the factors add; None if there are none
+    points: FloatArray | None = None  # (n_obs, 3) the points, m, where poses step locally and nothing else does
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,8 @@ class Objective:
             d_keyframe = np.concatenate([d_keyframe.T, d_intrinsics.T]).T
         terms = None if self.factors is None else self.factors.linearise(state)
         value = _total(rows.cost) + (0.0 if terms is None else terms.value)
-        return Linearisation(value, rows.residual, d_keyframe, rows.d_point, terms)
+        local = self.options.parameterisation == "local" and not intrinsics
+        return Linearisation(value, rows.residual, d_keyframe, rows.d_point, terms, points if local else None)
 
     def point_rows(self, state: State, rows: IntArray | slice = slice(None)) -> PointRows:
         """Return costs, residuals and derivatives by the points of some observations."""
@@ -257,7 +259,7 @@ class Objective:
         by_component = self.options.loss_per == "component"
         norm = np.abs(residual[:, :2]) if by_component else np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2)[:, None]
         costs, weight = self._loss(norm)
-        cost = costs.sum(axis=1)
+        cost = costs.sum(axis=1) if by_component else costs[:, 0]
         if self.options.cheirality != "keep" and len(masked):
             behind, _ = self._loss(np.array([_BEHIND_NORM]))
             cost[masked] = behind[0]

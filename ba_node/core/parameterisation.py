@@ -14,6 +14,17 @@ from ba_node.arrays import FloatArray, IntArray
 from ba_node.core import columns, geometry
 
 
+def local_jacobian(d_point: FloatArray, point: FloatArray) -> FloatArray:
+    """Return the derivative of residuals by a local step of the pose, (n, d, 6), from those by the points (n, d, 3)."""
+    out = columns.empty(*d_point.shape[:2], 6)
+    x, g = point[:, None, :], d_point
+    out[..., 0] = x[..., 1] * g[..., 2] - x[..., 2] * g[..., 1]
+    out[..., 1] = x[..., 2] * g[..., 0] - x[..., 0] * g[..., 2]
+    out[..., 2] = x[..., 0] * g[..., 1] - x[..., 1] * g[..., 0]
+    out[..., 3:] = g
+    return out
+
+
 def pose_jacobian(
     kind: str, d_point: FloatArray, point: FloatArray, rotation: FloatArray, row_pose: IntArray
 ) -> FloatArray:
@@ -25,17 +36,11 @@ def pose_jacobian(
     Returns:
         (n, d, 6): rotation, then translation.
     """
-    out = columns.empty(*d_point.shape[:2], 6)
-    x, g = point[:, None, :], d_point
-    out[..., 0] = x[..., 1] * g[..., 2] - x[..., 2] * g[..., 1]
-    out[..., 1] = x[..., 2] * g[..., 0] - x[..., 0] * g[..., 2]
-    out[..., 2] = x[..., 0] * g[..., 1] - x[..., 1] * g[..., 0]
-    if kind == "local":
-        out[..., 3:] = g
-    else:
+    out = local_jacobian(d_point, point)
+    if kind != "local":
         jr = geometry.right_jacobian(geometry.so3_log(rotation))
         out[..., :3] = columns.product(out[..., :3], columns.take(jr, row_pose))
-        out[..., 3:] = columns.product(g, columns.transposed(columns.take(rotation, row_pose)))
+        out[..., 3:] = columns.product(d_point, columns.transposed(columns.take(rotation, row_pose)))
     return out
 
 

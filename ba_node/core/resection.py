@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray, changed
 from ba_node.config import SolverOptions
-from ba_node.core import cameras, columns, geometry, loss
+from ba_node.core import cameras, columns, geometry, loss, parameterisation
 from ba_node.core.native_kernels import missing
 from ba_node.core.problem import Problem, State
 
@@ -83,7 +83,7 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
 
 
 class _Views(NamedTuple):
-    """Observations of one keyframe."""
+    """Observations of one keyframe, all but the model stored by components."""
 
     points: FloatArray  # (n, 3) m
     turn: FloatArray  # (n, 3, 3) camera from body
@@ -96,32 +96,28 @@ class _Views(NamedTuple):
     @classmethod
     def of(cls, problem: Problem, rows: IntArray) -> _Views:
         obs, cams = problem.observations, problem.cameras
-        camera, points = obs.camera[rows], problem.start.points[obs.point[rows]]
-        places = cams.rotation[camera], cams.translation[camera]
-        return cls(points, *places, cams.model[camera], cams.params[camera], obs.uv[rows], 1.0 / obs.sigma_px[rows])
+        camera, points = obs.camera.take(rows), columns.take(problem.start.points, obs.point.take(rows))
+        turn, shift, params = (columns.take(a, camera) for a in (cams.rotation, cams.translation, cams.params))
+        return cls(points, turn, shift, cams.model[camera], params, columns.take(obs.uv, rows), 1 / obs.sigma_px[rows])
 
 
 def _equations(
     views: _Views, options: SolverOptions, pose: tuple[FloatArray, FloatArray]
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return the cost of some observations of one keyframe at a pose, J'J (6, 6) and J'r (6,)."""
-    body = views.points @ pose[0].T + pose[1]
-    x_cam = (views.turn @ body[:, :, None])[..., 0] + views.shift
+    body = (pose[0] @ views.points.T + pose[1][:, None]).T
+    x_cam = columns.times(views.turn, body)
+    x_cam += views.shift
     behind = cameras.behind(x_cam, views.model)
     x_cam[behind] = (0.0, 0.0, 1.0)
     uv, d_uv, _ = cameras.project_jacobian(x_cam, views.model, views.params, intrinsics=False)
     scale = np.where(behind, 0.0, views.weight)[:, None]
     residual = (uv - views.uv) * scale
-    norm = np.where(behind, _BEHIND_NORM, np.sqrt(np.sum(residual * residual, axis=1)))
+    norm = np.where(behind, _BEHIND_NORM, np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2))
     cost, weight = loss.evaluate(options.loss, norm, options.loss_scale_px)
-    by_body = columns.product(d_uv, views.turn) * scale[:, :, None]
-    jacobian = np.empty((len(body), 2, 6))
-    (x, y, z), (by_x, by_y, by_z) = body.T[:, :, None], by_body.transpose(2, 0, 1)
-    jacobian[:, :, 0], jacobian[:, :, 1], jacobian[:, :, 2] = (
-        y * by_z - z * by_y,
-        z * by_x - x * by_z,
-        x * by_y - y * by_x,
-    )
-    jacobian[:, :, 3:] = by_body
-    weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
-    return float(np.sum(cost)), weighted.T @ jacobian.reshape(-1, 6), weighted.T @ residual.ravel()
+    d_uv *= scale[:, :, None]
+    by_body = columns.product(d_uv, views.turn)
+    jacobian = parameterisation.local_jacobian(by_body, body).T
+    rows = jacobian.reshape(6, -1)
+    weighted = (jacobian * weight).reshape(6, -1)
+    return float(np.sum(cost)), weighted @ rows.T, weighted @ residual.T.ravel()

@@ -7,9 +7,9 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 from ba_node.core.problem import State
+from ba_node.kept import kept_property
 
 
 class Status(enum.IntEnum):
@@ -60,7 +60,7 @@ class Result:
     loosest: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
     at_end: Callable[[], float] | None = None
 
-    @cached_property
+    @kept_property
     def weakest(self) -> tuple[float, float]:
         """Return what ``covariance.weakest`` has of the free poses, worked out now; 0, 0 if it was not asked for."""
         return self.loosest()
@@ -81,7 +81,7 @@ class Result:
         """Return the objective at the end."""
         return self.trace[-1].objective if self.trace else 0.0
 
-    @cached_property
+    @kept_property
     def gradient_norm(self) -> float:
         """Return the norm of the gradient at the end, worked out now if nobody had time to."""
         if self.at_end is not None:

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -33,6 +32,7 @@ from ba_node.core import columns, dense_products
 from ba_node.core.factors import Pairs
 from ba_node.core.objective import Linearisation
 from ba_node.core.problem import Problem
+from ba_node.kept import kept_property
 
 # S is formed while it takes at most this many block products an observation.
 _PRODUCTS_PER_OBSERVATION = 60.0
@@ -63,7 +63,7 @@ class Structure:
         key = obs.point[rows] * max(self.n_free, 1) + row_column[rows]
         order = np.argsort(key, kind="stable")
         rows, start = rows[order], columns.starts(key[order])
-        count = np.diff(start, append=len(rows))
+        count = columns.counts(start, len(rows))
         point, keyframe = obs.point[rows[start]], row_column[rows[start]]
         order = dense_products.edge_order(point, keyframe)
         self.edge_point, self.edge_keyframe, start, count = (a[order] for a in (point, keyframe, start, count))
@@ -87,9 +87,11 @@ class Structure:
         """Return True if forming S is cheaper than working without it."""
         return self.schur_products <= _PRODUCTS_PER_OBSERVATION * max(self.n_edges, 1)
 
-    def point_blocks(self, d_point: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return C (n_points, 3, 3) and gp (n_points, 3)."""
-        c, gradient = columns.normal_equations(d_point, residual, self.point_start)
+    def point_blocks(
+        self, d_point: FloatArray, residual: FloatArray, squares: list[FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return C (n_points, 3, 3) and gp (n_points, 3); ``squares`` are those of ``d_point``."""
+        c, gradient = columns.normal_equations(d_point, residual, self.point_start, squares)
         if len(c) == self.n_points:
             return c, gradient
         all_c, all_gradient = np.zeros((self.n_points, 3, 3), order="F"), np.zeros((self.n_points, 3), order="F")
@@ -107,6 +109,26 @@ class Structure:
             columns.put(out, edges, columns.take(out, edges) + products(rows))
         return out
 
+    def local_edge_products(self, squares: list[FloatArray], points: FloatArray) -> FloatArray:
+        """Return E where poses step locally: ``Jc = [x x g; g]'`` for rows g of Jp, so E is ``[[x] G; G]``, G = g g'.
+
+        ``squares`` are the entries of G of each observation, (n_obs,) each, ``points`` x, (n_obs, 3) m.
+        """
+        first = self._edge_rows[0][1]
+        entries = [values.take(first) for values in squares]
+        for edges, rows in self._edge_rows[1:]:
+            for mine, values in zip(entries, squares, strict=True):
+                mine[edges] += values.take(rows)
+        xx, xy, yy, xz, yz, zz = entries
+        x, y, z = (values.take(first) for values in points.T)
+        out, term = columns.empty(len(first), 6, 3), np.empty(len(first))
+        for k, (by_x, by_y, by_z) in enumerate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
+            for i, (a, b, c, d) in enumerate(((y, by_z, z, by_y), (z, by_x, x, by_z), (x, by_y, y, by_x))):
+                np.multiply(a, b, out=out[:, i, k])
+                out[:, i, k] -= np.multiply(c, d, out=term)
+            out[:, 3, k], out[:, 4, k], out[:, 5, k] = by_x, by_y, by_z
+        return out
+
     def keyframe_blocks(self, d_keyframe: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return B (n_free, d, d) and gc (n_free, d)."""
         rows, bounds = self._keyframe_rows, self._keyframe_bounds
@@ -114,13 +136,13 @@ class Structure:
         # Rows are in range; a check of that would make a copy.
         d_keyframe.T.take(rows, axis=-1, out=both.T[:-1], mode="clip")
         residual.T.take(rows, axis=-1, out=both.T[-1], mode="clip")
-        products = _products(both[:, :, :-1], both, bounds)
-        return products[:, :, :-1], products[:, :, -1]
+        products = _squares(both, bounds)
+        return products[:, :-1, :-1], products[:, :-1, -1]
 
     def edge_squares(self, blocks: FloatArray) -> FloatArray:
         """Return the sum of ``Z Z'`` over the edges (n_edges, d, 3) of each keyframe, (n_free, d, d)."""
         by_keyframe = columns.transposed(columns.take(blocks, self._edge_by_keyframe))
-        return _products(by_keyframe, by_keyframe, self._indptr_keyframe)
+        return _squares(by_keyframe, self._indptr_keyframe)
 
     def to_keyframes(self, blocks: FloatArray, x: FloatArray) -> FloatArray:
         """Return ``Z x`` for edges (n_edges, d, 3) and x (n_points, 3): (n_free, d)."""
@@ -139,7 +161,7 @@ class Structure:
         moved += columns.times(lin.d_point, columns.take(step_p, self._row_point))
         return moved
 
-    @cached_property
+    @kept_property
     def _dense(self) -> dense_products.DenseProducts:
         return dense_products.DenseProducts(self.edge_point, self.edge_keyframe, self.size)
 
@@ -188,8 +210,12 @@ class NormalEquations:
 def normal_equations(structure: Structure, lin: Linearisation) -> NormalEquations:
     """Return H and g of a linearisation."""
     b, gradient_c = structure.keyframe_blocks(lin.d_keyframe, lin.residual)
-    c, gradient_p = structure.point_blocks(lin.d_point, lin.residual)
-    e = structure.edge_products(lin.d_keyframe, lin.d_point)
+    squares = columns.squares(lin.d_point)
+    c, gradient_p = structure.point_blocks(lin.d_point, lin.residual, squares)
+    if lin.points is None:
+        e = structure.edge_products(lin.d_keyframe, lin.d_point)
+    else:
+        e = structure.local_edge_products(squares, lin.points)
     if lin.factors is None:
         return NormalEquations(b, c, e, gradient_c, gradient_p)
     b[:, :6, :6] += lin.factors.diagonal
@@ -219,12 +245,12 @@ class ReducedSystem:
                 self._blocks[:, :, j] += np.multiply(equations.e[:, :, i], inverse[i, :, None], out=term)
         self.rhs = (structure.to_keyframes(self._blocks, self._scaled_gradient_p) - equations.gradient_c).ravel()
 
-    @cached_property
+    @kept_property
     def z(self) -> scipy.sparse.bsr_matrix:
         """Return Z as a block-sparse matrix."""
         return self._structure.edge_matrix(self._blocks)
 
-    @cached_property
+    @kept_property
     def z_t(self) -> scipy.sparse.bsr_matrix:
         """Return Z' as a block-sparse matrix."""
         return self._structure.edge_matrix_transposed(self._blocks)
@@ -306,16 +332,17 @@ def inverse_cholesky3(c: FloatArray) -> FloatArray:
 
 def _runs(key: IntArray, rows: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Return rows sorted by their key, and where those of each key 0, 1, ..., n - 1 begin and end, (n + 1,)."""
-    ordered = rows[np.argsort(key[rows], kind="stable")]
-    return ordered, np.searchsorted(key[ordered], np.arange(n + 1))
+    of = key[rows]
+    return rows[columns.order(of, n)], np.concatenate([[0], np.cumsum(np.bincount(of, minlength=n))])
 
 
-def _products(a: FloatArray, b: FloatArray, bounds: IntArray) -> FloatArray:
-    """Return the sum of ``A' B`` over each run of blocks A (n, i, j) and B (n, i, k): (n_runs, j, k)."""
-    out = np.zeros((len(bounds) - 1, a.shape[2], b.shape[2]))
+def _squares(a: FloatArray, bounds: IntArray) -> FloatArray:
+    """Return the sum of ``A' A`` over each run of blocks A (n, i, j): (n_runs, j, j)."""
+    d = a.shape[2]
+    out = np.zeros((len(bounds) - 1, d, d))
     for k, (begin, end) in enumerate(itertools.pairwise(bounds.tolist())):
-        left, right = (c[begin:end].reshape(-1, c.shape[2], order="F") for c in (a, b))
-        np.matmul(left.T, right, out=out[k])
+        rows = a[begin:end].reshape(-1, d, order="F")
+        np.matmul(rows.T, rows, out=out[k])
     return out
 
 

@@ -31,9 +31,8 @@ _ROBUST_ROUNDS = 5
 _HUBER = 1.5
 # Of the angle between a ray and its camera's axis, where a depth tells a distance.
 _LEAST_COSINE = 0.01
-# Where the six sums of a symmetric matrix belong in it.
-_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-_DIAGONAL = np.arange(3)
+# Of a symmetric matrix's six entries.
+_DIAGONAL = np.array([0, 3, 5])
 # Observations that are worked on at once: a large map's would take a multiple of the memory of their rays.
 _AT_ONCE = 2**17
 
@@ -147,7 +146,8 @@ def triangulate(rays: Rays, n_points: int, kernels: str = "auto") -> Triangulati
     sums = _Sums(rays, n_points)
     for i in range(_PLAIN_ROUNDS + _ROBUST_ROUNDS):
         points = sums.weighted_midpoint(centre, distance, trust)
-        away = points.T.take(rays.point, axis=1) - centre
+        away = points.T.take(rays.point, axis=1)
+        away -= centre
         distance = _length(away)
         if i >= _PLAIN_ROUNDS - 1:
             across = _length(_cross(sums.direction, away)) / np.maximum(distance, 1e-9)
@@ -224,11 +224,27 @@ class _Sums:
         values[6:] += across * centre
         # Without rays numpy counts in integers.
         sums = np.bincount(self._bins, values.ravel(), 9 * self._n).astype(float, copy=False).reshape(9, -1)
-        matrix = sums[_PLACES].transpose(2, 0, 1).copy()
-        trace = matrix[:, 0, 0] + matrix[:, 1, 1] + matrix[:, 2, 2]
-        # A whiff of damping: parallel rays give a far point instead of a singular matrix.
-        matrix[:, _DIAGONAL, _DIAGONAL] += (1e-14 * trace + np.where(trace > 0, 0.0, 1.0))[:, None]
-        return np.asarray(np.linalg.solve(matrix, sums[6:].T[..., None])[..., 0])
+        return _solved(sums[:6], sums[6:])
+
+
+def _solved(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Solve symmetric 3x3 systems by L D L': (6, n) xx, xy, xz, yy, yz, zz, written over, and (3, n) -> (n, 3)."""
+    xx, xy, xz, yy, yz, zz = matrix
+    trace = xx + yy + zz
+    # A whiff of damping: parallel rays give a far point instead of a singular matrix.
+    matrix[_DIAGONAL] += 1e-14 * trace + (trace <= 0.0)
+    by_x, bz_x = xy / xx, xz / xx
+    yy -= by_x * xy
+    yz -= by_x * xz
+    bz_y = yz / yy
+    zz -= bz_x * xz + bz_y * yz
+    a, b, c = rhs
+    b = b - by_x * a
+    out = np.empty((3, len(a)))
+    np.divide(c - bz_x * a - bz_y * b, zz, out=out[2])
+    np.subtract(b / yy, bz_y * out[2], out=out[1])
+    np.subtract(a / xx, by_x * out[1] + bz_x * out[2], out=out[0])
+    return out.T
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from ba_node.arrays import BoolArray, FloatArray
 from ba_node.front_end.opencv import cv2
 from ba_node.front_end.patches import Floats
 from ba_node.front_end.records import Grey
+from ba_node.kept import kept_property
 
 # Images are smoothed by this before patches are compared, px.
 SMOOTHING_PX = 1.0
@@ -34,12 +34,12 @@ class Frame:
         """Return where patches are clear of the second image's rim: (h, w)."""
         return np.ones(self.grey.shape, bool) if self.right_rim is None else self.right_rim
 
-    @cached_property
+    @kept_property
     def soft(self) -> Floats:
         """Return the first image smoothed, in which patches are compared: (h, w) float32."""
         return soften(self.grey)
 
-    @cached_property
+    @kept_property
     def right_soft(self) -> Floats:
         """Return the second image smoothed."""
         assert self.right is not None

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from ba_node.core.solver import solve
 from ba_node.estimate import Iteration
 from ba_node.io.bal import BalProblem, behind, from_state, read_bal, to_problem, translated, write_bal
 from ba_node.io.bundler import BundlerScene, from_bal, is_bundler, read_bundler, write_bundler
+from ba_node.kept import kept_property
 
 # Points that lie so many times their own extent from the origin are moved there: coordinates of a whole country, as UTM
 # has them, leave too few digits to the steps of a solver.
@@ -125,7 +125,7 @@ class Solution(Solved):
     # for ``totals`` where several ranks have found them, each for its part
     summed: Totals | None = None
 
-    @cached_property
+    @kept_property
     def totals(self) -> Totals:
         """Return what is summed over all observations."""
         return self.summed or totals(self.bal, self.problem, self.result.state)

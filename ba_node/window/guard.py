@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.config import Config
 from ba_node.core.problem import Problem, State
+from ba_node.kept import kept_property
 from ba_node.window import depths, steps
 from ba_node.window.merging import Merged
 from ba_node.window.selection import Selection
@@ -354,7 +354,7 @@ class _Compared:
         tied = np.bincount(point, minlength=self.selection.problem.n_points)[point] >= _TIED
         return np.bincount(keyframe[tied], minlength=self.selection.problem.n_keyframes)
 
-    @cached_property
+    @kept_property
     def _views(self) -> tuple[IntArray, IntArray, BoolArray]:
         """Return point, keyframe, and whether all cameras agree, of each pair of point and keyframe."""
         obs, n = self.selection.observations, self.selection.problem.n_keyframes

@@ -15,7 +15,6 @@ problem has its origin at its oldest keyframe: far from the map's origin (UTM) n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from ba_node.arrays import BoolArray, FloatArray, IdArray, IntArray, changed
 from ba_node.config import Config
 from ba_node.core import geometry, native_kernels
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
+from ba_node.kept import kept_property
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, gauge, moving, odometry, old_keyframes, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
@@ -68,12 +68,12 @@ class Selection:
     strays: tuple[arrival.Stray, ...]  # keyframes that began in the wrong place
     beside: tuple[KeyframeFactors, ...] = ()  # factors of the problem that are no steps of the front-end
 
-    @cached_property
+    @kept_property
     def used(self) -> IntArray:
         """Return which of all observations are in the problem, in its order."""
         return self.inlier.nonzero()[0]
 
-    @cached_property
+    @kept_property
     def whole(self) -> Problem:
         """Return the problem with all observations, those that are left out too."""
         return changed(self.problem, observations=self.observations)

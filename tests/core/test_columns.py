@@ -57,3 +57,16 @@ def test_without_rows_there_are_no_runs() -> None:
     assert columns.starts(none).shape == (0,)
     assert columns.sum_runs(np.zeros((0, 3)), none).shape == (0, 3)
     assert columns.normal_equations(np.zeros((0, 2, 3)), np.zeros((0, 2)), none)[0].shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize("n", [5, 2**16, 2**16 + 1])
+def test_small_integers_are_ordered_as_they_come(n: int) -> None:
+    """The largest is the last that 16 bits hold, or the first that they do not."""
+    values = np.random.default_rng(n).integers(0, n, 3000)
+    values[:2] = n - 1, 0
+    np.testing.assert_array_equal(columns.order(values, n), np.argsort(values, kind="stable"))
+
+
+def test_counts_of_runs() -> None:
+    np.testing.assert_array_equal(columns.counts(np.array([0, 3, 4]), 6), [3, 1, 2])
+    assert columns.counts(np.zeros(0, np.intp), 0).shape == (0,)

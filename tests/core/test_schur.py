@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ba_node.config import SolverOptions
-from ba_node.core import dense_products, linear
+from ba_node.core import columns, dense_products, linear
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import ReducedSystem, Structure, inverse_cholesky3, normal_equations
@@ -56,6 +56,19 @@ def test_reduced_step_is_the_dense_step(shape: dict[str, object], mu: float, mak
     step = np.concatenate([step_c, system.expand(step_c)[1].ravel()])
     assert np.linalg.norm(step - expected) <= 1e-8 * np.linalg.norm(expected)
     assert equations.gradient_norm == pytest.approx(np.linalg.norm(gradient), rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [{}, {"stereo": True, "depth": True}, {"fixed": 3}])
+def test_both_ways_to_couple_poses_and_points_agree(shape: dict[str, object], make_problem: Make) -> None:
+    problem, _ = make_problem(**shape)
+    structure = Structure(problem)
+    lin = Objective(problem, SolverOptions(parameterisation="local", loss="huber")).linearise(problem.start)
+    assert lin.points is not None
+    expected = structure.edge_products(lin.d_keyframe, lin.d_point)
+    found = structure.local_edge_products(columns.squares(lin.d_point), lin.points)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    others = Objective(problem, SolverOptions(parameterisation="global")).linearise(problem.start)
+    assert others.points is None
 
 
 @pytest.mark.parametrize("shape", SHAPES)

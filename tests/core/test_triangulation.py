@@ -214,3 +214,15 @@ def test_a_point_does_not_depend_on_those_it_is_worked_on_with() -> None:
         alone = triangulate(dataclasses.replace(own, point=np.zeros(len(own.point), np.intp)), 1)
         for all_of_them, one in zip(vars(together).values(), vars(alone).values(), strict=True):
             np.testing.assert_array_equal(all_of_them[k], one[0], err_msg=f"point {k} of {views[k]} views")
+
+
+def test_symmetric_systems_are_solved_column_by_column() -> None:
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(50, 3, 3))
+    matrix, rhs = root @ np.swapaxes(root, 1, 2), rng.normal(size=(50, 3))
+    matrix[-1], rhs[-1] = 0.0, 0.0
+    entries = np.stack([matrix[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
+    found = triangulation._solved(entries, rhs.T)
+    expected = np.linalg.solve(matrix[:-1], rhs[:-1, :, None])[..., 0]
+    np.testing.assert_allclose(found[:-1], expected, rtol=1e-7)
+    np.testing.assert_array_equal(found[-1], np.zeros(3), err_msg="nothing tells where a point without rays is")

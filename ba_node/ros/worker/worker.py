@@ -18,6 +18,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FrameType
 
 from ba_node.backend import Backend, Check, ClockWatch, Work
 from ba_node.estimate import Estimate, Iteration, Refinement, SolveReport, Status
@@ -34,6 +35,8 @@ _REPORT_PERIOD_S = 1.0
 # What is done beside solves waits for so long at a time, and in all for this share of its time and as long as that:
 # where solves follow each other at once it must get on too.
 _GIVES_WAY_S, _WAITS = 0.2, 0.9
+# Where Python's imports are written.
+_IMPORTS = "<frozen importlib._bootstrap>"
 # Texts that begin alike say the same.
 _HEAD = 40
 # Falling behind for this long is warned about.
@@ -139,11 +142,11 @@ class Worker:
         """Do something on a thread of its own, between solves, and then something on the solver's."""
         began_s, waited_s = self._clock(), 0.0
 
-        def give_way(*_: object) -> None:
+        def give_way(frame: FrameType, *_: object) -> None:
             nonlocal waited_s
             if not self._resting.is_set():
                 now_s = self._clock()
-                if waited_s <= _GIVES_WAY_S + _WAITS * (now_s - began_s):
+                if waited_s <= _GIVES_WAY_S + _WAITS * (now_s - began_s) and not _imports(frame):
                     self._resting.wait(_GIVES_WAY_S)
                     waited_s += self._clock() - now_s
 
@@ -334,3 +337,10 @@ class Worker:
     def _put(self, output: Output) -> None:
         self._outputs.append(output)
         self._notify()
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Return True if a module is being imported: its lock is held, and a solve that wants it would wait as well."""
+    while frame is not None and frame.f_code.co_filename != _IMPORTS:
+        frame = frame.f_back
+    return frame is not None

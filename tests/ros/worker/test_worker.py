@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -160,6 +163,37 @@ def test_a_check_gives_way_to_solves_wherever_it_is(solves_end: bool, monkeypatc
     finally:
         go_on.set()
         assert rig.worker.stop()
+
+
+def test_a_solve_does_not_wait_for_an_import_of_what_gives_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever imports a module keeps others from it."""
+    monkeypatch.setattr(worker, "_GIVES_WAY_S", 60.0)
+    monkeypatch.syspath_prepend(tmp_path)
+    rig, importing, solving = Rig(), threading.Event(), threading.Event()
+    gate = SimpleNamespace(importing=importing, solving=solving)
+    monkeypatch.setitem(sys.modules, "gate_of_test", gate)
+    body = "import gate_of_test as gate\ngate.importing.set()\nassert gate.solving.wait(10.0)\n"
+    (tmp_path / "wanted_by_both.py").write_text(body + "done = [len(str(i)) for i in range(5)]\n")
+
+    def solve(_: Callable[[Any], bool]) -> None:
+        solving.set()
+        assert importlib.import_module("wanted_by_both").done == [1] * 5
+
+    rig.backend.while_solving = solve
+    rig.worker.start()
+    try:
+        work = SimpleNamespace(run=lambda: importlib.import_module("wanted_by_both"))
+        rig.worker.work_elsewhere(work)  # type: ignore[arg-type]
+        assert importing.wait(10.0)
+        began = time.monotonic()
+        rig.keyframe(1)
+        (report,) = reports(rig.wait_for_output())
+        assert report.newest_keyframe_id == 1
+        assert time.monotonic() - began < 10.0
+    finally:
+        solving.set()
+        assert rig.worker.stop()
+        sys.modules.pop("wanted_by_both", None)
 
 
 def test_stops_a_long_solve_after_an_iteration() -> None:
