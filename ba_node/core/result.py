@@ -8,6 +8,7 @@ import enum
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 from ba_node.core.problem import State
 
@@ -28,8 +29,7 @@ class Status(enum.IntEnum):
         return self in (Status.CONVERGED, Status.MAX_ITERATIONS, Status.STALLED)
 
 
-@dataclass(frozen=True)
-class Iteration:
+class Iteration(NamedTuple):
     """One row of the trace. Row 0 is the start."""
 
     iteration: int  # number of the outer iteration
