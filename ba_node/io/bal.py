@@ -21,9 +21,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
@@ -133,27 +134,33 @@ def to_problem(bal: BalProblem) -> Problem:
 
     The one camera of the rig has unit focal length, as the focal lengths are in ``State.intrinsics``.
     """
+    keyframe, point, images = bal.camera_index, bal.point_index, bal.observations
     # One call: the first one of each of numpy's functions takes ten times as long as others.
-    found = None if native.kernels is None else native.kernels.from_bal(bal.cameras, bal.point_index, bal.observations)
-    if found is not None:
-        rotation, translation, intrinsics, uv, camera, sigma = found
-        keyframe, point = bal.camera_index, bal.point_index
-    else:
-        # What is sorted already is not copied: it may be most of the memory of a large problem.
-        is_sorted = bool(np.logical_and.reduce(bal.point_index[1:] >= bal.point_index[:-1]))
-        order = slice(None) if is_sorted else np.argsort(bal.point_index, kind="stable")
-        rotation, translation = so3_exp(bal.cameras[:, :3]), bal.cameras[:, 3:6].copy()
-        intrinsics, uv = bal.cameras[:, 6:].copy(), np.array(bal.observations[order])
-        # A product with (1, -1) goes by rows of two numbers, five times as slow.
-        np.negative(uv[:, 1], out=uv[:, 1])
-        camera, sigma = np.zeros(len(uv), dtype=np.intp), np.ones(len(uv))
-        keyframe, point = bal.camera_index[order], bal.point_index[order]
+    made = _from_bal if native.kernels is None else native.kernels.from_bal
+    found = made(bal.cameras, point, images)
+    if found is None:
+        order = np.argsort(point, kind="stable")
+        keyframe, point = keyframe[order], point[order]
+        found = made(bal.cameras, point, images[order])
+    assert found is not None
+    rotation, translation, intrinsics, uv, camera, sigma = found
     return Problem(
         start=State(rotation, translation, bal.points.copy(), intrinsics),
         fixed=np.zeros(len(translation), dtype=bool),
         cameras=_RIG,
         observations=Observations(keyframe, camera, point, uv, sigma, depth_m=_NONE, depth_sigma_m=_NONE),
     )
+
+
+def _from_bal(cameras: FloatArray, point: IntArray, images: FloatArray) -> tuple[NDArray[Any], ...] | None:
+    """Return what ``native.kernels.from_bal`` does."""
+    if (point[1:] < point[:-1]).any():
+        return None
+    uv = np.array(images)
+    # A product with (1, -1) goes by rows of two numbers, five times as slow.
+    np.negative(uv[:, 1], out=uv[:, 1])
+    poses = so3_exp(cameras[:, :3]), cameras[:, 3:6].copy(), cameras[:, 6:].copy()
+    return *poses, uv, np.zeros(len(uv), dtype=np.intp), np.ones(len(uv))
 
 
 def translated(bal: BalProblem, offset: FloatArray) -> BalProblem:

@@ -347,7 +347,7 @@ def from_bal(
 ) -> tuple[Doubles, Doubles, Doubles, Doubles, Ints, Doubles] | None:
     """Return what cameras (n, 9) and images (n_obs, 2) of BAL are in core/problem.py.
 
-    Rotation, translation, intrinsics; uv, camera and sigma. None where shapes are others or ``point`` does not ascend.
+    Rotation, translation, intrinsics; uv, camera and sigma. None unless ``point`` ascends.
     """
 
 def cut_patches(image: Floats, uv: Doubles, offsets: Floats) -> Floats:

@@ -125,7 +125,15 @@ def test_numpy_makes_the_same_problem(is_sorted: bool, monkeypatch: pytest.Monke
 
 
 @pytest.mark.skipif(native.kernels is None, reason="not built")
-def test_what_has_another_shape_is_left_to_numpy() -> None:
+def test_order_is_no_matter_to_poses() -> None:
+    """Ranks have parts of a problem, some of them sorted, and the same cameras to the last bit."""
+    bal = make(n_obs=200)
+    part = dataclasses.replace(bal, point_index=np.sort(bal.point_index))
+    np.testing.assert_array_equal(to_problem(part).start.rotation, to_problem(bal).start.rotation)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+def test_another_shape_is_refused() -> None:
     bal = make(n_cameras=9, n_obs=20)
     point = np.sort(bal.point_index)
     assert native.kernels.from_bal(bal.cameras, point, bal.observations) is not None
@@ -135,7 +143,8 @@ def test_what_has_another_shape_is_left_to_numpy() -> None:
         (bal.cameras, point[1:], bal.observations),
         (bal.cameras, point, bal.observations.ravel()),
     ):
-        assert native.kernels.from_bal(cameras, points, uv) is None
+        with pytest.raises(ValueError, match="expected"):
+            native.kernels.from_bal(cameras, points, uv)
 
 
 TEXT = """2 1 2

@@ -50,11 +50,11 @@ py::object numbers(const py::bytes& bytes) {
   return py::none();
 }
 
-// cameras: (n, 9), uv: (n_obs, 2), as io/bal.py has them. None unless they are, and sorted by point.
+// cameras: (n, 9), uv: (n_obs, 2), as io/bal.py has them. None unless observations are sorted by point.
 py::object from_bal(const Doubles& cameras, const Ints& point, const Doubles& uv) {
   const std::int64_t* of = point.data();
   if (cameras.ndim() != 2 || cameras.shape(1) != 9 || uv.ndim() != 2 || uv.shape(1) != 2 || point.size() != uv.shape(0))
-    return py::none();
+    throw py::value_error("expected cameras (n, 9), point (n_obs,) and uv (n_obs, 2)");
   if (!std::is_sorted(of, of + point.size())) return py::none();
   const py::ssize_t n = cameras.shape(0), n_obs = uv.shape(0);
   Doubles rotation = empty({n, 3, 3}), translation = empty({n, 3}), intrinsics = empty({n, 3});
