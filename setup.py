@@ -26,6 +26,7 @@ NAME, MESSAGES = "ba_node", "ba_msgs"
 SOURCES = Path(NAME) / "native" / "src"
 # What is compiled once, and what once for each target.
 COMMON = (
+    "bindings/bal",
     "bindings/module",
     "bindings/patches",
     "bindings/steps",

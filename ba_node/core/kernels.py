@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import scipy
 
 from ba_node.arrays import FloatArray
+from ba_node.core import scaling
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.problem import State
 
@@ -17,8 +18,14 @@ from ba_node.core.problem import State
 DENSE_LIMIT = 3000
 
 
-@dataclass(frozen=True)
-class StepResult:
+class Hessian(Protocol):
+    """What returns the diagonal of H."""
+
+    def __call__(self, *, of_points: bool) -> tuple[FloatArray, FloatArray]:
+        """Return diag(B) and diag(C), not damped; see Kernels.diagonals."""
+
+
+class StepResult(NamedTuple):
     """What a step did."""
 
     state: State  # after the step and the inner iterations
@@ -64,6 +71,9 @@ class System(Protocol):
     def solve_sparse(self) -> FloatArray | None:
         """Return the solution by sparse Cholesky; None if S is not positive definite."""
 
+    def length2(self, kind: str, x: FloatArray, hessian: Hessian) -> float:
+        """Return |D x|^2 of a solution in the scaled space of that kind; see scaling.py."""
+
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Return the solution by PCG in the space ``D x``, in the space that is not scaled.
 
@@ -88,6 +98,16 @@ class System(Protocol):
 
     def diagonal_blocks(self) -> tuple[FloatArray, ...]:
         """Return the diagonal blocks of S in runs of equal size, each (n, d, d)."""
+
+
+def length2(system: System, kind: str, x: FloatArray, hessian: Hessian) -> float:
+    """Return |D x|^2 of a solution, with D of :func:`scaling.scaled_space`."""
+    if kind in ("none", "identity"):
+        return float(np.dot(x, x))
+    # In every iteration, and without roots.
+    diagonals = scaling.diagonals(kind, hessian(of_points=system.side != "points"))
+    squares = diagonals if kind == "diag" else (diagonals[0] ** 2, diagonals[1] ** 2)
+    return float(np.dot(system.gather(*squares) * x, x))
 
 
 class Kernels(Protocol):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -18,8 +19,7 @@ from ba_node.arrays import FloatArray
 Product = Callable[[FloatArray], FloatArray]
 
 
-@dataclass(frozen=True)
-class Solution:
+class Solution(NamedTuple):
     """What a linear solver found."""
 
     x: FloatArray | None  # (n,) the solution, None if there is none that is finite

@@ -18,7 +18,7 @@ from ba_node.config import SolverOptions
 from ba_node.core import linear_costs, scaling
 from ba_node.core.factors import FactorSum, FactorTerms, Known, Pairs, RelativePoses
 from ba_node.core.inner_iterations import least_promise
-from ba_node.core.kernels import DENSE_LIMIT, Kernels, LinearSolver, StepResult, System
+from ba_node.core.kernels import DENSE_LIMIT, Hessian, Kernels, LinearSolver, StepResult, System, length2
 from ba_node.core.linear import PcgLimits, Solution
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpyKernels
@@ -298,6 +298,13 @@ class NativeSystem:
         """Return the solution by sparse Cholesky; None if S is not positive definite."""
         x: FloatArray | None = self._kernel.solve_sparse()
         return x
+
+    def length2(self, kind: str, x: FloatArray, hessian: Hessian) -> float:
+        """Return |D x|^2 of a solution in the scaled space of that kind."""
+        if kind == "inc":
+            return length2(self, kind, x, hessian)
+        of_step: float = self._kernel.length2(kind == "diag", x)
+        return of_step
 
     def solve_pcg(self, kind: str, scale: FloatArray, limits: PcgLimits, *, formed: bool) -> Solution:
         """Solve by PCG in the space scaled by 1 / ``scale``; the next call writes over the solution."""

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +14,7 @@ from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import blocks, columns, linear, linear_costs, scaling
 from ba_node.core.inner_iterations import InnerIterations, iterate_points
-from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System
+from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System, length2
 from ba_node.core.objective import Linearisation, Objective
 from ba_node.core.problem import Problem, State
 from ba_node.core.schur import NormalEquations, ReducedSystem, Structure, normal_equations
@@ -138,6 +137,7 @@ class NumpySystem:
     """A reduction that also knows the full model."""
 
     radius_factor = 1.0
+    length2 = length2
 
     def __init__(
         self, reduction: Reduction, structure: Structure, equations: NormalEquations, linearisation: Linearisation
@@ -228,7 +228,7 @@ def solve_pcg(
         return np.asarray(matrix @ x) if matrix is not None else scale * system.product(scale * x)
 
     found = linear.pcg_steihaug(product, scale * system.rhs, precondition, limits)
-    return replace(found, x=None if found.x is None else scale * found.x)
+    return found._replace(x=None if found.x is None else scale * found.x)
 
 
 def preconditioner(kind: str, system: _Blocked, scale: FloatArray) -> linear.Product:

@@ -21,7 +21,7 @@ from ba_node.arrays import FloatArray, IntArray
 from ba_node.config import ConfigError, SolverOptions
 from ba_node.core import linear, linear_costs, native_kernels, scaling
 from ba_node.core.communicator import Communicator, total
-from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System
+from ba_node.core.kernels import DENSE_LIMIT, LinearSolver, StepResult, System, length2
 from ba_node.core.numpy_kernels import solve_pcg
 from ba_node.core.problem import Problem, ProblemError, State
 from ba_node.core.two_level import TwoLevel
@@ -172,6 +172,7 @@ class RankSystem:
 
     side = "points"
     radius_factor = 1.0
+    length2 = length2
 
     def __init__(self, local: System, communicator: Communicator, two_level: TwoLevel, factor: SumFactor) -> None:
         self.local, self._communicator, self._two_level, self._factor = local, communicator, two_level, factor

@@ -16,22 +16,13 @@ Where a step of PCG costs next to nothing beside an exact solution, PCG is tried
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear, scaling
-from ba_node.core.kernels import DENSE_LIMIT, System
-
-
-class Hessian(Protocol):
-    """What returns the diagonal of H."""
-
-    def __call__(self, *, of_points: bool) -> tuple[FloatArray, FloatArray]:
-        """Return diag(B) and diag(C), not damped; see Kernels.diagonals."""
-
+from ba_node.core.kernels import DENSE_LIMIT, Hessian, System
 
 # Where steps of PCG cost next to nothing beside the rest of an iteration, they go nearly as far as an exact solution.
 _NEARLY = 0.01
@@ -68,23 +59,21 @@ class ReducedSolver:
         radius *= system.radius_factor
         if self.kind != "pcg":
             x = system.solve_dense() if self.kind == "dense" else system.solve_sparse()
-            # One call, and short: no square is finite of what is not, nor of a step that is no step any more.
-            if x is None or not math.isfinite(np.dot(x, x)):
-                return linear.Solution(None)
-            share = self._share_inside(x, system, hessian, radius)
-            return linear.Solution(x if share == 1.0 else share * x, on_boundary=share < 1.0)
+            return linear.Solution(None) if x is None else self._inside(x, system, hessian, radius)
         if self._preconditioner == "two_level":
             t_eps, q_eps = min(t_eps, _NEARLY), min(q_eps, _NEARLY)
         limits = linear.PcgLimits(t_eps, options.max_linear_iterations, radius, q_eps)
         return self._pcg(system, hessian, limits, self._preconditioner, formed=system.unknowns <= DENSE_LIMIT)
 
-    def _share_inside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> float:
-        """Return the share of a step that lies inside the region, 1 if all of it does."""
-        if not np.isfinite(radius):
-            return 1.0
-        squares = scaling.squares(self._options.scaled_space, hessian(of_points=system.side != "points"))
-        length2 = float(np.dot(system.gather(*squares) * x, x))
-        return 1.0 if length2 <= radius * radius else radius / float(np.sqrt(length2))
+    def _inside(self, x: FloatArray, system: System, hessian: Hessian, radius: float) -> linear.Solution:
+        """Return the part of a solution that lies inside the region, None if it is no step at all."""
+        length2 = system.length2(self._options.scaled_space if radius < math.inf else "none", x, hessian)
+        # No square is finite of what is not, nor of a step that is no step any more.
+        if not math.isfinite(length2):
+            return linear.Solution(None)
+        if length2 <= radius * radius:
+            return linear.Solution(x)
+        return linear.Solution(radius / math.sqrt(length2) * x, on_boundary=True)
 
     def _worth_trying(self, system: System) -> int:
         """Return how many steps of PCG to try before an exact solver."""

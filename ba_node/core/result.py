@@ -7,6 +7,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from ba_node.core.problem import State
 from ba_node.kept import kept_property
@@ -28,8 +29,7 @@ class Status(enum.IntEnum):
         return self in (Status.CONVERGED, Status.MAX_ITERATIONS, Status.STALLED)
 
 
-@dataclass(frozen=True)
-class Iteration:
+class Iteration(NamedTuple):
     """One row of the trace. Row 0 is the start."""
 
     iteration: int  # number of the outer iteration

@@ -52,11 +52,3 @@ def scaled_space(
         kind = "identity"
     d_c, d_p = diagonals(kind, hessian)
     return (np.sqrt(d_c), np.sqrt(d_p)) if kind == "diag" and not literal else (d_c, d_p)
-
-
-def squares(kind: str, hessian: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return D^2 of :func:`scaled_space`: the length of a step is asked in every iteration, and needs no roots."""
-    if kind == "diag":
-        return diagonals(kind, hessian)
-    d_c, d_p = scaled_space(kind, hessian)
-    return d_c * d_c, d_p * d_p

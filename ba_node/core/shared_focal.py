@@ -22,7 +22,7 @@ from ba_node.arrays import FloatArray, IntArray
 from ba_node.config import SolverOptions
 from ba_node.core import cameras, native_kernels, numpy_kernels, scaling
 from ba_node.core.bordered import Shared, SharedState, exact_solver, require, solve_shared
-from ba_node.core.kernels import LinearSolver, StepResult, System
+from ba_node.core.kernels import LinearSolver, StepResult, System, length2
 from ba_node.core.linear import cholesky
 from ba_node.core.native_kernels import NativeKernels, NativeSystem
 from ba_node.core.problem import Problem, State
@@ -111,7 +111,7 @@ class FocalKernels(NativeKernels):
         """Take the step whose part in the system is x, and the inner iterations after it."""
         stepped = super().step(state, system, self._spread @ x, inner_iterations)
         z = x[len(x) - len(self._damping_z) :]
-        return replace(stepped, damping=stepped.damping + 0.5 * float(self._damping_z @ (z * z)))
+        return stepped._replace(damping=stepped.damping + 0.5 * float(self._damping_z @ (z * z)))
 
     def with_cameras(self, state: State) -> SharedState:
         """Return a state with the cameras that belong to it."""
@@ -127,6 +127,8 @@ class FocalKernels(NativeKernels):
 
 class _SummedSystem(NativeSystem):
     """``T' S T + mu Dz``, which is solved exactly."""
+
+    length2 = length2
 
     def __init__(self, system: NativeSystem, spread: scipy.sparse.csr_matrix, damping_z: FloatArray) -> None:
         self._of, self._spread = system, spread

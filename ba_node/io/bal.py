@@ -21,9 +21,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IntArray
@@ -42,6 +43,16 @@ MAX_BYTES = 2**32
 MAX_GROWTH = 10
 # Rows of text that are written at a time.
 _ROWS = 2**13
+_NONE = np.empty(0)
+# The camera of all keyframes: its focal length is one, as theirs are in ``State.intrinsics``.
+_RIG = Cameras(
+    rotation=np.array([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]]),
+    translation=np.zeros((1, 3)),
+    model=np.array([Model.RATIONAL], dtype=np.uint8),
+    params=np.array([[1.0, 1.0, *[0.0] * 10]]),
+)
+for _array in vars(_RIG).values():
+    _array.setflags(write=False)
 
 
 class BalError(ValueError):
@@ -123,36 +134,33 @@ def to_problem(bal: BalProblem) -> Problem:
 
     The one camera of the rig has unit focal length, as the focal lengths are in ``State.intrinsics``.
     """
-    n = len(bal.observations)
-    # What is sorted already is not copied: it may be most of the memory of a large problem.
-    is_sorted = bool(np.logical_and.reduce(bal.point_index[1:] >= bal.point_index[:-1]))
-    order = slice(None) if is_sorted else np.argsort(bal.point_index, kind="stable")
-    params = np.zeros((1, 12))
-    params[0, :2] = 1.0
-    # A product with (1, -1) goes by rows of two numbers, five times as slow.
-    uv = np.array(bal.observations[order])
-    np.negative(uv[:, 1], out=uv[:, 1])
+    keyframe, point, images = bal.camera_index, bal.point_index, bal.observations
+    # One call: the first one of each of numpy's functions takes ten times as long as others.
+    made = _from_bal if native.kernels is None else native.kernels.from_bal
+    found = made(bal.cameras, point, images)
+    if found is None:
+        order = np.argsort(point, kind="stable")
+        keyframe, point = keyframe[order], point[order]
+        found = made(bal.cameras, point, images[order])
+    assert found is not None
+    rotation, translation, intrinsics, uv, camera, sigma = found
     return Problem(
-        start=State(
-            so3_exp(bal.cameras[:, :3]), bal.cameras[:, 3:6].copy(), bal.points.copy(), bal.cameras[:, 6:].copy()
-        ),
-        fixed=np.zeros(len(bal.cameras), dtype=bool),
-        cameras=Cameras(
-            rotation=np.array([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]]),
-            translation=np.zeros((1, 3)),
-            model=np.array([Model.RATIONAL], dtype=np.uint8),
-            params=params,
-        ),
-        observations=Observations(
-            keyframe=bal.camera_index[order],
-            camera=np.zeros(n, dtype=np.intp),
-            point=bal.point_index[order],
-            uv=uv,
-            sigma_px=np.ones(n),
-            depth_m=np.empty(0),
-            depth_sigma_m=np.empty(0),
-        ),
+        start=State(rotation, translation, bal.points.copy(), intrinsics),
+        fixed=np.zeros(len(translation), dtype=bool),
+        cameras=_RIG,
+        observations=Observations(keyframe, camera, point, uv, sigma, depth_m=_NONE, depth_sigma_m=_NONE),
     )
+
+
+def _from_bal(cameras: FloatArray, point: IntArray, images: FloatArray) -> tuple[NDArray[Any], ...] | None:
+    """Return what ``native.kernels.from_bal`` does."""
+    if (point[1:] < point[:-1]).any():
+        return None
+    uv = np.array(images)
+    # A product with (1, -1) goes by rows of two numbers, five times as slow.
+    np.negative(uv[:, 1], out=uv[:, 1])
+    poses = so3_exp(cameras[:, :3]), cameras[:, 3:6].copy(), cameras[:, 6:].copy()
+    return *poses, uv, np.zeros(len(uv), dtype=np.intp), np.ones(len(uv))
 
 
 def translated(bal: BalProblem, offset: FloatArray) -> BalProblem:

@@ -105,6 +105,9 @@ class Kernel:
 
     def factor(self, damping_c: Doubles, damping_p: Doubles) -> None: ...
     def damp(self, diagonal: bool, mu: float) -> None: ...
+    def length2(self, diagonal: bool, x: Doubles) -> float:
+        """Return |D x|^2 (n,) with D^2 the diagonal of B, not damped, or the identity."""
+
     def rhs(self, out: Doubles) -> None: ...
     def dense(self, out: Doubles) -> None: ...
     def solve(self, out: Doubles) -> bool: ...
@@ -338,6 +341,14 @@ def loosest(blocks: Doubles, positions: Doubles, most: float) -> tuple[float, fl
 
 def numbers(text: bytes) -> Doubles | None:
     """Return the numbers between white space, None where something is no finite number as C++ reads them."""
+
+def from_bal(
+    cameras: Doubles, point: Ints, uv: Doubles
+) -> tuple[Doubles, Doubles, Doubles, Doubles, Ints, Doubles] | None:
+    """Return what cameras (n, 9) and images (n_obs, 2) of BAL are in core/problem.py.
+
+    Rotation, translation, intrinsics; uv, camera and sigma. None unless ``point`` ascends.
+    """
 
 def cut_patches(image: Floats, uv: Doubles, offsets: Floats) -> Floats:
     """Return what front_end.patches.sample does at uv (n, 2) by offsets (m, 2): (n, m)."""

@@ -108,7 +108,7 @@ class Solved:
             "iterations": max(0, len(result.trace) - 1),
             "accepted_iterations": result.accepted_iterations,
             "linear_iterations": result.linear_iterations,
-            "trace": [dataclasses.asdict(row) for row in result.trace],
+            "trace": [row._asdict() for row in result.trace],
             "origin": self.origin.tolist(),
             "attention": attention,
             "setup_s": self.setup_s,

@@ -81,9 +81,9 @@ def read_case(path: Path) -> Case:
 def case_problem(case: Case) -> Problem:
     """Return the case in the terms of ba_node; fixed intrinsics become those of the cameras."""
     problem = to_problem(case.bal)
-    fixed = np.arange(problem.n_keyframes) < case.n_fixed
+    problem.fixed[: case.n_fixed] = True
     if case.size == 9:
-        return replace(problem, fixed=fixed)
+        return problem
     start, cameras, observations = problem.start, problem.cameras, problem.observations
     intrinsics = case.bal.cameras[:, 6:]
     own = intrinsics[:1]
@@ -102,7 +102,6 @@ def case_problem(case: Case) -> Problem:
     return replace(
         problem,
         start=State(start.rotation, start.translation, start.points, np.empty((0, 3))),
-        fixed=fixed,
         cameras=replace(cameras, params=params),
         observations=observations,
     )

@@ -104,7 +104,7 @@ class Runner:
             "iterations": task.iterations,
             "status": result.status.name,
             "reason": f"took {taken} steps" if taken >= task.iterations else result.reason,
-            "trace": [dataclasses.asdict(row) for row in result.trace],
+            "trace": [row._asdict() for row in result.trace],
             **_end(task, posed, result),
         }
 

@@ -11,7 +11,7 @@ import pytest
 
 from ba_node import native
 from ba_node.config import SolverOptions
-from ba_node.core import cameras, native_kernels, numpy_kernels, reduced, solver
+from ba_node.core import cameras, native_kernels, numpy_kernels, reduced, scaling, solver
 from ba_node.core.numpy_kernels import NumpyKernels
 from ba_node.core.objective import Objective
 from ba_node.core.problem import Observations, Problem, State
@@ -105,6 +105,22 @@ def test_dense_cholesky_of_any_size(n: int, make_problem: Make) -> None:
     x = system.solve_dense()
     assert x is not None and len(x) == 6 * n
     near(system.dense() @ x, system.rhs, 1e-9)
+
+
+@built
+@pytest.mark.parametrize("kind", ["none", "identity", "diag", "inc"])
+def test_native_measures_steps_as_numpy_does(kind: str, make_problem: Make) -> None:
+    """By the diagonal that was not damped, whatever the damping."""
+    problem, _ = make_problem(start_error=0.02)
+    both = pair(problem, SolverOptions())
+    x = np.random.default_rng(0).normal(size=6 * both[0].n_free)
+    d_c, _ = scaling.scaled_space(kind, both[0].diagonals())
+    expected = float(np.sum((d_c.ravel() * x) ** 2))
+    for kernels in both:
+        system = kernels.damp("diag", 1e3)
+        assert system.length2(kind, x, kernels.diagonals) == pytest.approx(expected, rel=1e-10)
+        for bad in (np.nan, np.inf):
+            assert not np.isfinite(system.length2(kind, np.where(np.arange(len(x)) == 3, bad, x), kernels.diagonals))
 
 
 @built

@@ -16,11 +16,11 @@ from ba_node import native
 from ba_node.arrays import FloatArray
 from ba_node.config import SolverOptions
 from ba_node.core import linear, linear_costs, native_kernels, solver
-from ba_node.core.kernels import System
+from ba_node.core.kernels import Hessian, System
 from ba_node.core.linear_costs import Factor, Sizes
 from ba_node.core.numpy_kernels import NumpySystem, preconditioner
 from ba_node.core.problem import Observations, Problem, State
-from ba_node.core.reduced import Hessian, ReducedSolver
+from ba_node.core.reduced import ReducedSolver
 from tests.core.conftest import Spec, make
 
 Make = Callable[..., tuple[Problem, State]]

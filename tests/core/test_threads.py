@@ -39,7 +39,7 @@ def quantities(problem: Problem, threads: int) -> dict[str, object]:
     out |= {"rhs": system.rhs.copy(), "x": x.copy(), "dense": system.dense(), "sparse": system.sparse().toarray()}
     out |= {"product": system.product(x), "blocks": system.diagonal_blocks()[0], "back": system.back_substitute(x)[1:]}
     moved = kernels.step(problem.start, system, x, 3)
-    out |= {"moved": dataclasses.astuple(moved), "objective": kernels.objective(moved.state)}
+    out |= {"moved": (dataclasses.astuple(moved.state), *moved[1:]), "objective": kernels.objective(moved.state)}
     return out
 
 

@@ -105,6 +105,48 @@ def test_observations_are_sorted_by_point_and_stay_together() -> None:
     assert not problem.fixed.any()
 
 
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+@pytest.mark.parametrize("is_sorted", [True, False])
+def test_numpy_makes_the_same_problem(is_sorted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    bal = make(n_obs=200)
+    bal.cameras[:3, :3] = [0.0, 0.0, 0.0], [1e-6, -2e-6, 3e-6], [np.pi, 0.0, 0.0]
+    if is_sorted:
+        bal = dataclasses.replace(bal, point_index=np.sort(bal.point_index))
+    found = native.kernels.from_bal(bal.cameras, bal.point_index, bal.observations)
+    assert (found is not None) == is_sorted
+    ours = to_problem(bal)
+    monkeypatch.setattr(native, "kernels", None)
+    expected = to_problem(bal)
+    np.testing.assert_allclose(ours.start.rotation, expected.start.rotation, rtol=0.0, atol=1e-15)
+    for one, other in ((ours.start, expected.start), (ours.observations, expected.observations)):
+        for name in vars(one).keys() - {"rotation"}:
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), strict=True)
+    assert not np.shares_memory(ours.start.points, bal.points)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+def test_order_is_no_matter_to_poses() -> None:
+    """Ranks have parts of a problem, some of them sorted, and the same cameras to the last bit."""
+    bal = make(n_obs=200)
+    part = dataclasses.replace(bal, point_index=np.sort(bal.point_index))
+    np.testing.assert_array_equal(to_problem(part).start.rotation, to_problem(bal).start.rotation)
+
+
+@pytest.mark.skipif(native.kernels is None, reason="not built")
+def test_another_shape_is_refused() -> None:
+    bal = make(n_cameras=9, n_obs=20)
+    point = np.sort(bal.point_index)
+    assert native.kernels.from_bal(bal.cameras, point, bal.observations) is not None
+    for cameras, points, uv in (
+        (bal.cameras[:, :8], point, bal.observations),
+        (bal.cameras.ravel(), point, bal.observations),
+        (bal.cameras, point[1:], bal.observations),
+        (bal.cameras, point, bal.observations.ravel()),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            native.kernels.from_bal(cameras, points, uv)
+
+
 TEXT = """2 1 2
 
 0 0 1.0 2.0

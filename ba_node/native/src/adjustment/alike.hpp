@@ -19,15 +19,20 @@
 
 namespace ba::BA_TARGET {
 
-// Whether that pays: it needs 22 registers of eight, and blocks of 9 x 9 leave few lanes empty as they are.
+// Whether that pays: it needs 22 registers of eight, or 13 of four, and blocks of 9 x 9 leave few lanes empty as they
+// are.
 template <int D>
-constexpr bool kByLanes = D == 6 && kWhole;
+constexpr bool kByLanes = D == 6 && kHeld;
 
-// Three columns of s from kColumn on, from row kRow on, less the sum over lanes of x y' over n batches, each `stride`
-// after the one before.
-template <int kColumn, int kRow, int D>
-[[gnu::always_inline]] inline void subtract_columns(Block<D>& s, const V8* x, const V8* y, std::int64_t n,
-                                                    std::int64_t stride) {
+// A block of S less the sum over lanes of x y' over n batches, each `stride` after the one before; of one on the
+// diagonal at least what is below it.
+template <bool kDiagonal>
+void subtract_lanes(Block<6>& s, const V8* x, const V8* y, std::int64_t n, std::int64_t stride);
+
+#if defined(__AVX512F__)
+// Three columns from kColumn on, from row kRow on.
+template <int kColumn, int kRow>
+BA_INLINE void subtract_columns(Block<6>& s, const V8* x, const V8* y, std::int64_t n, std::int64_t stride) {
   V8 sums[3][6] = {};
   for (std::int64_t k = 0; k < n; ++k, x += stride, y += stride) {
 #pragma GCC unroll 3
@@ -49,6 +54,53 @@ template <int kColumn, int kRow, int D>
     std::memcpy(to, &column, sizeof(column));
   }
 }
+
+template <bool kDiagonal>
+inline void subtract_lanes(Block<6>& s, const V8* x, const V8* y, std::int64_t n, std::int64_t stride) {
+  subtract_columns<0, 0>(s, x, y, n, stride);
+  subtract_columns<3, kDiagonal ? 3 : 0>(s, x, y, n, stride);
+}
+#elif defined(__AVX__)
+// 3 x 3 numbers from kColumn and kRow on; kLower: of those what is on and below the diagonal. Left to itself g++ loads
+// the factors anew for each product, which then wait for loads.
+template <int kColumn, int kRow, bool kLower>
+BA_INLINE void subtract_tile(Block<6>& s, const V8* x, const V8* y, std::int64_t n, std::int64_t stride) {
+  Native4 sums[12] = {};
+  for (std::int64_t k = 0; k < n; ++k, x += stride, y += stride) {
+#pragma GCC unroll 6
+    for (int i = 0; i < 6; ++i) {
+      const auto* a = reinterpret_cast<const Native4*>(x + 6 * (i / 2) + kRow) + i % 2;
+      const auto* b = reinterpret_cast<const Native4*>(y + 6 * (i / 2) + kColumn) + i % 2;
+      const Native4 factor[3] = {held(b[0]), held(b[2]), held(b[4])};
+#pragma GCC unroll 3
+      for (int r = 0; r < 3; ++r) {
+        const Native4 row = held(a[2 * r]);
+#pragma GCC unroll 3
+        for (int c = 0; c < 3; ++c)
+          if (!kLower || r >= c) sums[3 * c + r] += row * factor[c];
+      }
+    }
+  }
+  double total[12];
+#pragma GCC unroll 3
+  for (int i = 0; i < 12; i += 4) {
+    transpose(*reinterpret_cast<Native4(*)[4]>(sums + i));
+    store4(total + i, (sums[i] + sums[i + 1]) + (sums[i + 2] + sums[i + 3]));
+  }
+#pragma GCC unroll 3
+  for (int c = 0; c < 3; ++c)
+#pragma GCC unroll 3
+    for (int r = kLower ? c : 0; r < 3; ++r) s.v[kStride6 * (kColumn + c) + kRow + r] -= total[3 * c + r];
+}
+
+template <bool kDiagonal>
+inline void subtract_lanes(Block<6>& s, const V8* x, const V8* y, std::int64_t n, std::int64_t stride) {
+  subtract_tile<0, 0, kDiagonal>(s, x, y, n, stride);
+  subtract_tile<0, 3, false>(s, x, y, n, stride);
+  if constexpr (!kDiagonal) subtract_tile<3, 0, false>(s, x, y, n, stride);
+  subtract_tile<3, 3, kDiagonal>(s, x, y, n, stride);
+}
+#endif
 
 // What is above the diagonal, from what is below it.
 inline void mirror(Block<6>& s) {
@@ -87,13 +139,9 @@ class AlikeBatches {
           sums[columns_of(run.begin)[a]].a += lane_sums(*reinterpret_cast<const V8(*)[6]>(of_gradient + D * a));
           const V8* x = z + kNumbers * a;
           // Of a block on the diagonal what is above it is mirrored in the end.
-          subtract_columns<0, 0>(blocks[*block], x, x, n, stride);
-          subtract_columns<3, 3>(blocks[*block++], x, x, n, stride);
-          for (std::int64_t b = a + 1; b < m; ++b) {
-            const V8* y = z + kNumbers * b;
-            subtract_columns<0, 0>(blocks[*block], x, y, n, stride);
-            subtract_columns<3, 0>(blocks[*block++], x, y, n, stride);
-          }
+          subtract_lanes<true>(blocks[*block++], x, x, n, stride);
+          for (std::int64_t b = a + 1; b < m; ++b)
+            subtract_lanes<false>(blocks[*block++], x, z + kNumbers * b, n, stride);
         }
       }
     }

@@ -7,6 +7,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <type_traits>
 #include <vector>
 
 #include "adjustment/layout.hpp"
@@ -228,7 +229,7 @@ class Equations {
   template <bool kDepth>
   void sum_keyframe(std::int64_t list, Block<D>& block, Column<D>& gradient) {
     constexpr int kRows = kDepth ? 3 : 2;
-    V8 h[D * (D + 1) / 2] = {}, g[D] = {};
+    std::conditional_t<D == 6, Folded, V8> h[D * (D + 1) / 2] = {}, g[D] = {};
     for (std::int64_t first = l_.list_begin[list]; first < l_.list_begin[list + 1]; first += kLanes) {
       V8 j[3][D], r[3];
       fetch_ahead(first, l_.list_begin[list + 1]);
@@ -237,11 +238,11 @@ class Equations {
 #pragma GCC unroll 9
       for (int m = 0; m < D; ++m) {
 #pragma GCC unroll 3
-        for (int row = 0; row < kRows; ++row) g[m] += j[row][m] * r[row];
+        for (int row = 0; row < kRows; ++row) add_product(g[m], j[row][m], r[row]);
 #pragma GCC unroll 9
         for (int n = 0; n <= m; ++n, ++t)
 #pragma GCC unroll 3
-          for (int row = 0; row < kRows; ++row) h[t] += j[row][m] * j[row][n];
+          for (int row = 0; row < kRows; ++row) add_product(h[t], j[row][m], j[row][n]);
       }
     }
     clear(&block, 1);

@@ -111,6 +111,7 @@ class KernelOf final : public Kernel {
 
   void factor(const double* damping_c, const double* damping_p) override { reduced_.factor(damping_c, damping_p); }
   void damp(bool diagonal, double mu) override { reduced_.damp(diagonal, mu); }
+  double length2(bool diagonal, const double* x) const override { return reduced_.length2(diagonal, x); }
   void rhs(double* out) override { reduced_.rhs(out); }
   void dense(double* out) override { reduced_.dense(out); }
   bool solve(double* x) override { return reduced_.solve(x); }

@@ -69,8 +69,7 @@ class ReducedSystem {
   // The same with mu times the diagonal itself, or the identity.
   void damp(bool diagonal, double mu) {
     for (std::int64_t k = 0; k < l_.n_free; ++k)
-      for (int i = 0; i < D; ++i)
-        damping_c_[k * D + i] = mu * (diagonal ? std::max(entry(equations_.b[k], i, i), kMinDiagonal) : 1.0);
+      for (int i = 0; i < D; ++i) damping_c_[k * D + i] = mu * scale2(diagonal, k, i);
     factor_points([&](std::int64_t i, V8(&damping)[3]) {
       const V8* c = &equations_.c[6 * i];
       const V8 d[3] = {c[0], c[2], c[5]};
@@ -237,10 +236,22 @@ class ReducedSystem {
     return reduction;
   }
 
+  // |D x|^2 for a step of the free keyframes, with D^2 the diagonal itself, not damped, or the identity.
+  double length2(bool diagonal, const double* x) const {
+    double sum = 0.0;
+    for (std::int64_t k = 0; k < l_.n_free; ++k)
+      for (int i = 0; i < D; ++i) sum += scale2(diagonal, k, i) * x[k * D + i] * x[k * D + i];
+    return sum;
+  }
+
   // 1/2 p' D p of the last step.
   double damping_cost() const { return damping_cost_; }
 
  private:
+  double scale2(bool diagonal, std::int64_t k, int i) const {
+    return diagonal ? std::max(entry(equations_.b[k], i, i), kMinDiagonal) : 1.0;
+  }
+
   // damping(batch, out): of the points of a batch.
   template <class Damping>
   void factor_points(Damping damping) {

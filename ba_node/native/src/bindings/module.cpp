@@ -6,12 +6,9 @@
 #include <pybind11/pybind11.h>
 
 #include <algorithm>
-#include <charconv>
-#include <cmath>
 #include <cstddef>
 #include <memory>
 #include <string>
-#include <string_view>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -24,38 +21,6 @@
 namespace ba {
 
 namespace {
-
-bool is_space(char c) { return c == ' ' || (c >= '\t' && c <= '\r'); }
-
-// The numbers of a text between white space; None where something in it is no finite number as C++ reads them.
-py::object numbers(const py::bytes& bytes) {
-#if defined(__cpp_lib_to_chars)
-  const std::string_view text(bytes);
-  std::size_t n = 0;
-  bool between = true;
-  for (const char c : text) {
-    const bool space = is_space(c);
-    n += between && !space;
-    between = space;
-  }
-  Doubles out = empty({static_cast<py::ssize_t>(n)});
-  double* value = out.mutable_data();
-  const bool sound = without_gil([&] {
-    const char *at = text.data(), *end = at + text.size();
-    for (; at != end; ++at) {
-      if (is_space(*at)) continue;
-      const auto [next, error] = std::from_chars(at, end, *value);
-      if (error != std::errc() || !std::isfinite(*value) || (next != end && !is_space(*next))) return false;
-      ++value;
-      if (next == end) break;
-      at = next;
-    }
-    return true;
-  });
-  if (sound) return std::move(out);
-#endif
-  return py::none();
-}
 
 // What this processor can run, the widest first.
 std::vector<const Target*> supported_targets() {
@@ -272,6 +237,7 @@ void bind_reduced_system(py::class_<Kernel>& kernel) {
              without_gil([&] { k.factor(c, p); });
            })
       .def("damp", [](Kernel& k, bool diagonal, double mu) { without_gil([&] { k.damp(diagonal, mu); }); })
+      .def("length2", [](const Kernel& k, bool diagonal, const Doubles& x) { return k.length2(diagonal, x.data()); })
       .def("rhs", [](Kernel& k, OutDoubles out) { k.rhs(out.mutable_data()); })
       .def("dense",
            [](Kernel& k, OutDoubles out) {
@@ -382,6 +348,7 @@ PYBIND11_MODULE(_kernels, m) {
   ba::bind_relative_poses(m);
   ba::bind_window(m);
   ba::bind_patches(m);
+  ba::bind_bal(m);
   m.def("targets", &ba::target_names);
   m.def("target", [] { return ba::target->name; });
   m.def("use_target", &ba::use_target);
@@ -391,5 +358,4 @@ PYBIND11_MODULE(_kernels, m) {
   m.def("triangulate", &ba::triangulate);
   m.def("agreeing", &ba::agreeing);
   m.def("consensus", &ba::consensus);
-  m.def("numbers", &ba::numbers);
 }

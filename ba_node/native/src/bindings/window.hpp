@@ -31,5 +31,6 @@ auto unless_short(std::int64_t n_obs, F f) {
 void bind_window(pybind11::module_& m);
 void bind_steps(pybind11::module_& m);
 void bind_patches(pybind11::module_& m);
+void bind_bal(pybind11::module_& m);
 
 }  // namespace ba

@@ -270,6 +270,21 @@ BA_INLINE bool any(const TwiceMask<H>& m) {
 
 BA_INLINE double sum(const V8& v) { return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])); }
 
+// What sums of products are kept in where there are many: eight lanes, or four that each stand for two, for half the
+// memory.
+#if defined(__AVX512F__)
+using Folded = V8;
+BA_INLINE void add_product(Folded& to, const V8& a, const V8& b) { to += a * b; }
+#else
+using Folded = decltype(V8::lo);
+BA_INLINE void add_product(V8& to, const V8& a, const V8& b) { to += a * b; }
+BA_INLINE void add_product(Folded& to, const V8& a, const V8& b) {
+  to += a.lo * b.lo;
+  to += a.hi * b.hi;
+}
+BA_INLINE double sum(const Folded& v) { return (v[0] + v[1]) + (v[2] + v[3]); }
+#endif
+
 // Rows become columns.
 BA_INLINE void transpose(Native2 (&r)[2]) {
   const Native2 first = BA_SHUFFLE(Native2Mask, r[0], r[1], 0, 2);

@@ -52,6 +52,8 @@ class Kernel {
   virtual void factor(const double* damping_c, const double* damping_p) = 0;
   // The same with mu times the diagonal itself, or the identity.
   virtual void damp(bool diagonal, double mu) = 0;
+  // |D x|^2 of a step of the free keyframes (n_free x d), with D^2 the same diagonal or the identity.
+  virtual double length2(bool diagonal, const double* x) const = 0;
   virtual void rhs(double* out) = 0;
   // S, symmetric, (n x n), n = n_free d.
   virtual void dense(double* out) = 0;
