@@ -43,8 +43,10 @@ from ba_node.core.problem import Cameras, Problem, State
 # Keyframes that are needed, and those at either end at which no change is looked for.
 _KEYFRAMES, _ENDS = 12, 4
 _NEWEST, _OBSERVATIONS, _MAX_CAMERAS = 60, 5000, 4
-# What a score is at least where images change: sound drives show 14, others by their faults 36. And by how many times
-# its mean the sum of losses is lower with the change.
+# Observations where a step is odd: a score grows with them, that of chance does not.
+_ALL = 15_000
+# What a score is at least where images change: sound drives show 14, others by their faults 36, which grows with the
+# observations. And by how many times its mean the sum of losses is lower with the change.
 _SCORE, _SURE = 45.0, 25.0
 # A lower score tells of a change where the front-end's step to that keyframe is off by so many times what any other is,
 # these by less than this part of a step.
@@ -83,40 +85,54 @@ def check_change(tracks: Tracks) -> Diagnosis:
     if n < _KEYFRAMES or n_cam > _MAX_CAMERAS:
         return outcome
     keyframes = np.arange(max(0, n - _NEWEST), n)
-    problem = problem_of_all(tracks, keyframes, _OBSERVATIONS)
+    for most in (_OBSERVATIONS, _ALL):
+        outcome.findings, doubted = _changes(tracks, keyframes, most)
+        if outcome.findings or not doubted:
+            break
+    return outcome
+
+
+def _changes(tracks: Tracks, keyframes: IntArray, most: int) -> tuple[list[Finding], bool]:
+    """Return what changes by about so many observations, and whether one step is so odd that more are worth a look."""
+    problem, n_cam = problem_of_all(tracks, keyframes, most), len(tracks.cameras.model)
     if problem is None:
-        return outcome
+        return [], False
     given = Adjusted(problem, tracks.cameras.params)
     noise = float(np.quantile(given.norms, _LOW)) / _USUAL
+    off = _off(given.state, tracks, keyframes)
+    odd = int(np.argmax(off))
+    others = float(np.delete(off, odd).max())
+    doubted = _ODD * others < off[odd] and others < _SMALL
     if noise > _MOST_NOISE:
-        return outcome
+        return [], doubted
     off_by = given.norms / noise
-    noise *= math.sqrt(1.0 + _TOGETHER * float(np.mean((off_by > _MOVING[0]) & (off_by < _MOVING[1]))))
+    together = 1.0 + _TOGETHER * float(np.mean((off_by > _MOVING[0]) & (off_by < _MOVING[1])))
+    noise *= math.sqrt(together)
     # The images of all cameras may change alike, or those of one.
     which = [tuple(range(n_cam)), *((camera,) for camera in range(n_cam if n_cam > 1 else 0))]
     with np.errstate(all="ignore"):
         problem = placed(dataclasses.replace(problem, start=given.state))
         scores = _scores(problem, which, noise)
         cameras, score = which[int(np.argmax(scores.max(axis=1)))], scores.max(axis=0)
-        if score.max() > _SCORE:
+        if score.max() > _SCORE * most / _OBSERVATIONS:
             k = int(np.argmax(score > _ABOUT * score.max()))
             found = _adjusted(problem, cameras, k, noise)
-            if found.is_sure and _is_better(found, given) and not _jumps(_off(found.state, tracks, keyframes), k):
+            jumps = _jumps(_off(found.state, tracks, keyframes), k)
+            if found.is_sure and not jumps and _gain(found, given) > _SURE * together:
                 change, at = found.change, int(keyframes[k])
-                outcome.findings += [named(tracks, camera, at, change, np.zeros(3)) for camera in cameras]
-        if score.max() > _DOUBTED and not outcome.findings:
-            off = _off(given.state, tracks, keyframes)
-            k = int(np.argmax(off))
-            others = float(np.delete(off, k).max())
-            if _ODD * others < off[k] and others < _SMALL and abs(int(np.argmax(score)) - k) <= 1:
-                outcome.findings.append(_unclear(tracks, int(keyframes[k]), off[k], others))
-    return outcome
+                return [named(tracks, camera, at, change, np.zeros(3)) for camera in cameras], doubted
+    if doubted and score.max() > _DOUBTED and abs(int(np.argmax(score)) - odd) <= 1:
+        return [_unclear(tracks, int(keyframes[odd]), off[odd], others)], doubted
+    return [], doubted
 
 
-def _is_better(found: _Changed, given: Adjusted) -> bool:
-    """Return True if a change leaves clearly less than the cameras as given, these once more from where it ended."""
+def _gain(found: _Changed, given: Adjusted) -> float:
+    """Return by how many times its mean the sum of losses is lower with a change.
+
+    The cameras as given are adjusted once more from where the change ended.
+    """
     measure = Measure(given.norms)
-    return len(measure) * (given.thorough(found.state, measure) / measure(found) - 1.0) > _SURE
+    return len(measure) * (given.thorough(found.state, measure) / measure(found) - 1.0)
 
 
 def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:

@@ -32,6 +32,8 @@ _STANDARD_ERRORS = 4.0
 _GROSS = 5.0
 # A factor is named if depths agree on it to this share (median deviation of its logarithm).
 _AGREE = 0.35
+# Points agree on a factor to this part of it: 0.04 where the unit is another, 0.3 where many move along with a camera.
+_ALIKE = 0.15
 # A shift of all disparities is named unless a factor of all depths leaves so many times less spread, and goes first.
 _CLEARLY = 3.0
 # A factor is named unless a shift leaves so much less.
@@ -170,6 +172,9 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
             finding, causes=(*finding.causes, steps[0]), changes=("the factor from depth images to depth_m", steps[1])
         )
         return Diagnosis([both], rows=rows)
+    inner = float(np.median([_deviation(np.log(given / found)) for given, found in pairs]))
+    if inner > _ALIKE * abs(np.log(factor)) and 1.0 / _GROSS < factor < _GROSS:
+        return Diagnosis(untold=[f"depths contradict {by}, each by another factor: much may move"], rows=rows)
     unit = unit_of(factor)
     finding = _depth_finding(f"depth_m {unit or 'in another unit'}: it is {_times(factor)} what {by} tell", evidence)
     if not unit:

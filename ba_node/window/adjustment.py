@@ -49,6 +49,11 @@ _GROWN, _FEW = 0.05, 10
 # that shows no lengths, whose scale drifts, and with others.
 _YOUNG, _AGAIN = 320, (1.25, 1.4)
 _ITERATIONS = 30
+# Share of the keyframes that windows have to have refined.
+_REFINED = 0.8
+# Warnings that say nothing of the images and poses that are in the map; and those of what is left out of solves.
+_OF_NAMES = frozenset(["bad_stamp", "equal_stamps", "clock_jump", "clock_step", "lower_session", "stray_session"])
+_ALLOWED = _OF_NAMES | {"frame_changed", "frame_name", "far_from_origin", "moving", "stray"}
 # Poses that explain tracks better by less than this share do so by rounding; worse by more than that, worse indeed.
 _ROUNDED, _WORSE = 1e-9, 0.005
 _NOTHING_CAME = "nothing came of a solve of everything"
@@ -206,11 +211,12 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
     """Return whether a young map has grown by so much that all of it is to be refined again.
 
     Windows hold what is older as it was found when less was known, and with it the scale of one camera. Not where more
-    than pixels and steps places the map, where a keyframe is not refined, anything was found to be odd, little is seen,
-    the front-end is far worse than stated, or, with one camera, it hardly moves for some of the time.
+    than pixels and steps places the map, where a fifth of the keyframes is not refined, where more is odd than stamps,
+    names and what is left out (what moves, keyframes that contradict their tracks), where little is seen, where the
+    front-end is far worse than stated, or, with one camera, where it hardly moves for some of the time.
     """
     known, n, window = scene.constraints, len(scene.keyframes), config.window
-    odd = scene.log.warnings.keys() - {"moving"}
+    odd = scene.log.warnings.keys() - _ALLOWED
     if not max(window.max_keyframes + 1, _AGAIN[0] * known.grown_at) <= n <= _YOUNG or odd:
         return None
     if window.old_keyframes != "fix" or config.factors.adjust_m <= 0.0:
@@ -221,7 +227,7 @@ def _grown(scene: Scene, config: Config) -> loops.Due | None:
     looped = known.renamed or any(one.is_loop for one in known.relative.values())
     if known.absolute or known.landmarks or known.seams or looped:
         return None
-    if not scene.keyframes.refined[scene.order].all():
+    if scene.keyframes.refined[scene.order].mean() < _REFINED:
         return None
     known.grown_at = n
     told = scaled or odometry.tell_scale(scene, config.odometry)

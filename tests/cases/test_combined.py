@@ -135,6 +135,13 @@ CASES = (
         (("zoomed_midway", 1.2), ("outliers_uniform", 0.3)), "mono", 9510, {"look_deg": 90.0, **LOOP}, "focal length"
     ),
     Combined((("outliers_uniform", 0.2), ("zoomed_midway", 1.12)), "stereo", 8007, {}, "focal length of camera 0 from"),
+    Combined((("zoomed_midway", 1.15), ("outliers_uniform", 0.2)), "stereo", 11002, {"look_deg": 90.0}, "zoomed"),
+    Combined((("region_midway", 12.0),), "stereo", 11013, {"look_deg": 90.0}, "another region of interest"),
+    Combined((("baseline_off", 0.98),), "stereo", 11122, {}, "baseline"),
+    # What moves is neither another unit of depths nor a zoom, and where it carries a solution along that is given up.
+    Combined((("outliers_moving", 0.35),), "rgbd", 11405, {}, r"(?s)\A(?!.*another unit).*move"),
+    Combined((("outliers_moving", 0.3),), "mono", 11408, {"look_deg": 90.0}, r"(?s)\A(?!.*focal length of camera)"),
+    Combined((("outliers_moving", 0.6),), "stereo", 11210, {"look_deg": 90.0, **LOOP}, "what moves carried"),
     Combined((("zoomed_midway", 1.1),), "stereo", 7501, LOOP, "focal length"),
     Combined((("zoomed_midway", 1.2),), "mono", 7502, {}, "focal length"),
     Combined((("ids_midway", 1.0),), "stereo", 7503, {}, r"track ids stand for other points|\bids?\b"),

@@ -18,7 +18,7 @@ from ba_node.check.onset import check_onset
 from ba_node.check.tracks import Tracks
 from ba_node.core import bordered
 from ba_node.core.cameras import FX
-from ba_node.measurements import CameraRig, FeatureTracks
+from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from experiments.robustness.faults.catalogue import spoiled, spoiled_by
 from experiments.robustness.faults.recording import Recording
 from tests.check.set_ups import recording, seen
@@ -90,6 +90,21 @@ def test_a_small_change_that_passes_for_a_step_is_named_by_its_keyframe(
     assert found.since_ns == tracks.stamp_ns[20]
 
 
+@pytest.mark.parametrize(
+    "faults",
+    [(("region_midway", 12.0),), (("zoomed_midway", 1.15), ("outliers_uniform", 0.2))],
+    ids=["region", "zoom"],
+)
+def test_a_step_that_is_odd_is_asked_of_more_observations(
+    faults: tuple[tuple[str, float], ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracks = tracks_of(spoiled_by(faults, "stereo", 11017 if len(faults) == 1 else 11001, **SIDEWAYS))
+    (found,) = check_change(tracks).findings
+    assert found.since_ns == tracks.stamp_ns[20]
+    monkeypatch.setattr(change, "_ALL", change._OBSERVATIONS)
+    assert not check_change(tracks).findings
+
+
 @pytest.mark.parametrize(("mode", "cameras"), [("mono", (0,)), ("stereo", (0, 1)), ("stereo", (1,))])
 def test_a_score_is_that_of_a_linearisation_with_cameras_before_and_after(mode: str, cameras: tuple[int, ...]) -> None:
     tracks = seen(recording(mode=mode, path="loop"), 30)
@@ -136,3 +151,18 @@ def test_sound_images_are_not_named(path: str, mode: str, look_deg: float) -> No
 )
 def test_other_faults_are_not_taken_for_it(faults: tuple[tuple[str, float], ...], options: dict[str, Any]) -> None:
     assert not check_change(tracks_of(spoiled_by(faults, "mono", 9401, **options))).findings
+
+
+def test_what_moves_over_a_few_keyframes_is_no_change() -> None:
+    """Tracks on an object pull together: a score of 57 is not enough, they have to gain more."""
+    data = spoiled("outliers_moving", "mono", 0.3, 11408, **SIDEWAYS)
+    newest = {one.keyframe_id for one in data.keyframes[20:]}
+    rest = dataclasses.replace(
+        data,
+        timeline=tuple(
+            entry
+            for entry in data.timeline
+            if not isinstance(entry[2], Keyframe | FeatureTracks) or entry[2].keyframe_id in newest
+        ),
+    )
+    assert not check_change(tracks_of(rest)).findings

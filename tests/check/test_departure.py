@@ -90,19 +90,53 @@ def test_one_side_is_named(mode: str, aside_deg: tuple[float, float, float]) -> 
     assert abs(int(found[1]) - expected) < 0.25 * expected, f"{text}: expected about {expected:.0f} px"
 
 
-def test_less_is_doubted_at_the_end_alone() -> None:
-    """A baseline that is 2 % off is not told for certain, but said; the map stays."""
-    data, said = recording(path="line"), 0
+def test_less_is_enough_at_the_end_alone() -> None:
+    """A baseline that is 2 % off is told on most drives then, and on few before."""
+    data = recording(path="line")
+    before = at_the_end = 0
     for seed in range(20):
         scene = refined(data, 1.02, seed=seed)
+        before += departed(scene) is not None
+        check = departed(scene, final=True)
+        if check is not None and check.found is not None:
+            assert check.found.harmful and "baseline: lengths are 1.0" in check.found.causes()
+            at_the_end += 1
+        assert departed(refined(data, 1.0, seed=seed), final=True) is None, f"seed {seed}"
+    assert before + 3 <= at_the_end, f"{before} of 20 before the end, {at_the_end} there"
+
+
+def test_less_aside_is_doubted_at_the_end() -> None:
+    """A camera that is turned by 1.3 degrees is not told for certain, but said; the map stays."""
+    data, said = recording(path="line"), 0
+    for seed in range(20):
+        scene = refined(data, 1.0, seed=seed, aside_deg=(0.0, 0.0, 1.3))
         if departed(scene, final=True) is not None:
             continue
         check = departed(scene, final=True, doubted=True)
         if check is not None and check.found is not None:
-            assert not check.found.harmful and "baseline: lengths are 1.0" in check.found.causes()
+            assert not check.found.harmful and "camera 0 does not fit" in check.found.causes()
             said += 1
         assert departed(refined(data, 1.0, seed=seed), final=True, doubted=True) is None, f"seed {seed}"
     assert said >= 3, f"{said} of 20 are doubted"
+
+
+@pytest.mark.parametrize("mode", ["stereo", "rgbd"])
+def test_where_much_moves_steps_that_were_carried_along_are_named(mode: str) -> None:
+    data = recording(mode=mode, path="line")
+    for sigmas, told in ((0.0, False), (1.0, False), (4.0, True)):
+        scene = refined(data, 1.0, 50)
+        # Twelve steps to the left.
+        scene.keyframes.position[:, 1] += sigmas * STEP_NOISE_M * np.clip(np.arange(50) - 20, 0, 12)
+        assert departed(scene, final=True) is None, "nothing is known to move"
+        scene.log.warn("moving", "much moves")
+        check = departed(scene, final=True)
+        assert (check is not None) == told, f"{sigmas} sigmas"
+        if check is not None and check.found is not None:
+            words = check.found.causes()
+            found = re.search(r"what moves carried the solution along from keyframe (\d+) to (\d+)", words)
+            assert found and check.found.harmful, words
+            ids = [int(scene.keyframes.keyframe_id[row]) for row in scene.order]
+            assert abs(ids.index(int(found[1])) - 20) <= 2 and abs(ids.index(int(found[2])) - 32) <= 2
 
 
 @pytest.mark.slow

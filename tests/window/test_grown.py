@@ -92,12 +92,13 @@ def test_one_camera_is_left_to_its_windows_where_nothing_tells_its_scale_or_trac
     assert backend.map.summary().notices == {"not_refined": 1} and not backend.map.adjustments
 
 
-def test_maps_of_which_something_was_said_are_left_to_their_windows() -> None:
+@pytest.mark.parametrize(("kind", "times"), [("held", 0), ("depths", 0), ("bad_stamp", 1), ("stray", 1)])
+def test_maps_of_which_more_was_said_than_stamps_are_left_to_their_windows(kind: str, times: int) -> None:
     few = {"keyframes": 24, "length_m": 16.0, "landmarks": 800, "tracks": 60}
     backend = Backend(Config().with_values({"guard.check_setup": False}))
     for _ in backend.replay(m for _, _, m in recording(51, **few).timeline()):
-        backend.scene.log.warn("held", "a solution was held")
-    assert backend.map.adjustments == 0
+        backend.scene.log.warn(kind, "something is odd")
+    assert backend.map.adjustments == times
 
 
 def test_one_that_is_refused_leaves_what_windows_found_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
