@@ -89,9 +89,10 @@ def test_depths_that_change_their_unit_near_the_end_are_named(
 
 
 @pytest.mark.slow
-def test_a_baseline_that_is_off_by_little_is_said_and_the_result_stays(tmp_path: Path, run: Replay) -> None:
+def test_a_baseline_that_is_off_by_little_is_said_and_does_no_harm(tmp_path: Path, run: Replay) -> None:
     recording = spoiled("baseline_off", "stereo", 0.983, 401, path="loop", length_m=30.0, keyframes=60)
     outcome = run(write(tmp_path, recording))
     assert outcome.code == 3, outcome.words
     outcome.tells("scale of focal length or baseline: lengths are 0.98")
-    assert outcome.report["keyframes_refined"] == len(recording.keyframes)
+    (found,) = outcome.errors(recording.truth)
+    assert found.published_m <= 1.001 * found.input_m
