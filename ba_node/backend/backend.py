@@ -32,8 +32,8 @@ from collections.abc import Callable, Iterable, Iterator
 from ba_node.backend import archive
 from ba_node.backend.current_map import Completion, CurrentMap
 from ba_node.backend.summary import MapEnded
-from ba_node.backend.worse import wrong_at_the_end
-from ba_node.check.departure import departed, deviates
+from ba_node.backend.worse import amiss, wrong_at_the_end
+from ba_node.check.departure import deviates
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
 from ba_node.core.problem import Cameras
@@ -183,7 +183,7 @@ class Backend:
         asked: list[Check | None] = []
 
         def taken(refinement: Refinement) -> None:
-            asked.append(departed(self.scene))
+            asked.append(amiss(self.scene))
             if asked == [None]:  # else it is taken back at once
                 on_poses(refinement)
 
@@ -192,7 +192,7 @@ class Backend:
             self._look()
         if (study := self.map.begun_study()) is not None:
             self._work(study)
-        return estimate if wrong else self.take_check(*(asked or [departed(self.scene)])) or self.adjust() or estimate
+        return estimate if wrong else self.take_check(*(asked or [amiss(self.scene)])) or self.adjust() or estimate
 
     def _look(self) -> str:
         """Have the set-up checked if that is due; return why solves are held, empty if they are not."""

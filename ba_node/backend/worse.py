@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from ba_node.check.departure import departed, deviates
 from ba_node.check.diagnosis import Diagnosis, Finding
+from ba_node.check.measured_depths import depths_err
 from ba_node.check.watch import Check, of_all_images, of_few_keyframes, of_the_newest
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
@@ -26,12 +27,19 @@ def is_worse(before: float, after: float, share: float = _SHARE) -> bool:
     return after > (1.0 + share) * before + _SLACK_PX
 
 
+def amiss(scene: Scene) -> Check | None:
+    """Return what is wrong with a young map that goes on, None if nothing is, or if it is not asked now."""
+    wrong = departed(scene)
+    return depths_err(scene, at_once=wrong is not None) or wrong
+
+
 def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
     """Return what is wrong with a map when no more will come, None if nothing is."""
     wrong = of_the_newest(scene, deviates(scene, final=True))
     wrong = (
         wrong
         or of_all_images(scene)
+        or depths_err(scene, at_once=True)
         or departed(scene, final=True)
         or explains_worse(scene, config)
         or of_few_keyframes(scene)
