@@ -138,8 +138,13 @@ class Directions:
 
 
 def root_information(covariance: FloatArray) -> FloatArray:
-    """Return W with ``W' W`` the inverse of covariances (n, m, m)."""
-    return np.asarray(np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2))
+    """Return W, upper triangular, with ``W' W`` the inverse of covariances (n, m, m).
+
+    From ``C = U U'`` with U upper triangular, ``W = U^-1``: the inverse of C, whose smallest eigenvalues rounding may
+    have turned negative, is not made.
+    """
+    lower = np.linalg.cholesky(covariance[..., ::-1, ::-1])
+    return np.asarray(np.tril(np.linalg.inv(lower))[..., ::-1, ::-1])
 
 
 def _stepped(state: State, step: FloatArray) -> State:

@@ -121,7 +121,7 @@ class _Steps:
                 measured = known.relative.get(key)
                 if measured is not None and not measured.is_loop:
                     step[k] = measured.position if key[0] == one else -measured.rotation.T @ measured.position
-                    variance[k] = np.trace(np.linalg.inv(measured.root.T @ measured.root)[3:, 3:]) / 3.0
+                    variance[k] = np.sum(np.linalg.inv(measured.root)[3:] ** 2) / 3.0
         gap = moved - (table.rotation[order[:-1]] @ step[:, :, None])[..., 0]
         gap = np.append(np.zeros((1, 3)), np.cumsum(gap, axis=0), axis=0)
         each = np.nan_to_num(variance), np.linalg.norm(moved, axis=1), np.isnan(variance)
