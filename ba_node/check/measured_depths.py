@@ -39,8 +39,8 @@ _SPREAD, _OF_MEDIAN, _FLOOR = 1.4826, 1.25, 0.001
 _OFFSET_M, _ERRORS, _TILT = 0.03, 4.5, 0.005
 # Medians that scatter by such a share about what an offset leaves are wrong, if that is so many standard errors.
 _BENT, _BENT_ERRORS = 0.01, 4.0
-# Keyframes at which it is asked, up to which a map is young, and from which on it is asked at once: with fewer, poses that
-# are off along the way look like an offset.
+# Keyframes at which it is asked, up to which a map is young, and from which on it is asked at once: with fewer, poses
+# that are off along the way look like an offset.
 _AT, _YOUNG, _FEWEST = frozenset({30, 60, 120}), 120, 20
 
 
