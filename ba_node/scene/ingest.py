@@ -226,7 +226,8 @@ def _check_fold(
 def why_refused(rig: CameraRig) -> str:
     """Return why the cameras of a rig are turned away, in words; empty if they are not."""
     log = RejectionLog()
-    return "" if rig_cameras(rig, log) is not None else log.notes[-1]
+    # Without the count of what was turned away, which ends a note.
+    return "" if rig_cameras(rig, log) is not None else log.notes[-1].rpartition("; dropped (")[0]
 
 
 def seen_from_first(rig: CameraRig) -> CameraRig:
