@@ -93,7 +93,8 @@ class BaNode(ManagedNode):
     @property
     def keyframes_refined(self) -> int:
         """Return how many keyframes have been refined so far."""
-        return self._refined_before + (self._host.worker.refined if self._host else 0)
+        workers = self._leaving if self._host is None else [*self._leaving, self._host.worker]
+        return self._refined_before + sum(worker.refined for worker in workers)
 
     def summary(self) -> str:
         """Return in words what the node has done."""
@@ -176,8 +177,10 @@ class BaNode(ManagedNode):
         self._lingering = host.after_cleanup
         self._linger_timer.reset()
         try:
-            self._leaving = [worker for worker in [*self._leaving, host.worker] if not worker.stop(_STOP_S)]
-            self._refined_before += host.worker.refined
+            self._leaving.append(host.worker)
+            for worker in [worker for worker in self._leaving if worker.stop(_STOP_S)]:
+                self._leaving.remove(worker)
+                self._refined_before += worker.refined
             if self._kept is not None:
                 (kept, backend), self._kept = self._kept, None
                 self._saving = kept.save(backend, host.worker)

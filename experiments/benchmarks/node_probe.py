@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,8 @@ def cpu_ns() -> Counter[str]:
     spent: Counter[str] = Counter()
     for task in Path("/proc/self/task").iterdir():
         name = names.get(int(task.name), "others")
-        spent[name] += int((task / "schedstat").read_text().split()[0])
+        with suppress(OSError):  # a thread that has just ended
+            spent[name] += int((task / "schedstat").read_text().split()[0])
     return spent
 
 

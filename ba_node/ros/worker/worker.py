@@ -238,15 +238,15 @@ class Worker:
             self._put(Notice("falling_behind", lag))
         # More keyframes than a window holds take several solves; without progress the next try waits for new data.
         self._behind = n_solved > 0 and self._backend.ready
-        if estimate is not None and not self._inbox.closed:
-            if not self._has_left:
-                self._poses_leave(arrived_s, estimate.refinement)
+        if estimate is not None and not self._has_left:
+            self._poses_leave(arrived_s, estimate.refinement)
+        if estimate is not None and self._has_left:  # what was published counts, also if the node has ended meanwhile
             self._put(self._finished(estimate, start_s, arrived_s))
 
     def _poses_leave(self, arrived_s: float, refinement: Refinement) -> None:
         self._budget.end()
-        self._has_left = True
-        if not self._inbox.closed:
+        self._has_left = not self._inbox.closed
+        if self._has_left:
             self._leave(refinement, arrived_s)
 
     def _arrival_s(self, now_s: float) -> float:

@@ -232,6 +232,16 @@ def test_poses_leave_once_and_before_the_rest_is_worked_out(early: bool) -> None
     assert (refinement.poses.keyframe_id.tolist(), arrived_s, report.newest_keyframe_id) == ([7], 0.25, 7)
 
 
+@pytest.mark.parametrize("early", [True, False])
+def test_what_was_published_counts_where_the_node_ends_meanwhile(early: bool) -> None:
+    rig = Rig()
+    rig.backend.early = early
+    rig.backend.after_poses = rig.inbox.close
+    rig.keyframe(7)
+    rig.step()
+    assert (len(rig.left), rig.worker.refined) == ((1, 1) if early else (0, 0))
+
+
 def test_outputs_nobody_fetches_are_bounded() -> None:
     rig = Rig()
     for number in range(200):
