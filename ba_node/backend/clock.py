@@ -11,11 +11,10 @@ set leaves a step in the sum of r, at a keyframe that came when it was due.
 from __future__ import annotations
 
 from collections import deque
-from statistics import median  # numpy's takes ten times as long for so few
+from collections.abc import Iterable
+from itertools import accumulate, pairwise
+from statistics import median
 
-import numpy as np
-
-from ba_node.arrays import FloatArray
 from ba_node.backend.backend import Backend
 from ba_node.measurements import Keyframe, Measurement
 from ba_node.scene.scene import Scene
@@ -54,8 +53,7 @@ class ClockWatch:
             return
         self._came.append((measurement.keyframe_id, measurement.stamp_ns, time_s))
         ids, stamps, times = zip(*self._came, strict=True)
-        stamp_s = _NS * np.array([one - stamps[0] for one in stamps], float)
-        for at, step_s in clock_steps(stamp_s, np.array(times) - times[0]):
+        for at, step_s in clock_steps([_NS * (one - stamps[0]) for one in stamps], [one - times[0] for one in times]):
             where = "forward" if step_s > 0.0 else "back"
             text = f"{where} by {abs(step_s):.4g} s at keyframe {ids[at]} ({_NS * stamps[at]:.3f} s)"
             self._steps.setdefault(ids[at], text)
@@ -69,24 +67,26 @@ class ClockWatch:
             )
 
 
-def clock_steps(stamp_s: FloatArray, time_s: FloatArray) -> list[tuple[int, float]]:
-    """Return before which keyframes stamps (n,) step against the times of their arrival (n,), and by how much, s."""
-    stamp, time = np.diff(stamp_s), np.diff(time_s)
-    rises = stamp > 0.0
-    if len(stamp) < 2 * _LEAST or not rises.any():
+def clock_steps(stamp_s: Iterable[float], time_s: Iterable[float]) -> list[tuple[int, float]]:
+    """Return before which keyframes stamps step against the times of their arrival, and by how much, s."""
+    # Of so few numbers, and for every keyframe: a dozen functions of numpy would take several times as long.
+    stamp, time = ([after - before for before, after in pairwise(of)] for of in (stamp_s, time_s))
+    paces = [dt / ds for ds, dt in zip(stamp, time, strict=True) if ds > 0.0]
+    if len(stamp) < 2 * _LEAST or not paces:
         return []
-    pace = median((time[rises] / stamp[rises]).tolist())
-    late = time - pace * stamp
-    size = np.abs(late)
-    if size.max() <= _AT_ONCE * _STEP_S:  # none is a jump: nearly always
+    pace = median(paces)
+    late = [dt - pace * ds for ds, dt in zip(stamp, time, strict=True)]
+    size = [abs(one) for one in late]
+    if max(size) <= _AT_ONCE * _STEP_S:  # none is a jump: nearly always
         return []
-    delay = np.append(0.0, np.cumsum(late))
-    least = max(_STEP_S, _USUAL * median(size.tolist()))
+    delay = list(accumulate(late, initial=0.0))
+    least, usual_s = max(_STEP_S, _USUAL * median(size)), median(time)
     found: list[tuple[int, float]] = []
-    jumps = 1 + np.flatnonzero(size > _AT_ONCE * least)
-    for k in jumps[(jumps >= _LEAST) & (jumps <= len(delay) - _LEAST)].tolist():
-        step = median(delay[k : k + _SIDE].tolist()) - median(delay[max(k - _SIDE, 0) : k].tolist())
+    for k in range(_LEAST, len(delay) - _LEAST + 1):
+        if size[k - 1] <= _AT_ONCE * least:
+            continue
+        step = median(delay[k : k + _SIDE]) - median(delay[max(k - _SIDE, 0) : k])
         is_step = abs(step) > least and late[k - 1] / step > _AT_ONCE
-        if is_step and pace > 0.0 and abs(time[k - 1] - median(time.tolist())) < _ON_TIME * abs(step):
+        if is_step and pace > 0.0 and abs(time[k - 1] - usual_s) < _ON_TIME * abs(step):
             found.append((k, -step / pace))
     return found

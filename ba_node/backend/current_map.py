@@ -223,7 +223,7 @@ class CurrentMap:
             return None, {}
         selection, tracks, kernels = tried.selection, self.config.tracks, self.config.solver.kernels
         taken = None if tried.held else tried.found.state
-        taking_part = _taking_part_of(self.scene, selection)
+        taking_part = selection.taking_part(self.scene)
         refined: Poses | None = None
         extra: dict[str, Any] = {}
         for stray in selection.strays:
@@ -378,11 +378,6 @@ def _rows_by_id(wanted: IdArray, ids: IdArray, values: FloatArray) -> FloatArray
     _, here, there = np.intersect1d(wanted, ids, return_indices=True)
     out[here] = values[there]
     return out
-
-
-def _taking_part_of(scene: Scene, selection: window.Selection) -> IntArray:
-    """Return the keyframes of the window and of the problem, oldest first."""
-    return scene.by_time(scene.distinct(np.concatenate([selection.window, selection.keyframes])))
 
 
 def _end_of_solve(scene: Scene, due: IntArray, window_size: int) -> int:

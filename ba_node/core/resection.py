@@ -34,12 +34,11 @@ def resected(problem: Problem, options: SolverOptions, keyframe: int) -> State:
     few others, or agrees with them as well as it can. The views' depths and the problem's factors are not looked at.
     """
     start = problem.start
-    pose = _pose(problem, options, keyframe)
-    if pose is None:
+    found = _pose(problem, options, keyframe)
+    if found is None:
         return start
     rotation, translation, points = start.rotation.copy(), start.translation.copy(), start.points.copy()
-    rotation[keyframe], translation[keyframe] = pose
-    _, alone = _views(problem, keyframe)
+    rotation[keyframe], translation[keyframe], alone = found
     in_body = points[alone] @ start.rotation[keyframe].T + start.translation[keyframe]
     points[alone] = (in_body - translation[keyframe]) @ rotation[keyframe]
     return changed(start, rotation=rotation, translation=translation, points=points)
@@ -53,8 +52,11 @@ def _views(problem: Problem, keyframe: int) -> tuple[IntArray, BoolArray]:
     return rows, (own > 0) & (own == np.bincount(point, minlength=n))
 
 
-def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[FloatArray, FloatArray] | None:
-    """Return the keyframe's pose, (3, 3) and (3,) m, body from world; None if it stays."""
+def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[FloatArray, FloatArray, BoolArray] | None:
+    """Return the keyframe's pose, (3, 3) and (3,) m, body from world; None if it stays.
+
+    And which points it alone sees, (n_pt,).
+    """
     if options.kernels != "numpy" and not missing(options):
         limits = _LEAST, _STEPS, _LEAST_GAIN, _DAMPING
         model = options.loss, options.loss_scale_px
@@ -79,7 +81,7 @@ def _pose(problem: Problem, options: SolverOptions, keyframe: int) -> tuple[Floa
             break
         turn = geometry.so3_exp(step[:3])
         at = turn @ at[0], turn @ at[1] + step[3:]
-    return None if best is start else best
+    return None if best is start else (*best, alone)
 
 
 class _Views(NamedTuple):

@@ -107,7 +107,16 @@ def refined_message(poses: Poses, stamp_ns: int, frame_id: str, session_id: int)
 
 def pose_messages(poses: Poses, frame_id: str) -> list[bytes]:
     """Return a ``geometry_msgs/PoseStamped`` for each pose."""
-    return [_ENCODING + row.tobytes() for row in _stamped(poses, frame_id, 0)]
+    name = frame_id.encode() + b"\x00"
+    layout = _pose_layout(len(name))
+    values = zip(poses.stamp_ns.tolist(), poses.position.tolist(), poses.orientation.tolist(), strict=True)
+    return [layout.pack(_ENCODING, *stamp_parts(ns), len(name), name, *place, *turn) for ns, place, turn in values]
+
+
+@functools.cache
+def _pose_layout(size: int) -> struct.Struct:
+    """Return the layout of a ``geometry_msgs/PoseStamped`` by itself, with a name of so many bytes."""
+    return struct.Struct(f"<4siII{size}s{-(12 + size) % 8}x7d")
 
 
 def path_message(poses: Poses, stamp_ns: int, frame_id: str) -> bytes:

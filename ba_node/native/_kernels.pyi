@@ -163,7 +163,7 @@ def allocations() -> int:
 
 def resect(
     problem: Problem, keyframe: int, cost: tuple[str, float], limits: tuple[int, int, float, float]
-) -> tuple[Doubles, Doubles] | None:
+) -> tuple[Doubles, Doubles, NDArray[np.bool_]] | None:
     """Return what core.resection._pose does; cost: loss and its scale; limits: as its module has them."""
 
 def residual_norms(problem: Problem, state: State) -> Doubles: ...

@@ -232,8 +232,9 @@ class BaNode(ManagedNode):
         """Give the components the poses of a solve, on the solver's thread: another would have to wake up first."""
         with host.leaving:
             for component in self._components if host.active else ():
-                with self._surviving(component):
-                    component.take_poses(refinement, arrived_s)
+                if type(component).take_poses is not Component.take_poses:
+                    with self._surviving(component):
+                        component.take_poses(refinement, arrived_s)
 
     @contextmanager
     def _surviving(self, component: Component) -> Iterator[None]:

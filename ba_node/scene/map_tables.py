@@ -216,6 +216,8 @@ class MapTables(Views):
         """Return the landmark row of each track (all different), making rows for new ones."""
         rows = self._landmark_rows.find(track_ids)
         new = rows < 0
+        if not new.any():
+            return rows
         rows[new] = self.landmarks.append(int(np.count_nonzero(new)), track_id=track_ids[new])
         self._landmark_rows.insert(track_ids[new], rows[new])
         return rows

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from ba_node.arrays import changed
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, Measurement, OfSession, OfTime
 from ba_node.scene import ingest
 from ba_node.scene.candidates import (
@@ -115,9 +116,8 @@ class Sessions:
         return Decision(self.state)
 
     def _keyframe(self, scene: Scene, keyframe: Keyframe) -> Decision:
-        as_it_is = Decision(self.state, (Admitted(keyframe),))
         if not scene.usable(keyframe):
-            return as_it_is
+            return Decision(self.state, (Admitted(keyframe),))
         current = scene.session_id
         if not len(scene.keyframes):
             first = current is None or keyframe.session_id == current
@@ -132,7 +132,7 @@ class Sessions:
         if odd is not None:
             return self._support(scene, *odd)
         if scene.find_keyframe(keyframe.keyframe_id) is not None:
-            return as_it_is
+            return Decision(self.state, (Admitted(keyframe),))
         return self._against(keyframe)
 
     def _odd(self, scene: Scene, keyframe: Keyframe) -> tuple[Kind, Keyframe, str] | None:
@@ -229,7 +229,7 @@ class Sessions:
 
     def _against(self, keyframe: Keyframe) -> Decision:
         """Take in a keyframe that goes on as before: it speaks against what is held."""
-        state = dataclasses.replace(self.state, lower=(-1, 0), calm=self.state.calm + 1)
+        state = changed(self.state, lower=(-1, 0), calm=self.state.calm + 1)
         if state.calm >= _CALM:
             state = dataclasses.replace(state, distrust=max(0, state.distrust - 1), calm=0)
         candidate = state.candidate

@@ -17,6 +17,7 @@ agree with it (within the gate, at their own newest keyframe). Smoothing moves a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,8 +96,8 @@ class MapCorrection:
 
 def _apart(a: Transform, b: Transform) -> tuple[float, float]:
     """Return the distance (m) and the angle (rad) between two poses."""
-    angle = np.linalg.norm(geometry.so3_log(a.rotation.T @ b.rotation))
-    return float(np.linalg.norm(a.translation - b.translation)), float(angle)
+    *axis, cosine = geometry.quaternion_from_matrix(a.rotation.T @ b.rotation).tolist()
+    return math.dist(a.translation, b.translation), 2.0 * math.atan2(math.hypot(*axis), cosine)
 
 
 def _beyond(config: FramesConfig, distance_m: float, angle_rad: float) -> bool:

@@ -191,9 +191,9 @@ def _unexplained(found: Explained, config: Config) -> str:
     if not config.guard.held_out_tracks:
         return ""
     bad = found.worse(config.guard.max_worse_share)
-    if not len(bad):
+    if not bad:
         return ""
-    k = int(bad[0])
+    k = bad[0]
     figures = f"mean residual {found.mean[0, k]:.2f} -> {found.mean[1, k]:.2f} sigmas"
     if k == 0:
         return f"it explains the tracks that it was tried on worse than the poses that came in ({figures})"

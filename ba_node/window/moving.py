@@ -125,7 +125,7 @@ def much(problem: Problem, moves: BoolArray) -> bool:
         return False
     views = np.bincount(problem.observations.point, minlength=problem.n_points)
     placed = ~np.isnan(problem.start.points[:, 0])
-    return bool(np.sum(views[moves & placed]) > _MUCH * np.sum(views[placed]))
+    return bool(views @ (moves & placed) > _MUCH * (views @ placed))
 
 
 def _off(problem: Problem, norms: FloatArray, unrefined: BoolArray) -> FloatArray:

@@ -83,9 +83,9 @@ class Steps:
         """Return the factors of some steps."""
         pairs = self.first[kept, None] + np.arange(2)
         root = np.zeros((2, len(pairs), 6, 6))
-        index = np.arange(3)
-        root[0][:, index, index] = 1.0 / self.sigma_rad[kept, None]
-        root[1][:, index + 3, index + 3] = 1.0 / self.sigma_m[kept, None]
+        # Three numbers each of a diagonal, that of turns before that of moves.
+        root[0].reshape(-1, 36)[:, :15:7] = 1.0 / self.sigma_rad[kept, None]
+        root[1].reshape(-1, 36)[:, 21::7] = 1.0 / self.sigma_m[kept, None]
         measured = self.rotation[kept], self.translation[kept]
         return tuple(RelativePoses(pairs, *measured, part, _LOSS, loss_scale) for part in root)
 
@@ -198,12 +198,13 @@ def _as_learned(
     refined = geometry.steps_between(table.rotation, table.position, first, last)
     stated = steps.rotation[rows], steps.translation[rows]
     worse = factor * _medians_off(refined, stated, (steps.sigma_rad[rows], steps.sigma_m[rows]))
-    worse /= _MEDIAN_NORM
+    worse = (worse / _MEDIAN_NORM).tolist()
     # Keyframes of before they were known to be precise are worse than they.
-    times = np.where(np.array(shares) < 1.0, 1.0, np.clip(worse, 1.0, config.max_inflation))
+    most = config.max_inflation
+    times = [1.0 if share < 1.0 else min(max(off, 1.0), most) for share, off in zip(shares, worse, strict=True)]
     # Where many see how well the front-end turns, few are not to know better.
     weak = ~(many[steps.first] & many[steps.first + 1]) & (shares[0] == 1.0)
-    turns = np.where(weak, np.clip(worse[0], _LEAST_SHARE, config.max_inflation), times[0])
+    turns = np.where(weak, min(max(worse[0], _LEAST_SHARE), most), times[0])
     return changed(steps, sigma_rad=turns * steps.sigma_rad, sigma_m=times[1] * steps.sigma_m)
 
 
@@ -236,8 +237,8 @@ def _travelled(
         steps = geometry.steps_between(table.input_rotation, table.input_position, order[at], order[at + 1])
     rotation, translation = steps
     cosine = 0.5 * (rotation[:, 0, 0] + rotation[:, 1, 1] + rotation[:, 2, 2] - 1.0)
-    turn = np.arccos(np.clip(cosine, -1.0, 1.0))
-    length = np.sqrt(np.sum(translation * translation, axis=1))
+    turn = np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
+    length = np.sqrt(np.add.reduce(translation * translation, axis=1))
     if factor is None:
         return length, turn
     return np.bincount(factor, length, len(place)).astype(float), np.bincount(factor, turn, len(place)).astype(float)

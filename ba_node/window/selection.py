@@ -78,6 +78,12 @@ class Selection:
         """Return the problem with all observations, those that are left out too."""
         return changed(self.problem, observations=self.observations)
 
+    def taking_part(self, scene: Scene) -> IntArray:
+        """Return the keyframes of the window and of the problem, oldest first."""
+        if (scene.numbers(self.window, self.keyframes) >= 0).all():  # as of most windows
+            return self.keyframes
+        return scene.by_time(scene.distinct(np.concatenate([self.window, self.keyframes])))
+
     def explained(self, state: State, kernels: str) -> trial.Explained:
         """Return how well the front-end's poses and those of a solution explain the tracks that they are tried on."""
         tracks = self.tried, int(np.count_nonzero(self.held_out))

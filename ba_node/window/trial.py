@@ -70,10 +70,10 @@ class Explained:
     parallax_rad: float  # median over the tracks of the largest angle between two rays, by the second set of poses
     points: FloatArray  # (n_out, 3) those that took no part, by the second set of poses, m
 
-    def worse(self, share: float) -> IntArray:
+    def worse(self, share: float) -> list[int]:
         """Return which residuals the second set raises by more than a share: 0 for all cameras, 1 + camera."""
-        with np.errstate(invalid="ignore"):
-            return np.flatnonzero(self.mean[1] > (1.0 + share) * self.mean[0] + _SLACK)
+        before, after = self.mean.tolist()
+        return [k for k, mean in enumerate(after) if mean > (1.0 + share) * before[k] + _SLACK]
 
 
 # Rotation (n_kf, 3, 3) and translation (n_kf, 3) m of body from world.

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import Counter
 from typing import Any
@@ -69,13 +70,18 @@ class Publishing(Component):
         self._told: Outcome | None = None
         self._behind: set[str] = set()
         self._outputs: dict[str, Any] = {}
+        # Who listens to poses, as far as it was told: to ask takes longer than to write the message.
+        self._listeners: dict[str, int] = {}
         for topic in OUTPUT_TYPES:
             matched = self._catch_up if topic in LATCHED_OUTPUTS else None
+            if topic in _POSES:
+                matched = functools.partial(self._count, topic)
             self._outputs[topic] = self.publisher(TOPICS[topic], matched=matched)
 
     def take_poses(self, refinement: Refinement, arrived_s: float) -> None:
         """Publish the poses of a solve, and note how old they are then."""
-        wanted = {topic for topic in _POSES if self._outputs[topic].get_subscription_count()}
+        told = self._listeners
+        wanted = {one for one in _POSES if (told[one] if one in told else self._outputs[one].get_subscription_count())}
         for topic, message in pose_outputs(refinement, wanted):
             self._outputs[topic].publish(message)
         arrival, stamp = self._ages
@@ -102,6 +108,9 @@ class Publishing(Component):
 
     def _heard(self) -> set[str]:
         return {topic for topic, publisher in self._outputs.items() if publisher.get_subscription_count()}
+
+    def _count(self, topic: str, status: Any) -> None:
+        self._listeners[topic] = status.current_count
 
     def _catch_up(self, _status: object) -> None:
         """Give those who come late what they missed."""

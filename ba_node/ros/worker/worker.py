@@ -90,6 +90,7 @@ class Worker:
         self._notify, self._leave = notify, leave
         self._clock = clock
         self._outputs: deque[Output] = deque(maxlen=_MAX_OUTPUTS)
+        self._done: deque[Command] = deque()  # what takes in work that was done elsewhere
         self._budget = Budget(clock)
         self._keyframes = KeyframeAccounts()
         self._arrivals = ClockWatch()
@@ -132,14 +133,22 @@ class Worker:
 
     def check_elsewhere(self, check: Check) -> None:
         """Check a set-up on another thread; what is found comes back as a command."""
-        self._elsewhere("setup_check", check.run, lambda backend: backend.take_check(check))
+        self._elsewhere("setup_check", check.run, lambda: self._inbox.post(lambda backend: backend.take_check(check)))
 
     def work_elsewhere(self, work: Work) -> None:
-        """Do what takes long likewise."""
-        self._elsewhere("work", work.run, lambda backend: backend.take_work(work))
+        """Do what takes long likewise; what came of it is taken in after the next solve, or in a silence.
 
-    def _elsewhere(self, name: str, work: Callable[[], object], then: Command) -> None:
-        """Do something on a thread of its own, between solves, and then something on the solver's."""
+        It may take as long as two solves, and a keyframe that came meanwhile would wait for it.
+        """
+
+        def done() -> None:
+            self._done.append(lambda backend: backend.take_work(work))
+            self._inbox.post(lambda _: None)
+
+        self._elsewhere("work", work.run, done)
+
+    def _elsewhere(self, name: str, work: Callable[[], object], then: Callable[[], None]) -> None:
+        """Do something on a thread of its own, between solves, and then something else."""
         began_s, waited_s = self._clock(), 0.0
 
         def give_way(frame: FrameType, *_: object) -> None:
@@ -161,7 +170,7 @@ class Worker:
 
         def run() -> None:
             self._guard(between_solves)
-            self._inbox.post(then)
+            then()
 
         # Not a daemon: Python must not end while the kernels run.
         threading.Thread(target=run, name=name, daemon=False).start()
@@ -200,17 +209,16 @@ class Worker:
         if self._settled:
             self._guard(self._backend.flush)
         self._behind = False
-        if self._backend.ready:
+        if solves := self._backend.ready:
             self._guard(self._solve)
+        while self._done and (solves or self._settled):
+            self._guard(self._command, self._done.popleft())
         self._log_rejections()
         self._guard(self._report_rejections)
 
     def _take(self, arrival: Arrival) -> None:
         if callable(arrival.content):
-            estimate, now_s = arrival.content(self._backend), self._clock()
-            if estimate is not None and not self._inbox.closed:
-                self._poses_leave(now_s, estimate.refinement)
-                self._put(self._finished(estimate, now_s, now_s))
+            self._command(arrival.content)
             return
         content, backend = arrival.content, self._backend
         backend.refused.clear()
@@ -224,6 +232,12 @@ class Worker:
                 self._keyframes.rejected += 1
             else:
                 self._keyframes.refuse(one.session_id, one.keyframe_id)
+
+    def _command(self, command: Command) -> None:
+        estimate, now_s = command(self._backend), self._clock()
+        if estimate is not None and not self._inbox.closed:
+            self._poses_leave(now_s, estimate.refinement)
+            self._put(self._finished(estimate, now_s, now_s))
 
     def _solve(self) -> None:
         start_s = self._clock()

@@ -165,6 +165,21 @@ def test_a_check_gives_way_to_solves_wherever_it_is(solves_end: bool, monkeypatc
         assert rig.worker.stop()
 
 
+@pytest.mark.parametrize("silent", [False, True])
+def test_what_was_worked_out_beside_solves_is_taken_in_after_the_next_or_in_a_silence(silent: bool) -> None:
+    """It may take as long as two solves: a keyframe that comes meanwhile would wait."""
+    rig, done = Rig(), list[str]()
+    rig.backend.while_solving = lambda _: done.append("solved")
+    rig.backend.take_work = lambda _: done.append("taken")  # type: ignore[attr-defined]
+    rig.worker.work_elsewhere(SimpleNamespace(run=lambda: None))  # type: ignore[arg-type]
+    rig.worker.step(rig.inbox.drain(10.0))
+    assert done == []
+    if not silent:
+        rig.keyframe(1)
+    rig.step()
+    assert done == ["solved", "taken"][silent:]
+
+
 def test_a_solve_does_not_wait_for_an_import_of_what_gives_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever imports a module keeps others from it."""
     monkeypatch.setattr(worker, "_GIVES_WAY_S", 60.0)

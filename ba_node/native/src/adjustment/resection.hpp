@@ -101,14 +101,19 @@ PoseSums pose_sums(const ProblemView& p, const double* pose, const double* point
   return out;
 }
 
-// pose: (3, 3) and (3,) of the keyframe, body from world; false if it stays where it is.
+// pose: (3, 3) and (3,) of the keyframe, body from world; alone: which points it alone sees, (n_pt,). False if it stays
+// where it is.
 inline bool resect(const ProblemView& p, const StateView& start, std::int64_t keyframe, const CostModel& cost,
-                   const ResectionLimits& limits, double* pose) {
+                   const ResectionLimits& limits, double* pose, bool* alone) {
   std::vector<char> known(p.n_points);
   for (std::int64_t o = 0; o < p.n_obs; ++o) known[p.point[o]] |= p.keyframe[o] != keyframe;
+  std::fill_n(alone, p.n_points, false);
   std::vector<std::int64_t> rows;
-  for (std::int64_t o = 0; o < p.n_obs; ++o)
-    if (p.keyframe[o] == keyframe && known[p.point[o]]) rows.push_back(o);
+  for (std::int64_t o = 0; o < p.n_obs; ++o) {
+    if (p.keyframe[o] != keyframe) continue;
+    if (known[p.point[o]]) rows.push_back(o);
+    alone[p.point[o]] = !known[p.point[o]];
+  }
   if (static_cast<std::int64_t>(rows.size()) < limits.least) return false;
   double at[12], best[12];
   std::copy_n(start.rotation + 9 * keyframe, 9, at);

@@ -83,13 +83,15 @@ py::object resect(const py::object& problem, std::int64_t keyframe, const std::p
   model.loss = loss_named(cost.first);
   model.scale = cost.second;
   double pose[12];
-  if (!target->resect(arrays.view(), arrays.start.view(), keyframe, model, {least, iterations, least_gain, damping},
-                      pose))
+  const ProblemView view = arrays.view();
+  Array<bool> alone({static_cast<py::ssize_t>(view.n_points)});
+  if (!target->resect(view, arrays.start.view(), keyframe, model, {least, iterations, least_gain, damping}, pose,
+                      alone.mutable_data()))
     return py::none();
   Doubles rotation = empty({3, 3}), translation = empty({3});
   std::copy_n(pose, 9, rotation.mutable_data());
   std::copy_n(pose + 9, 3, translation.mutable_data());
-  return py::make_tuple(rotation, translation);
+  return py::make_tuple(rotation, translation, alone);
 }
 
 py::tuple triangulate(const py::object& rays, py::ssize_t n_points) {

@@ -113,7 +113,7 @@ struct Target {
   RelativePoseFactors* (*make_relative_poses)(const RelativePosesView&);
   void (*residual_norms)(const ProblemView&, const StateView&, double* out);
   bool (*resect)(const ProblemView&, const StateView& start, std::int64_t keyframe, const CostModel&,
-                 const ResectionLimits&, double* pose);
+                 const ResectionLimits&, double* pose, bool* alone);
   void (*triangulate)(const RaysView&, std::int64_t n_points, double* points, double* parallax, bool* measured);
   void (*agreeing)(const RaysView&, std::int64_t n_points, double gate, bool* agrees);
   void (*consensus)(const RaysView&, std::int64_t n_points, double gate, double* points, double* parallax,
