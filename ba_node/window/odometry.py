@@ -64,8 +64,6 @@ _FAR_WORSE = 8.0
 _TELLING, _NEARLY_ALL = 10.0, 0.9
 # Steps tell how far others err aside if the cosine of the angle between refined and given is larger, and lengths alike.
 _ALIKE = 0.85
-# A body's path leaves every plane by more than this share of its extent.
-_FLAT = 1e-6
 # Turns are not taken for more precise than this share of what is stated.
 _LEAST_SHARE = 0.2
 # What refined steps are off by counts so many times where keyframes see little.
@@ -184,14 +182,8 @@ def _as_long(scene: Scene, keyframes: IntArray, many: BoolArray, steps: Steps, s
     if len(cosine) < _LEAST_STEPS:
         return steps
     aside = float(np.mean(1.0 - cosine**2) - 2.0 * np.var(along / np.mean(along), ddof=1))
-    power = 1.0 if _planar(table.input_position[keyframes]) else 0.5
+    power = 1.0 if geometry.is_planar(table.input_position[keyframes]) else 0.5
     return changed(steps, translation=steps.translation * (1.0 - max(aside, 0.0)) ** -power)
-
-
-def _planar(position: FloatArray) -> bool:
-    """Return True if positions (n, 3) m lie in a plane, as those of a front-end that leaves out all else."""
-    extent = np.linalg.svd(position - position[0], compute_uv=False)
-    return bool(extent[2] < _FLAT * extent[0])
 
 
 def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> Steps:
