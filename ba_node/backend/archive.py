@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.config import SceneConfig
+from ba_node.backend.current_map import Completion, CurrentMap
+from ba_node.config import Config, SceneConfig
 from ba_node.estimate import SolveReport, Status, Transform
 from ba_node.scene import snapshot
 from ba_node.scene.map_content import MapContent, require, require_all, require_rotations, within
@@ -43,6 +44,18 @@ class MapState:
             "landmarks": len(scene.landmarks),
             "observations": len(scene.observations),
         }
+
+
+def map_of(known: MapState, config: Config, index: int) -> CurrentMap:
+    """Return the map with a number that goes on from all that a back-end knew."""
+    scene, newest = known.scene, None
+    scene.config = config.scene
+    if known.current is not None:
+        newest = int(scene.keyframes.keyframe_id[known.current])
+    made = CurrentMap(config, scene, index)
+    made.report, made.correction = known.report, known.correction
+    made.completion = Completion(newest, known.settled, known.delivered)
+    return made
 
 
 def pack(known: MapState) -> MapContent:

@@ -30,9 +30,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
 from ba_node.backend import archive
-from ba_node.backend.current_map import Completion, CurrentMap
+from ba_node.backend.current_map import CurrentMap
 from ba_node.backend.summary import MapEnded
-from ba_node.backend.worse import amiss, wrong_at_the_end
+from ba_node.backend.worse import amiss, keep_lengths, wrong_at_the_end
 from ba_node.check.departure import deviates
 from ba_node.check.watch import Check, SetUpWatch
 from ba_node.config import Config
@@ -103,8 +103,7 @@ class Backend:
 
     def configure(self, config: Config) -> None:
         """Take new parameters, from the next solve and the next measurement on."""
-        self.map.config = config
-        self.scene.config = config.scene
+        self.map.config, self.scene.config = config, config.scene
 
     @property
     def held(self) -> list[Keyframe]:
@@ -244,9 +243,8 @@ class Backend:
     def replay(self, stream: Iterable[Measurement]) -> Iterator[Estimate | Keyframe | MapEnded]:
         """Take in a stream to its end, with a solve for every keyframe, just before the next one begins.
 
-        Yields:
-            Every estimate; every keyframe that the map has now, as it came; and what became of a map when another one
-            took its place, before the first keyframe of that.
+        Yields every estimate; every keyframe that the map has now, as it came; and what became of a map when another
+        one took its place, before the first keyframe of that.
         """
         for measurement in stream:
             for admitted in self.admit(measurement):
@@ -257,15 +255,15 @@ class Backend:
         while self.ready:
             if (estimate := self.solve()) is not None:
                 yield estimate
-        undone = self.take_check(wrong_at_the_end(self.scene, self.config))
-        if (last := undone if self.setup.reason(self.scene) else self.adjust(final=True)) is not None:
+        changed = self._ended()
+        if (last := changed if self.setup.reason(self.scene) else self.adjust(final=True) or changed) is not None:
             yield last
 
     def _taken(self, admitted: Admitted) -> Iterator[Estimate | Keyframe | MapEnded]:
         if self.completes(admitted) and (estimate := self.solve()) is not None:
             yield estimate
-        if admitted.begins is not None and (undone := self.take_check(wrong_at_the_end(self.scene, self.config))):
-            yield undone
+        if admitted.begins is not None and (changed := self._ended()):
+            yield changed
         before = self.map
         self.take(admitted)
         if self.map is not before:
@@ -273,6 +271,14 @@ class Backend:
         one = admitted.measurement
         if isinstance(one, Keyframe) and self.scene.find_keyframe(one.keyframe_id) is not None:
             yield one
+
+    def _ended(self) -> Estimate | None:
+        """Ask what is wrong with a map to which no more comes; return what is known now if that changes it."""
+        undone = self.take_check(wrong_at_the_end(self.scene, self.config))
+        if undone is None and keep_lengths(self.scene, self.config):
+            self.map.correct(int(self.scene.order[-1]))
+            return self.estimate()
+        return undone
 
     def take_check(self, check: Check | None) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
@@ -312,10 +318,8 @@ class Backend:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
 
         ``first`` is done to the map before, once it is known that the result is taken. ``grown``: the map has grown, no
-        more: nothing is said if it is not taken, and what shows at a map's end is not asked.
-
-        Returns:
-            What is known now, and how many later keyframes followed; None if the result is of no use or of another map.
+        more: nothing is said if it is not taken, and what shows at a map's end is not asked. Returns what is known now,
+        and how many later keyframes followed; None if the result is of no use or of another map.
         """
         taken, result, self.refusal = optimization, optimization.result, ""
         if not result.status.usable or not result.state.is_finite():
@@ -340,8 +344,8 @@ class Backend:
         statistics = quality.statistics(taken.selection, result, found.norms) | verdict.health
         self.map.report = dataclasses.replace(self.map.base_report(self.solve_count, newest), **statistics)
         self.map.correct(newest)
-        undone = None if grown else self.take_check(wrong_at_the_end(self.scene, self.config))
-        return undone or self.map.with_covariances(self.estimate(), taken), followed
+        now = (None if grown else self._ended()) or self.estimate()
+        return now if self.setup.reason(self.scene) else self.map.with_covariances(now, taken), followed
 
     def reset(self) -> None:
         """Forget everything but the cameras and the count of solves: the next keyframe begins a map, in any session."""
@@ -361,13 +365,9 @@ class Backend:
 
         Keyframes of the same session are taken in from there on; a higher session begins a new map, as always.
         """
-        known.scene.config = self.config.scene
-        self.map = CurrentMap(self.config, known.scene, self.map.index + 1)
-        self.map.report, self.map.correction = known.report, known.correction
+        self.map = archive.map_of(known, self.config, self.map.index + 1)
         self._earlier = joining.Earlier()
         self._sessions.reset(set(self.scene.keyframes.keyframe_id.tolist()))
-        newest = None if known.current is None else int(self.scene.keyframes.keyframe_id[known.current])
-        self.map.completion = Completion(newest, known.settled, known.delivered)
         self.solve_count = max(self.solve_count, known.solve_count)
 
     def _decided(self, decision: Decision, measurement: Measurement | None = None) -> tuple[Admitted, ...]:

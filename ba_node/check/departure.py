@@ -47,6 +47,8 @@ _FACTORS: Limits = ((1.015, 4.5), (1.012, 8.0))
 _AT_THE_END: Limits = ((1.012, 3.6),)
 # With as much the set-up may have changed: the newest keyframes are worth a look with all tests.
 _WORTH_A_LOOK: Limits = ((1.012, 2.4),)
+# Too little to say so, too much to trust lengths: one in 60 sound drives shows as much by chance.
+_HARDLY_CHANCE: Limits = ((1.004, 2.4),)
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
 # Student's distribution asks for.
 _FEW = 8.0
@@ -119,13 +121,10 @@ def _of_the_newest(scene: Scene, limits: Limits, *, look: bool = False) -> Findi
 
 def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
     """Return what is wrong if refined steps (n, 3) are longer or shorter than the given ones."""
-    along = refined + given
-    ratio = np.sum(refined * along, axis=1) / np.sum(given * along, axis=1)
-    mean, error = _trimmed_mean(np.log(ratio))
-    if not _differs(mean, error, len(given), limits):
+    factor = _factor(scene, refined, given, limits)
+    if factor == 1.0:
         return None
-    factor = float(np.exp(mean))
-    evidence = f"refined steps are {factor:.3g} times as long as the front-end's, over {len(ratio)} of them"
+    evidence = f"refined steps are {factor:.3g} times as long as the front-end's, over {len(given)} of them"
     if _measures_depths(scene):
         by, ours = "depth_m tells", f"scale of depth_m: it is {factor:.3g} times what the front-end's steps tell"
         change = "the factor from depth images to depth_m in the feature_tracks"
@@ -136,6 +135,28 @@ def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: L
     steps = f"scale of the front-end's steps: they are {1.0 / factor:.3g} times what {by}"
     changes = (change, "the position in the keyframes, expected metres")
     return Finding((ours, steps), evidence, changes)
+
+
+def _factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> float:
+    """Return by what factor refined steps (n, 3) are longer than the given ones; 1 where that may be chance."""
+    # Where the front-end moves in a plane it has of a step what lies along its own.
+    along = given if geometry.is_planar(scene.keyframes.input_position) else refined + given
+    ratio = np.sum(refined * along, axis=1) / np.sum(given * along, axis=1)
+    mean, error = _trimmed_mean(np.log(ratio))
+    return float(np.exp(mean)) if _differs(mean, error, len(given), limits) else 1.0
+
+
+def doubtful_factor(scene: Scene) -> float:
+    """Return by what factor refined steps of a young map are longer than the front-end's where that is hardly chance.
+
+    It is 1 elsewhere, and where lengths are told by more than the two.
+    """
+    known = scene.constraints
+    alone = not (known.absolute or known.landmarks or known.relative)
+    if not (alone and _STEPS < len(scene.keyframes) <= _YOUNG and _has_scale(scene)):
+        return 1.0
+    refined, given = _steps(scene)
+    return _factor(scene, refined, given, _HARDLY_CHANCE) if len(refined) >= _STEPS else 1.0
 
 
 def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:

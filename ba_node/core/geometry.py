@@ -18,6 +18,8 @@ from ba_node.arrays import FloatArray, IntArray
 _SMALL = 1e-4
 # What rounding leaves of R'R - I, and much more: its square is below rounding.
 _ROUNDED = 1e-8
+# A path leaves every plane by more than this share of its extent.
+_FLAT = 1e-6
 
 
 def hat(v: FloatArray) -> FloatArray:
@@ -187,3 +189,9 @@ def steps_between(
     back = np.swapaxes(rotation[first], 1, 2)
     moved = (position[second] - position[first])[:, :, None]
     return back @ rotation[second], (back @ moved)[..., 0]
+
+
+def is_planar(position: FloatArray) -> bool:
+    """Return True if positions (n, 3) m lie in a plane, as those of odometry that leaves out all else; no body's do."""
+    extent = np.linalg.svd(position - position[:1], compute_uv=False)
+    return len(extent) < 3 or bool(extent[2] <= _FLAT * extent[0])

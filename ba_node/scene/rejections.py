@@ -54,6 +54,7 @@ NOTICES: dict[str, str] = {
     "empty_tracks": "A tracks message without rows.",
     "frame_name": "A keyframe whose frame_id is empty or begins with a slash.",
     "not_refined": "A solve of everything, as the map has grown, that was not taken: what windows found stays.",
+    "lengths_kept": "A map made as long as the front-end has it, where cameras or depths tell a little more or less.",
     "redundant": "A keyframe that was taken out of the map as others see its points (scene.redundant_share).",
     "apart": "A session before that no tracks connect with the last one, where scene.join_sessions asks for one map.",
 }

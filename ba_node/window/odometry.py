@@ -26,6 +26,13 @@ much: nothing but the steps tells there what moves.
 Where much of what is seen moves, refined steps may follow it and tell nothing; there the standard deviations are those
 stated, and the loss is the widest too, but where depths are measured. Rotation and translation have a loss each, so
 that a wrong one does not release the other.
+
+Where images tell no lengths, steps v that err aside shorten the map: its steps u, of which images tell the direction,
+fit them best at ``s = u.v / |u|^2 = |v| cos(u, v) / |u|``. Noise alike in all directions makes v longer by as much, but
+not what turns it: stamps beside those of the images, a camera that is turned on the body. So with c the cosines, ``a =
+mean(1 - c^2) - 2 var(|v| c / |u|)`` is what steps err more aside than noise along them explains, and they are made
+longer by ``1 / sqrt(1 - a)``. Where a front-end moves in a plane its steps are those of the body less what leads out of
+it, c times as long as well, and the factor is ``1 / (1 - a)``.
 """
 
 from __future__ import annotations
@@ -55,6 +62,8 @@ MANY_OBSERVATIONS = 50
 _FAR_WORSE = 8.0
 # Steps of so many standard deviations tell a length; so large a share of them is nearly all.
 _TELLING, _NEARLY_ALL = 10.0, 0.9
+# Steps tell how far others err aside if the cosine of the angle between refined and given is larger, and lengths alike.
+_ALIKE = 0.85
 # Turns are not taken for more precise than this share of what is stated.
 _LEAST_SHARE = 0.2
 # What refined steps are off by counts so many times where keyframes see little.
@@ -124,6 +133,8 @@ def factors(
         learned_from.append((np.ones(len(many), bool), _HALF_SEEN))
     inflated = None if much_moves else _as_learned(scene, config, keyframes, learned_from, stated)
     steps = stated if inflated is None else inflated
+    if not problem.has_scale:
+        steps = _as_long(scene, keyframes, many, steps, stated.sigma_m)
     if turned is not None:
         rotation, sigma_rad = turned.between(keyframes, first, first + 1)
         known = ~np.isnan(sigma_rad)
@@ -152,6 +163,27 @@ def _front_end(scene: Scene, config: OdometryConfig, keyframes: IntArray, first:
         np.maximum(sigma_rad, _SMALLEST_SIGMA),
         np.maximum(sigma_m, _SMALLEST_SIGMA),
     )
+
+
+def _as_long(scene: Scene, keyframes: IntArray, many: BoolArray, steps: Steps, stated_m: FloatArray) -> Steps:
+    """Return steps made longer by the inverse cosine of the usual angle by which they err aside, see above.
+
+    Told by keyframes that see ``many`` points, and by steps that are long for ``stated_m`` (n,), their deviations.
+    """
+    table, pairs = scene.keyframes, (steps.first, steps.first + 1)
+    sure = many & table.refined[keyframes]
+    _, refined = geometry.steps_between(table.rotation, table.position, *(keyframes[end] for end in pairs))
+    length, given = (np.sqrt(np.sum(moves**2, axis=1)) for moves in (refined, steps.translation))
+    told = sure[pairs[0]] & sure[pairs[1]] & (np.minimum(length, given) > _TELLING * stated_m)
+    cosine = np.sum(refined * steps.translation, axis=1)[told] / (length * given)[told]
+    ratio = (given / np.maximum(length, 1e-12))[told]
+    alike = (cosine > _ALIKE) & (np.abs(np.log(ratio)) < 1.0 - _ALIKE)
+    cosine, along = cosine[alike], (cosine * ratio)[alike]
+    if len(cosine) < _LEAST_STEPS:
+        return steps
+    aside = float(np.mean(1.0 - cosine**2) - 2.0 * np.var(along / np.mean(along), ddof=1))
+    power = 1.0 if geometry.is_planar(table.input_position[keyframes]) else 0.5
+    return changed(steps, translation=steps.translation * (1.0 - max(aside, 0.0)) ** -power)
 
 
 def stated(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> Steps:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ba_node.backend import Backend
-from ba_node.backend.worse import explains_worse
+from ba_node.backend.worse import explains_worse, keep_lengths
 from ba_node.config import Config
 from ba_node.estimate import Estimate
+from ba_node.evaluation.metrics import absolute_error
 from experiments.robustness.faults import SOUND, spoiled
 
 
@@ -53,3 +54,41 @@ def test_mismatches_that_nothing_bounds_are_said(share: float, settings: dict[st
         pass
     assert backend.solve_count
     assert any("nothing bounds how far each draws the map" in line for line in backend.report.warnings) == said
+
+
+@pytest.mark.parametrize("rig", ["stereo", "rgbd"])
+def test_lengths_that_are_doubted_are_those_of_the_front_end(rig: str) -> None:
+    """The map keeps its shape; what follows from its last pose follows."""
+    recording = spoiled(SOUND, rig, seed=12, keyframes=30, length_m=15.0)
+    backend = Backend(Config())
+    for _ in backend.replay(iter(recording.measurements)):
+        pass
+    scene, config = backend.scene, backend.config
+    assert not keep_lengths(scene, config), "the map is sound"
+    table = scene.keyframes
+    table.input_rotation[:], table.input_position[:] = table.rotation, table.position.copy()
+    noise = np.random.default_rng(3).normal(size=table.position.shape)
+    table.input_position[:] = table.position / 1.008 + 0.002 * noise
+    before, points = table.position.copy(), scene.landmarks.position.copy()
+    assert keep_lengths(scene, config) and scene.log.notices["lengths_kept"] == 1
+    first, last = scene.order[[0, -1]]
+    ratio = np.linalg.norm(before[last] - before[first]) / np.linalg.norm(table.position[last] - table.position[first])
+    assert ratio == pytest.approx(1.008, abs=0.002)
+    placed = scene.landmarks.has_position
+    np.testing.assert_allclose(
+        points[placed] - before[first], ratio * (scene.landmarks.position[placed] - before[first])
+    )
+    assert not keep_lengths(scene, config), "once is enough"
+
+
+@pytest.mark.slow
+def test_a_baseline_off_by_little_that_is_not_told_does_no_harm() -> None:
+    recording = spoiled("baseline_off", "stereo", 0.98, 100)
+    backend = Backend(Config())
+    for _ in backend.replay(iter(recording.measurements)):
+        pass
+    came, found = (
+        absolute_error(poses, recording.truth, "se3").translation.rmse
+        for poses in (recording.odometry, backend.estimate().trajectory)
+    )
+    assert found < came, f"{came:.4f} -> {found:.4f} m"

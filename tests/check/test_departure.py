@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from ba_node.check.departure import departed
+from ba_node.check.departure import departed, doubtful_factor
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.scene.scene import Scene
@@ -103,6 +103,29 @@ def test_less_is_enough_at_the_end_alone() -> None:
             at_the_end += 1
         assert departed(refined(data, 1.0, seed=seed), final=True) is None, f"seed {seed}"
     assert before + 3 <= at_the_end, f"{before} of 20 before the end, {at_the_end} there"
+
+
+def test_a_factor_that_is_hardly_chance_is_doubtful() -> None:
+    data = recording(path="line")
+    for noise_m, factor, doubted in ((0.005, 1.009, True), (0.005, 0.991, True), (STEP_NOISE_M, 1.004, False)):
+        scene = refined(data, factor, noise_m=noise_m)
+        assert departed(scene, final=True) is None
+        expected = pytest.approx(factor, abs=0.003) if doubted else 1.0
+        assert doubtful_factor(scene) == expected, f"factor {factor}, noise {noise_m} m"
+
+
+def test_steps_of_odometry_in_a_plane_are_compared_in_it() -> None:
+    """A body that goes up and down moves by some percent more than its odometry in the plane has."""
+    scene = refined(recording(path="line"), 1.0, noise_m=0.001)
+    table = scene.keyframes
+    table.input_position[:, 2] = 1.0
+    table.input_rotation[:] = np.eye(3)
+    table.position[:] = table.input_position
+    table.rotation[:] = table.input_rotation
+    table.position[scene.order, 2] += 0.15 * (np.arange(len(table)) % 2)
+    assert doubtful_factor(scene) == 1.0
+    table.input_position[:, 2] += 1e-4 * np.random.default_rng(1).normal(size=len(table))
+    assert doubtful_factor(scene) > 1.004, "not in a plane"
 
 
 def test_less_aside_is_doubted_at_the_end() -> None:

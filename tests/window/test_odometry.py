@@ -25,6 +25,7 @@ from experiments.robustness.faults.recording import rows_of
 from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
 GOOD = {"drift_rotation_deg": 0.2, "drift_translation": 0.01}
+PRECISE = {"drift_rotation_deg": 0.02, "drift_translation": 0.002}
 ON = Config()
 OFF = ON.with_values({"odometry.enabled": False})
 
@@ -235,3 +236,35 @@ def test_a_turn_on_the_spot_past_a_bare_wall_is_no_worse_than_it_came(seed: int)
         absolute_error(poses, recording.truth, "none").rotation.rmse for poses in (recording.odometry, refined)
     )
     assert after < 0.8 * before, (before, after)
+
+
+def test_steps_that_err_aside_count_as_long_as_they_are() -> None:
+    """Turned by an angle against the map's steps they are along these by its cosine shorter."""
+    scene, selection = selected(made(baseline_m=0.0, drift_rotation_deg=0.0, drift_translation=0.0))
+    table = scene.keyframes
+    table.refined[:] = True
+    turn = geometry.so3_exp(np.array([0.0, 0.0, 0.2]))
+    table.input_rotation[:] = table.input_rotation @ turn
+    _, move = odometry.factors(scene, ON.odometry, selection.problem, selection.keyframes)
+    assert isinstance(move, RelativePoses)
+    pairs = selection.keyframes[move.keyframes.T]
+    _, steps = geometry.steps_between(table.rotation, table.position, *pairs)
+    along = np.sum(move.translation * steps, axis=1) / np.sum(steps * steps, axis=1)
+    assert float(np.median(along)) == pytest.approx(1.0, abs=0.002), along
+
+
+def test_a_front_end_that_moves_in_a_plane_does_not_shorten_the_map_of_one_camera() -> None:
+    """Of steps that lead up and down it has what is level alone; the map's would be shorter by 1.2 %."""
+    data = made(keyframes=40, length_m=20.0, baseline_m=0.0, landmarks=2500, tracks=150, **PRECISE)
+    stream: list[Measurement] = []
+    for _, _, one in data.timeline():
+        if not isinstance(one, Keyframe):
+            stream.append(one)
+            continue
+        turn = geometry.matrix_from_quaternion(one.orientation)
+        turn = geometry.so3_exp(np.array([0.0, 0.0, np.arctan2(turn[1, 0], turn[0, 0])]))
+        level, orientation = one.position * [1.0, 1.0, 0.0], geometry.quaternion_from_matrix(turn)
+        stream.append(dataclasses.replace(one, position=level, orientation=orientation))
+    refined = played(stream).estimate().trajectory
+    lengths = [float(np.linalg.norm(poses.position[-1] - poses.position[0])) for poses in (refined, data.truth)]
+    assert lengths[0] / lengths[1] == pytest.approx(1.0, abs=0.006)
