@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ba_node.check import change, ids, intrinsics, motion, mounting, onset, placement, relations, units
+from ba_node.check import change, ids, intrinsics, lengths, motion, mounting, onset, placement, relations, units
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
@@ -48,10 +48,10 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "silent": lambda: placement.check_silent(tracks),
         "cameras": lambda: placement.check_cameras(tracks, related),
         "poses": lambda: _poses(tracks, related()),
-        "depth": lambda: units.check_depth(tracks, related()),
+        "depth": lambda: lengths.check_depth(tracks, related()),
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
         "mounting": lambda: mounting.check_mounting(tracks, related()),
-        "lengths": lambda: units.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
+        "lengths": lambda: lengths.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
         "change": lambda: change.check_change(tracks),
     }
     for name, test in tests.items():
