@@ -30,7 +30,10 @@ import dataclasses
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
+from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, angle
+from ba_node.check.exposure import find_late
+from ba_node.check.tracks import tracks_of
 from ba_node.check.watch import NEWEST, Check
 from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
@@ -94,6 +97,9 @@ def departed(scene: Scene, *, final: bool = False, doubted: bool = False) -> Che
     if finding is None:
         return None
     found = Diagnosis([dataclasses.replace(finding, harmful=not doubted)])
+    tracks = tracks_of(scene) if found.harmful and two_view.available() else None
+    if tracks is not None:
+        found = find_late(tracks, found)
     return Check(scene, lambda: found, found)
 
 
