@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from experiments.robustness.faults import exposure, midway, motion, setup, stamps, tracks
+from experiments.robustness.faults import exposure, midway, motion, setup, stamps, surround, tracks
 from experiments.robustness.faults.fault import MONO, RGBD, STEREO, Fault
 
 _TWO = (STEREO,)
@@ -305,6 +305,14 @@ FAULTS: dict[str, Fault] = {
         amounts=(1000.0, 0.001),
         rigs=(RGBD, STEREO),
         named=("poses in (millimetres|kilometres)",),
+        codes=_LOOK,
+    ),
+    "focal_of_first": Fault(
+        "focal length of the first of three cameras, times",
+        surround.focal_of_first,
+        amounts=(1.2, 1.05),
+        rigs=_TWO,
+        named=("focal length of camera 0 off .* against those of cameras 1 and 2",),
         codes=_LOOK,
     ),
 }
