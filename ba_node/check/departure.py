@@ -30,7 +30,10 @@ import dataclasses
 import numpy as np
 
 from ba_node.arrays import FloatArray, IntArray
+from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, angle
+from ba_node.check.exposure import find_late
+from ba_node.check.tracks import tracks_of
 from ba_node.check.watch import NEWEST, Check
 from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
@@ -67,6 +70,11 @@ _LEAST_M = 0.02
 _STRETCH, _CARRIED = 12, 60.0
 # One standard deviation of a normal distribution, in median absolute deviations.
 _SPREAD = 1.4826
+# Cosines between where a camera looks and where it moves, from which on a focal length turns steps, and scales them.
+_ASIDE, _AHEAD = 0.95, 0.2
+# Part of a turn that may be out of the plane of these two, for a focal length to explain it.
+_IN_PLANE = 0.5
+_K = "k of camera_info in camera_rig"
 # Share of the usual step below which one tells nothing; share that is left out at either end of their ratios.
 _TELLING, _TRIMMED = 0.3, 0.1
 
@@ -96,6 +104,9 @@ def departed(scene: Scene, *, final: bool = False, doubted: bool = False) -> Che
     if finding is None:
         return None
     found = Diagnosis([dataclasses.replace(finding, harmful=not doubted)])
+    tracks = tracks_of(scene) if found.harmful and two_view.available() else None
+    if tracks is not None:
+        found = find_late(tracks, found)
     return Check(scene, lambda: found, found)
 
 
@@ -127,14 +138,18 @@ def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: L
     evidence = f"refined steps are {factor:.3g} times as long as the front-end's, over {len(given)} of them"
     if _measures_depths(scene):
         by, ours = "depth_m tells", f"scale of depth_m: it is {factor:.3g} times what the front-end's steps tell"
-        change = "the factor from depth images to depth_m in the feature_tracks"
+        causes = {ours: "the factor from depth images to depth_m in the feature_tracks"}
+        ahead = float(_seen(scene, along.mean(axis=0))[2])
+        if abs(ahead) < _ASIDE:
+            # It scales what lies across the axis alone.
+            causes[_focal(1.0 + (1.0 / factor - 1.0) / (1.0 - ahead**2))] = _K
     else:
         by = "the cameras tell"
         ours = f"scale of focal length or baseline: lengths are {factor:.3g} times what the front-end's steps tell"
-        change = "k in the camera_info, or body_from_camera, of the camera_rig"
+        causes = {ours: "k in the camera_info, or body_from_camera, of the camera_rig"}
     steps = f"scale of the front-end's steps: they are {1.0 / factor:.3g} times what {by}"
-    changes = (change, "the position in the keyframes, expected metres")
-    return Finding((ours, steps), evidence, changes)
+    causes[steps] = "the position in the keyframes, expected metres"
+    return Finding(tuple(causes), evidence, tuple(causes.values()))
 
 
 def _factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> float:
@@ -179,7 +194,25 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits)
         "roi in camera_info in camera_rig, or subtract its offset from the principal point in k",
         "body_from_camera in camera_rig (or tf_static), or the pose in the keyframes if it is not that of the body",
     )
+    way = given.mean(axis=0)
+    towards, aside = _seen(scene, way), _seen(scene, way + np.cross(turn, way))
+    if min(abs(towards[2]), abs(aside[2])) > _AHEAD and abs(towards[2]) < _ASIDE:
+        # A focal length turns the way in its plane with the axis.
+        flat, bent = towards[:2] / towards[2], aside[:2] / aside[2]
+        factor = float(flat @ flat / (bent @ flat))
+        if np.linalg.norm(bent - flat / factor) < _IN_PLANE * np.linalg.norm(bent - flat):
+            return Finding((_focal(factor), place, region), evidence, (_K, *changes[::-1]))
     return Finding((region, place), evidence, changes)
+
+
+def _seen(scene: Scene, move: FloatArray) -> FloatArray:
+    """Return the direction (3,) of a move in the body as camera 0 sees it."""
+    assert scene.cameras is not None
+    return np.asarray(scene.cameras.rotation[0] @ move / max(float(np.linalg.norm(move)), 1e-12))
+
+
+def _focal(factor: float) -> str:
+    return f"focal length off by a factor of about {factor:.2f}"
 
 
 def _carried(scene: Scene) -> Finding | None:

@@ -5,17 +5,32 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
 
-from ba_node.check import change, ids, intrinsics, motion, mounting, onset, placement, relations, units
+from ba_node.check import (
+    change,
+    exposure,
+    ids,
+    intrinsics,
+    lengths,
+    motion,
+    mounting,
+    onset,
+    placement,
+    relations,
+    units,
+)
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import Relation
 from ba_node.check.tracks import Tracks
 
 _RELATIONS = frozenset({"cameras", "poses"})
 _BUILD_ON_THESE = ("intrinsics", "mounting", "lengths")
+# What a camera that is exposed later seems to be.
+_OF_CAMERAS = ("cameras", "intrinsics", "mounting", "lengths")
 # Sizes of the image whose losses differ by no more than this factor are both named.
 _ALIKE = 1.1
 # Part of the loss as given that another size may leave where the poses alone do not tell.
@@ -48,10 +63,10 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         "silent": lambda: placement.check_silent(tracks),
         "cameras": lambda: placement.check_cameras(tracks, related),
         "poses": lambda: _poses(tracks, related()),
-        "depth": lambda: units.check_depth(tracks, related()),
+        "depth": lambda: lengths.check_depth(tracks, related()),
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
         "mounting": lambda: mounting.check_mounting(tracks, related()),
-        "lengths": lambda: units.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
+        "lengths": lambda: lengths.check_lengths(tracks, related(), "intrinsics" in told | outcome.told),
         "change": lambda: change.check_change(tracks),
     }
     for name, test in tests.items():
@@ -61,6 +76,9 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
             outcome.untold.append(f"{name}: not before cameras and poses are known to fit")
             continue
         found = run(test, name)
+        if name == "cameras" or (found.harmful and name in _OF_CAMERAS):
+            late = run(functools.partial(exposure.find_late, tracks, found), "exposure")
+            found = late if late.findings else found
         outcome.add(found)
         if not found.untold:
             outcome.told |= {name}

@@ -37,6 +37,8 @@ _APART, _MOST = 0.25, 0.7
 _SPREAD, _OF_MEDIAN, _FLOOR = 1.4826, 1.25, 0.001
 # An offset is wrong from so many m, standard errors and that share of depth between the nearest and farthest class on.
 _OFFSET_M, _ERRORS, _TILT = 0.03, 4.5, 0.005
+# A smaller one may be of a focal length that bends the way.
+_OF_INTRINSICS_M = 0.06
 # Medians that scatter by such a share about what an offset leaves are wrong, if that is so many standard errors.
 _BENT, _BENT_ERRORS = 0.01, 4.0
 # Keyframes at which it is asked, up to which a map is young, and from which on it is asked at once: with fewer, poses
@@ -97,8 +99,12 @@ def wrong_with(profile: Profile) -> Finding | None:
     cause = f"depth_m is off by about {offset:+.2f} m at all distances"
     (first, last), (near_m, far_m) = profile.ratio[[0, -1]] / scale, profile.distance[[0, -1]]
     evidence = f"{first:.3f} times as much at {near_m:.1f} m and {last:.3f} at {far_m:.1f} m {evidence}"
-    change = "depth_m in the feature_tracks, expected from the centre of the camera (its lens) along the optical axis"
-    return Finding((cause,), evidence, (change,))
+    causes = {
+        cause: "depth_m in the feature_tracks, expected from the centre of the camera (its lens) along the optical axis"
+    }
+    if abs(offset) < _OF_INTRINSICS_M:
+        causes["focal length or principal point off by a few percent"] = "k of camera_info in camera_rig"
+    return Finding(tuple(causes), evidence, tuple(causes.values()))
 
 
 def profile_of(scene: Scene) -> Profile | None:

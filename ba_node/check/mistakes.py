@@ -174,7 +174,7 @@ def in_place_of(other: int) -> Mistake:
 
 
 # Mistakes that show as a camera moves, beside those of pixels.
-IN_MOTION = (
+_IN_MOTION = (
     Mistake(
         "poses inverted: they hold body-from-world, expected world-from-body",
         f"{_POSES}: send the inverse",
@@ -209,11 +209,30 @@ IN_MOTION = (
         f"{_POSES}, or {_EXTRINSICS}",
         _poses(_turned(_OPTICAL)),
     ),
-    Mistake("positions of body_from_camera in millimetres", f"{_EXTRINSICS}, expected metres", _scaled(0.001)),
-    Mistake("positions of body_from_camera in centimetres", f"{_EXTRINSICS}, expected metres", _scaled(0.01)),
     Mistake("quaternions of the poses with w first", _POSES, _poses(_w_first)),
     _RIG_W_FIRST,
 )
+# Cameras that swing about a body that hardly moves: how far they are from it tells which of the two lengths is wrong.
+_LARGE_RIG = tuple(
+    Mistake(f"positions of body_from_camera in {unit}", f"{_EXTRINSICS}, expected metres", _scaled(factor))
+    for unit, factor in (("millimetres", 0.001), ("centimetres", 0.01))
+)
+_SMALL_STEPS = (
+    Mistake(
+        "positions of the poses in kilometres, or in another unit far larger than metres",
+        "the position in the keyframes, expected metres",
+        _poses(lambda poses: (poses[0], 1000.0 * poses[1])),
+    ),
+)
+# Rigs that are no larger are not given in too small a unit, larger ones are no rigs, m.
+_SMALLEST_M, _LARGEST_M = 2.0, 10.0
+
+
+def in_motion(given: Tracks) -> tuple[Mistake, ...]:
+    """Return the mistakes that show as a camera moves."""
+    lever_m = float(np.linalg.norm(given.cameras.translation, axis=1).max())
+    large, small = (lever_m > _SMALLEST_M) * _LARGE_RIG, (lever_m < _LARGEST_M) * _SMALL_STEPS
+    return (*_IN_MOTION, *large, *small)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
-from ba_node.check.mistakes import FLIPS, IN_MOTION, LAGS, Flip, Mistake, finding
+from ba_node.check.mistakes import FLIPS, LAGS, Flip, Mistake, finding, in_motion
 from ba_node.check.relations import Relation, agreed
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pair, Pose
@@ -52,7 +52,7 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         return _too_few(usable)
     rows = [now.row(test, "as given"), Row(test, "free", float(np.mean([one.share for one in usable])))]
     if np.median(now.off) > DOUBTFUL_DEG:
-        tried = {one: compare(one.undo(tracks, 0), usable) for one in IN_MOTION}
+        tried = {one: compare(one.undo(tracks, 0), usable) for one in in_motion(tracks)}
         rows += [other.row(test, one.name) for one, other in tried.items()]
         best = min(float(np.median(other.off)) for other in tried.values())
         named = [one for one, it in tried.items() if np.median(it.off) <= 1.15 * best + 1.0 and now.loses_to(it)]
@@ -82,7 +82,7 @@ def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
     if not off:
         return None
     # Others may explain the turns as well.
-    for one in IN_MOTION:
+    for one in in_motion(tracks):
         tried[one] = compare(one.undo(tracks, 0), usable)
         if now.turns_worse_than(tried[one]) and np.median(tried[one].off) < 1.15 * np.median(now.off) + 1.0:
             off[one] = float(np.mean(tried[one].rotation))

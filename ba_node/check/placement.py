@@ -40,7 +40,10 @@ _TURNED_DEG = 0.5
 # A usual mistake is not one of a few degrees.
 _SAME_DEG = 10.0
 # Factors by which the focal length of one camera may be wrong.
-_ZOOMS = tuple(float(factor) for factor in np.geomspace(0.5, 2.0, 41))
+_ZOOMS, _CLOSER = (tuple(map(float, np.geomspace(1.0 / most, most, n))) for most, n in ((2.0, 41), (1.03, 9)))
+# Another focal length explains so many times what the given one does.
+_BETTER = 1.1
+_INFO = "k in the camera_info of camera {camera}"
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
@@ -56,6 +59,7 @@ _CLEAR = 0.5
 def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diagnosis:
     """Compare the cameras of the rig with each other; ``related`` gives the relations in motion, should it matter."""
     outcome = Diagnosis()
+    compared: dict[int, Diagnosis] = {}
     for camera in range(1, min(len(tracks.cameras.model), 1 + _MAX_CAMERAS)):
         relation = of_cameras(tracks, camera)
         if relation is None:
@@ -71,8 +75,56 @@ def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diag
         why = "too many outliers" if unclear else "too few keyframes"
         if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
             found = Diagnosis(untold=[f"{why} to measure how camera {camera} is off its place"], rows=found.rows)
+        compared[camera] = found
+    for found in _by_majority(tracks, compared).values():
         outcome.add(found)
     return outcome
+
+
+def _by_majority(tracks: Tracks, compared: dict[int, Diagnosis]) -> dict[int, Diagnosis]:
+    """Return what the comparisons of cameras with camera 0 tell together: it may be that which is wrong."""
+    wrong = [camera for camera, one in compared.items() if one.harmful and not one.usual]
+    zooms = {camera: zoom for camera in wrong if (zoom := _zoom_of(tracks, camera))}
+    if not any(one.sound for one in compared.values()) and len(wrong) == 1 and zooms:
+        ((camera, factor),) = zooms.items()
+        (finding,) = compared[camera].findings
+        cause = f"focal length of camera 0 off by a factor of about {1.0 / factor:.3g} against that of camera {camera}"
+        changes = (*finding.changes, _INFO.format(camera=0))
+        both = dataclasses.replace(finding, causes=(*finding.causes, cause), changes=changes)
+        return compared | {camera: dataclasses.replace(compared[camera], findings=[both])}
+    if len(wrong) < 2 or len(wrong) < len(compared):
+        return compared
+    relation, given = of_cameras(tracks, wrong[1], wrong[0]), tracks.between_cameras(*wrong[:2])
+    if relation is None or two_view.share(relation.pair, given) < max(_FITS * relation.share, _CONTRADICT):
+        return compared
+    those = f"cameras {' and '.join(map(str, wrong[:2]))}"
+    cause, change = "camera 0 does not fit its place on the body", "body_from_camera of camera 0 in camera_rig"
+    if len(zooms) == len(wrong):
+        factor = 1.0 / float(np.median(list(zooms.values())))
+        cause, change = f"focal length of camera 0 off by a factor of about {factor:.3g}", _INFO.format(camera=0)
+        cause += f" against those of {those}"
+    evidence = f"{those} agree with each other, and neither with camera 0"
+    first = Diagnosis(
+        [Finding((cause,), evidence, (change,))], rows=[row for one in compared.values() for row in one.rows]
+    )
+    return {0: first}
+
+
+def _zoom_of(tracks: Tracks, camera: int) -> float:
+    """Return the factor by which the focal length of a camera is off that of camera 0; 0 if it is not."""
+    relation, given = of_cameras(tracks, camera), tracks.between_cameras(0, camera)
+    return 0.0 if relation is None else _zoom(relation, given, two_view.share(relation.pair, given))[0]
+
+
+def _zoom(relation: Relation, given: Pose, share: float) -> tuple[float, float]:
+    """Return the factor of the focal length of b with which the given pose explains the rays, and their share; or 0."""
+    best, tried = 1.0, _ZOOMS
+    for _ in range(2):
+        shares = {factor: two_view.share(relation.pair.zoomed(factor), given) for factor in tried}
+        best = max(shares, key=lambda one: shares[one])
+        tried = tuple(float(best * factor) for factor in _CLOSER)
+    explains = shares[best] >= max(_NAMED * relation.share, _BETTER * share)
+    return (best, shares[best]) if explains else (0.0, 0.0)
 
 
 def check_silent(tracks: Tracks) -> Diagnosis:
@@ -215,12 +267,11 @@ def _misfit(camera: int, relation: Relation, given: Pose, rows: list[Row]) -> Di
     """Tell of a camera that is a little off its place, or whose own intrinsics are wrong: the rig fits with others."""
     row, other = rows[0], Diagnosis(rows=rows)
     change = f"body_from_camera of camera {camera} in camera_rig (or tf_static)"
-    info = f"k in the camera_info of camera {camera}"
-    tried = {factor: two_view.share(relation.pair.zoomed(factor), given) for factor in _ZOOMS}
-    factor = max(tried, key=lambda one: tried[one])
-    if tried[factor] >= max(_NAMED * relation.share, 1.1 * row.share):
-        cause = f"focal length of camera {camera} off by a factor of about {factor:.2g} against that of camera 0"
-        rows.append(Row(row.test, cause, tried[factor]))
+    info = _INFO.format(camera=camera)
+    factor, share = _zoom(relation, given, row.share)
+    if factor:
+        cause = f"focal length of camera {camera} off by a factor of about {factor:.3g} against that of camera 0"
+        rows.append(Row(row.test, cause, share))
         other.findings.append(Finding((cause,), f"{row.share:.0%} of the tracks meet as given", (info,)))
         return other
     # A rotation alone is measured far better than together with the direction of the baseline.

@@ -83,12 +83,12 @@ def rays(tracks: Tracks, rows: tuple[IntArray, IntArray]) -> Pair:
     return Pair(tracks.ray[rows[0]], tracks.ray[rows[1]], gate)
 
 
-def of_cameras(tracks: Tracks, camera: int) -> Relation | None:
-    """Return how a camera stands to camera 0 by what both see in the same keyframes."""
-    found = [tracks.match((k, 0), (k, camera)) for k in spread(len(tracks), _KEYFRAMES)]
+def of_cameras(tracks: Tracks, camera: int, other: int = 0) -> Relation | None:
+    """Return how a camera stands to another one by what both see in the same keyframes."""
+    found = [tracks.match((k, other), (k, camera)) for k in spread(len(tracks), _KEYFRAMES)]
     rows_a, rows_b = (np.concatenate(part) for part in zip(*found, strict=True))
     pick = spread(len(rows_a), _MAX_RAYS)
-    return relate(tracks, (-1, 0), (-1, camera), (rows_a[pick], rows_b[pick]))
+    return relate(tracks, (-1, other), (-1, camera), (rows_a[pick], rows_b[pick]))
 
 
 def shared_views(tracks: Tracks, camera: int) -> int:

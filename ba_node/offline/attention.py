@@ -45,6 +45,7 @@ def _not_taken(session: Mapping[str, Any]) -> list[str]:
         return [f"{count}: their result was not taken" for count in counts]
     reason, warnings = session["unrefined"], session["warnings"]
     known = any(reason in text for text in warnings.values()) or ("setup" in warnings and "set-up" in reason)
+    known = known or "outvoted" in warnings
     # Without a solve a loaded map held all of it.
     stands = "the front-end's poses stand" if session["solves"] else "the poses of that map stand"
     return ["nothing was refined: " + "; ".join([*([] if known else [reason]), *counts, stands])]

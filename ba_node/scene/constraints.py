@@ -84,6 +84,7 @@ class Constraints:
         adjusted_at: how many keyframes there were when the map was last bent.
         asked_at: and when it was last asked whether the map has left the world.
         grown_at: and when all of it was last refined as it had grown.
+        compared_at: and when what came of keyframes was last compared with it, see window/outvoted.py.
         judged_at: and when what is absolute was last judged, see window/receiver.py.
         scatter: what that found, how many times as much as stated by source.
         left_out: likewise, stretches that jumped: source, first and last stamp (ns).
@@ -109,6 +110,7 @@ class Constraints:
         self.asked_at = 0
         self.grown_at = 0
         self.judged_at = 0
+        self.compared_at = 0
         self.scatter: dict[int, float] = {}
         self.left_out: list[tuple[int, int, int]] = []
         self.seams: set[int] = set()
@@ -278,6 +280,7 @@ class Constraints:
         self.map_from_world = older.map_from_world or self.map_from_world
         self.asked_at = 0
         self.judged_at = 0
+        self.compared_at = 0
 
     def forget(self, keyframes: IdArray, oldest_ns: int) -> None:
         """Drop what belongs to keyframes that were forgotten; ``oldest_ns`` is the stamp of the oldest that is left."""
@@ -287,7 +290,8 @@ class Constraints:
         self.steps = {key: value for key, value in self.steps.items() if key not in gone}
         self.seams -= gone
         self.absolute = [one for one in self.absolute if one.stamp_ns >= oldest_ns]
-        self.adjusted_at, self.judged_at = (max(0, n - len(gone)) for n in (self.adjusted_at, self.judged_at))
+        for name in ("adjusted_at", "judged_at", "compared_at"):
+            setattr(self, name, max(0, getattr(self, name) - len(gone)))
 
     def end(self, keyframes: IdArray, tracks: IdArray, span_ns: tuple[int, int], log: RejectionLog) -> None:
         """Give up what names keyframes that never came; count what lies outside the time of all, or has no track."""

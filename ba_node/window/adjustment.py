@@ -27,7 +27,7 @@ from ba_node.core.priors import PosePriors
 from ba_node.core.problem import KeyframeFactors, Observations, Problem, State
 from ba_node.estimate import Extras
 from ba_node.scene.scene import Scene
-from ba_node.window import constraints, contradicted, full, loops, odometry, receiver, retriangulation, trial
+from ba_node.window import constraints, contradicted, full, loops, odometry, outvoted, receiver, retriangulation, trial
 
 # What a step of the map is worth, by what one of the front-end's is; how far (rms, in sigmas) steps may be bent.
 _WORTH, _BENT = 1.0 / 3.0, 10.0
@@ -53,7 +53,7 @@ _ITERATIONS = 30
 _REFINED = 0.8
 # Warnings that say nothing of the images and poses that are in the map; and those of what is left out of solves.
 _OF_NAMES = frozenset(["bad_stamp", "equal_stamps", "clock_jump", "clock_step", "lower_session", "stray_session"])
-_ALLOWED = _OF_NAMES | {"frame_changed", "frame_name", "far_from_origin", "moving", "stray"}
+_ALLOWED = _OF_NAMES | {"frame_changed", "frame_name", "map_frame", "far_from_origin", "moving", "outvoted", "stray"}
 # Poses that explain tracks better by less than this share do so by rounding; worse by more than that, worse indeed.
 _ROUNDED, _WORSE = 1e-9, 0.005
 _NOTHING_CAME = "nothing came of a solve of everything"
@@ -188,6 +188,9 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
     if unaligned and (final or n - known.adjusted_at >= _TRY_AGAIN * n):
         known.adjusted_at = n
         constraints.align(scene, config)
+    if final or n - known.compared_at >= max(_FEW, _GROWN * n):
+        known.compared_at = n
+        outvoted.say_outvoted(scene, config.factors, everything=final)
     jumped = ""
     if known.absolute and (final or n - known.judged_at >= max(_FEW, _GROWN * n)):
         known.judged_at = n
@@ -197,7 +200,8 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
         scene.log.warn(
             "unaligned",
             f"{count} priors in frame {known.world_frame!r} were not used: the path is too short, or they are too few"
-            " or too noisy, to tell where the map lies in it (factors.align_m)",
+            " or too noisy, to tell where the map lies in it (factors.align_m)."
+            f"{contradicted.likely(scene, constraints.every_pair(scene, config.factors), units_alone=True)}",
         )
     found = loops.merged(scene, config, final) if known.merges else None
     found = found or (loops.measured(scene, config) if known.unchecked else None)
@@ -358,7 +362,8 @@ def _left_the_world(scene: Scene, config: Config, final: bool) -> loops.Due | No
         priors = f"in frame {known.world_frame!r}"
         which = f"of {len(pairs)} recent priors {priors} no two agree, and half of them lie"
         which = f"the only recent prior {priors} lies" if len(pairs) == 1 else which
-        text = f"{which} {middle_m:.2f} m beside the map: it stays as it is until another one confirms that"
+        text = f"{which} {middle_m:.2f} m beside the map: it stays as it is until another one confirms that."
+        text += contradicted.likely(scene, pairs)
         scene.log.warn("unconfirmed", text)
         return None
     return loops.Due(f"the map has come to lie {middle_m:.2f} m beside where priors have it")

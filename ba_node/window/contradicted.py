@@ -22,6 +22,7 @@ import numpy as np
 
 from ba_node.arrays import BoolArray, FloatArray, IntArray, take_rows
 from ba_node.config import FactorsConfig
+from ba_node.core.units import unit_of
 from ba_node.scene.scene import Scene
 from ba_node.window import constraints
 
@@ -32,6 +33,9 @@ _BESIDE, _ROW, _TOGETHER = 5.0, 10, 1.3
 _MANY, _TOO_MANY = 5, 0.2
 # Measurements and steps may drift apart by so many standard deviations; one of these is so much of the way.
 _DRIFTED, _OF_WAY = 5.0, 0.003
+# Names by source. Pairs of measurements whose distances are compared with the map's, and how nearly these agree.
+_KINDS = {0: "pose priors", 1: "fixes of a receiver", constraints.LANDMARK: "landmark priors"}
+_DISTANCES, _ALIKE = 300, 0.1
 # Groups of measurements, at least _ROW in each, that are compared with each other.
 _GROUPS = 60
 
@@ -63,11 +67,39 @@ def say_contradicted(scene: Scene, config: FactorsConfig) -> None:
             f"{count} of {len(pairs)} priors in frame {known.world_frame!r} lie {np.median(off_m[wrong]):.1f} m beside"
             f" the map (median), from {stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s: they contradict the"
             " others, or images and odometry, or their covariance is too small. Did their source change its reference?"
-            f"{_left_out(int(np.count_nonzero(jumped)))}",
+            f"{_left_out(int(np.count_nonzero(jumped)))}{likely(scene, take_rows(pairs, wrong))}",
         )
     for source in np.unique(pairs.source[~jumped]):
         of = ~jumped & (pairs.source == source)
         _say_drifted(scene, take_rows(pairs, of), off[of], config)
+
+
+def likely(scene: Scene, pairs: constraints.Pairs, *, units_alone: bool = False) -> str:
+    """Return of which kind measurements far beside the map are, and by how far apart they are what may be wrong.
+
+    ``units_alone``: nothing is known to be, so that it is said if their unit is.
+    """
+    if not len(pairs):
+        return ""
+    kind = " and ".join(_KINDS[source] for source in np.unique(pairs.source).tolist())
+    some = np.random.default_rng(0).integers(len(pairs), size=(2, _DISTANCES))
+    told_m, map_m = (np.linalg.norm(np.subtract(*at[some]), axis=1) for at in (pairs.position, pairs.points(scene)))
+    apart = (map_m > 0.5 * np.median(map_m)) & (map_m > 0.0) & (told_m > 0.0)
+    ratio = np.log(told_m[apart] / map_m[apart])
+    alike = len(pairs) >= _ROW and apart.any() and np.median(np.abs(ratio - np.median(ratio))) < _ALIKE
+    factor = float(np.exp(np.median(ratio))) if alike else float("nan")
+    if unit := unit_of(factor):
+        why = f"their positions are {unit}, expected metres ({factor:.4g} times as far apart as in the map)"
+    elif units_alone:
+        return ""
+    elif abs(np.log(factor)) < _ALIKE and (pairs.source == 0).any():
+        why = (
+            "their positions are as far apart as in the map, so look at their orientations: expected are poses of the"
+            " body in that frame, not inverted, nor of a camera"
+        )
+    else:
+        why = "expected are positions in metres, in that frame, of the body (fixes: the antenna, landmarks: the point)"
+    return f" They are {kind}: {why}."
 
 
 def _say_drifted(scene: Scene, pairs: constraints.Pairs, off: FloatArray, config: FactorsConfig) -> None:

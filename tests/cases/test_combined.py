@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from experiments.robustness.faults.catalogue import spoiled_by
+from experiments.robustness.faults.spoil import spoiled_by
 from tests.cases.conftest import Replay, harmless
 from tests.cases.test_siblings import write
 

@@ -11,7 +11,7 @@ import pytest
 
 from ba_node.measurements import FeatureTracks
 from experiments.robustness.faults import SOUND, spoiled
-from experiments.robustness.faults.catalogue import spoiled_by
+from experiments.robustness.faults.spoil import spoiled_by
 from tests.cases.conftest import Replay, harmless
 from tests.cases.test_siblings import write
 

@@ -200,6 +200,7 @@ WRONG: dict[str, Wrong] = {
     "camera from world": poses(lambda r, p, data: geometry.inverse(*geometry.compose(r, p, *_camera_0(data)))),
     "poses of optical body": poses(lambda r, p, _: (r @ _OPTICAL, p)),
     "poses in mm": poses(lambda r, p, _: (r, 1000.0 * p)),
+    "poses in km": poses(lambda r, p, _: (r, 0.001 * p)),
     "poses in cm": poses(lambda r, p, _: (r, 100.0 * p)),
     "poses with w first": poses(
         lambda r, p, _: (
@@ -232,6 +233,8 @@ WRONG: dict[str, Wrong] = {
         ),
     ),
     "depth in mm": images(lambda one: dataclasses.replace(one, depth_m=1000.0 * one.depth_m)),
+    "depth times 6": images(lambda one: dataclasses.replace(one, depth_m=6.0 * one.depth_m)),
+    "poses over 6": poses(lambda r, p, _: (r, p / 6.0)),
     "depth in cm": images(lambda one: dataclasses.replace(one, depth_m=100.0 * one.depth_m)),
     "depth in km": images(lambda one: dataclasses.replace(one, depth_m=0.001 * one.depth_m)),
     "depth times 1.1": images(lambda one: dataclasses.replace(one, depth_m=1.1 * one.depth_m)),

@@ -19,8 +19,8 @@ from ba_node.check.tracks import Tracks
 from ba_node.core import bordered
 from ba_node.core.cameras import FX
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
-from experiments.robustness.faults.catalogue import spoiled, spoiled_by
 from experiments.robustness.faults.recording import Recording
+from experiments.robustness.faults.spoil import spoiled, spoiled_by
 from tests.check.set_ups import recording, seen
 
 SIDEWAYS: dict[str, Any] = {"look_deg": 90.0}

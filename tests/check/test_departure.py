@@ -90,6 +90,30 @@ def test_one_side_is_named(mode: str, aside_deg: tuple[float, float, float]) -> 
     assert abs(int(found[1]) - expected) < 0.25 * expected, f"{text}: expected about {expected:.0f} px"
 
 
+@pytest.mark.parametrize(("aside_deg", "told"), [((0.0, 0.0, 2.0), True), ((0.0, 2.0, 0.0), False)])
+def test_a_camera_that_looks_aside_may_have_another_focal_length(
+    aside_deg: tuple[float, float, float], told: bool
+) -> None:
+    """It turns the way in the plane of axis and way, and in no other; which of the three it is cannot be told."""
+    data = recording(path="line", look_deg=-45.0)
+    check = departed(refined(data, 1.0, noise_m=0.005, aside_deg=aside_deg), final=True)
+    assert check is not None and check.found is not None
+    text = check.found.causes()
+    assert all(words in text for words in ("camera 0 does not fit", "principal point wrong")), text
+    found = re.match(r"focal length off by a factor of about (\d\.\d\d)", text)
+    assert bool(found) == told, text
+    if found:
+        # tan 45 deg over tan 43 or 47 deg
+        assert abs(abs(np.log(float(found[1]))) - 0.07) < 0.015, text
+
+
+def test_depths_of_a_camera_that_looks_aside_may_be_right_and_its_focal_length_wrong() -> None:
+    for look_deg, told in ((0.0, False), (90.0, True)):
+        check = departed(refined(recording(mode="rgbd", path="line", look_deg=look_deg), 1.05))
+        assert check is not None and check.found is not None
+        assert ("focal length off by a factor of about 0.9" in check.found.causes()) == told, check.found.causes()
+
+
 def test_less_is_enough_at_the_end_alone() -> None:
     """A baseline that is 2 % off is told on most drives then, and on few before."""
     data = recording(path="line")

@@ -39,8 +39,9 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "poses of camera": (("stereo", "mono"), "^poses are of the camera, given as of the body"),
     "camera from world": (("stereo", "mono"), "^poses inverted and of the camera"),
     "poses of optical body": (("stereo", "mono"), "the poses are of a body whose z looks forward"),
-    "poses in mm": (("stereo",), "poses in millimetres"),
-    "poses in cm": (("stereo",), "poses in centimetres"),
+    "poses in mm": (("stereo", "rgbd"), "poses in millimetres"),
+    "poses in cm": (("stereo", "rgbd"), "poses in centimetres"),
+    "poses in km": (("stereo", "mono", "rgbd"), "positions of the poses in kilometres"),
     "poses with w first": (("stereo", "mono"), "quaternions of the poses with w first"),
     "turned 1 about y": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
     "turned 1 about x": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
@@ -107,6 +108,23 @@ def test_mistake_is_named(wrong: str, mode: str) -> None:
         wrong not in ("slots", "ids modulo 200", "rows for ids") and not wrong.startswith(("stamps", "sigma"))
     )
     assert all(finding.changes for finding in found.findings)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"), [("depth times 6", "depth_m in another unit"), ("poses over 6", "poses in another unit")]
+)
+def test_two_cameras_tell_whether_depths_or_poses_are_off(wrong: str, named: str) -> None:
+    """Neither a depth nor a speed is absurd; with one camera both are named."""
+    alone = examine(seen(recording(wrong=wrong, mode="rgbd", look_deg=90.0)))
+    assert {"depth_m", "poses"} <= {cause.split()[0] for cause in alone.findings[0].causes}, alone.summary()
+    found = examine(seen(recording(wrong=wrong, depth_share=0.8, look_deg=90.0)))
+    assert found.causes().startswith(named), found.summary()
+    assert ("poses" in found.causes()) == (named[:5] == "poses"), found.summary()
+
+
+def test_a_speed_that_nothing_has_is_said_where_images_have_no_scale() -> None:
+    found = examine(seen(recording(wrong="poses in mm", mode="mono")))
+    assert found.causes().startswith("poses in another unit than metres") and not found.harmful, found.summary()
 
 
 @pytest.mark.parametrize("keyframes", [10, 25])

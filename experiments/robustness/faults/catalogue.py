@@ -1,65 +1,11 @@
 # Copyright 2026 The ba_node Authors
 # SPDX-License-Identifier: Apache-2.0
-"""Declare every way in which a recording goes wrong once: what it is, how much of it, and what a user must be told.
-
-One line makes a recording with a fault and its truth::
-
-    recording = spoiled("camera_turned", amount=2.0, seed=3)
-"""
+"""Declare every way in which a recording goes wrong once: what it is, how much of it, and what a user must be told."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
-
-import numpy as np
-
-from experiments.robustness.faults import midway, motion, setup, stamps, tracks
-from experiments.robustness.faults.recording import Recording
-from experiments.synthetic.generate import generate
-from experiments.synthetic.options import SyntheticOptions
-from experiments.synthetic.world import Path, World
-
-Edit = Callable[[Recording, float, np.random.Generator], Recording]
-Motion = Callable[[World, Path, float], tuple[World, Path]]
-
-STEREO, MONO, RGBD = "stereo", "mono", "rgbd"
-RIGS: dict[str, dict[str, Any]] = {
-    STEREO: {"baseline_m": 0.12},
-    MONO: {"baseline_m": 0.0},
-    RGBD: {"baseline_m": 0.0, "depth_share": 0.9},
-}
-# A short drive with odometry that is good, so that harm shows, and yet worse than what the tracks tell.
-_BASE: dict[str, Any] = {
-    "keyframes": 40,
-    "landmarks": 2500,
-    "path": "line",
-    "length_m": 20.0,
-    "tracks": 150,
-    "outlier_share": 0.01,
-    "drift_rotation_deg": 0.3,
-    "drift_translation": 0.02,
-}
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One way in which a recording goes wrong."""
-
-    about: str  # what is wrong, for tables
-    edit: Edit | None = None  # what it does to the messages
-    motion: Motion | None = None  # what it does to the world and the path
-    amounts: tuple[float, ...] = (1.0,)  # how much of it, the usual first
-    rigs: tuple[str, ...] = (STEREO, MONO)  # the rigs that can have it, the usual first
-    # patterns (re, any case), each of which must be found in the messages to the user; none where the result is to be
-    # as good as ever
-    named: tuple[str, ...] = ()
-    # exit codes of a replay that are right: 3 where there is something to look at, 2 where it may be refused
-    codes: tuple[int, ...] = (0, 3)
-    least: float = 1.0  # share of the keyframe messages that have to be published
-    changes: Mapping[str, Any] = field(default_factory=dict)  # options of the recording that it needs
-
+from experiments.robustness.faults import exposure, midway, motion, setup, stamps, surround, tracks
+from experiments.robustness.faults.fault import MONO, RGBD, STEREO, Fault
 
 _TWO = (STEREO,)
 _ALL = (STEREO, MONO, RGBD)
@@ -345,48 +291,28 @@ FAULTS: dict[str, Fault] = {
         named=("mirrored",),
         codes=_LOOK,
     ),
+    "second_late": Fault(
+        "second camera exposed later, s",
+        exposure.second_late,
+        amounts=(0.05, 0.02),
+        rigs=_TWO,
+        named=("camera 1 is not synchronised",),
+        codes=_LOOK,
+    ),
+    "poses_in_mm": Fault(
+        "positions of the keyframes in another unit, times",
+        setup.steps_scaled,
+        amounts=(1000.0, 0.001),
+        rigs=(RGBD, STEREO),
+        named=("poses in (millimetres|kilometres)",),
+        codes=_LOOK,
+    ),
+    "focal_of_first": Fault(
+        "focal length of the first of three cameras, times",
+        surround.focal_of_first,
+        amounts=(1.2, 1.05),
+        rigs=_TWO,
+        named=("focal length of camera 0 off .* against those of cameras 1 and 2",),
+        codes=_LOOK,
+    ),
 }
-
-
-def spoiled_by(
-    faults: Sequence[tuple[str, float | None]], rig: str | None = None, seed: int = 0, **changes: Any
-) -> Recording:
-    """Return a recording with several faults at once, see :func:`spoiled`; each with its amount, None for the usual."""
-    options = dict(_BASE)
-    known = [(name, FAULTS[name], FAULTS[name].amounts[0] if amount is None else amount) for name, amount in faults]
-    for _, fault, _ in known:
-        options |= fault.changes
-    options |= RIGS[rig or (known[0][1].rigs[0] if known else STEREO)] | changes
-
-    def moved(world: World, path: Path) -> tuple[World, Path]:
-        for _, fault, much in known:
-            if fault.motion is not None:
-                world, path = fault.motion(world, path, much)
-        return world, path
-
-    data = generate(SyntheticOptions(**options, seed=seed), moved)
-    recording = Recording(data, tuple(data.timeline()))
-    for name, fault, much in known:
-        if fault.edit is not None:
-            recording = fault.edit(recording, much, np.random.default_rng([seed, *name.encode()]))
-    return recording
-
-
-def spoiled(name: str, rig: str | None = None, amount: float | None = None, seed: int = 0, **changes: Any) -> Recording:
-    """Return a recording with a fault. The same arguments give the same numbers.
-
-    Args:
-        name: one of FAULTS, or ``sound`` for none.
-        rig: one of RIGS; None for the usual one of the fault.
-        amount: how much of the fault; None for the usual.
-        seed: of world, noise and fault.
-        changes: SyntheticOptions other than those of a short drive with good odometry.
-
-    Raises:
-        KeyError: no such fault or rig.
-        ConfigError: an option out of range.
-    """
-    return spoiled_by([] if name == SOUND else [(name, amount)], rig, seed, **changes)
-
-
-SOUND = "sound"

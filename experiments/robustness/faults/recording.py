@@ -115,10 +115,10 @@ class Projector:
         """Return the point (n, 3) that each track follows, m."""
         return np.asarray(self._points[self.landmarks(track_id)])
 
-    def uv(self, image: FeatureTracks, points: FloatArray) -> FloatArray:
-        """Return where points (n, 3) lie in an image, px; NaN where it does not show them."""
+    def uv(self, image: FeatureTracks, points: FloatArray, path: Path | None = None) -> FloatArray:
+        """Return where points (n, 3) lie in an image, px; NaN where it does not show them, or would from a path."""
         lens = self._lenses[image.camera_index]
-        uv, _ = lens.project(points, self.path, self.number[image.keyframe_id])
+        uv, _ = lens.project(points, self.path if path is None else path, self.number[image.keyframe_id])
         return np.where(lens.in_image(uv)[:, None], uv, np.nan)
 
     def wrong(self, image: FeatureTracks, limit_px: float) -> NDArray[np.bool_]:

@@ -1,0 +1,50 @@
+# Copyright 2026 The ba_node Authors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera that is exposed later is told from one that is off its place, and only where something is wrong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from ba_node.check.diagnosis import Diagnosis
+from ba_node.check.examine import examine
+from ba_node.check.exposure import find_late
+from ba_node.check.tracks import Tracks, tracks_of
+from ba_node.config import Config
+from ba_node.scene.scene import Scene
+from experiments.robustness.faults import SOUND, spoiled
+
+LOOP: dict[str, Any] = {"path": "loop", "length_m": 30.0, "keyframes": 60}
+
+
+def tracks(name: str, amount: float | None = None, seed: int = 0, **changes: Any) -> Tracks:
+    scene = Scene(Config().scene)
+    for measurement in spoiled(name, "stereo", amount, seed, **changes).measurements:
+        scene.add(measurement)
+    found = tracks_of(scene)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("delay_s", "changes"), [(0.05, {}), (0.02, LOOP), (0.05, LOOP), (0.1, LOOP)])
+def test_a_camera_that_is_exposed_later_is_named_alone(delay_s: float, changes: dict[str, Any]) -> None:
+    """Else its place, a focal length, its track ids or nothing are blamed."""
+    found = examine(tracks("second_late", delay_s, seed=4, **changes))
+    assert len(found.findings) == 1 and found.harmful, found.summary()
+    (cause,) = found.findings[0].causes
+    assert cause.startswith("camera 1 is not synchronised with camera 0"), found.summary()
+    assert "after those of camera 0" in cause, cause
+    told_ms = float(cause.split(" about ")[1].split(" ms")[0])
+    assert abs(told_ms - 1e3 * delay_s) < 0.2 * 1e3 * delay_s, cause
+
+
+@pytest.mark.parametrize("changes", [{}, LOOP, {"look_deg": 90.0}])
+@pytest.mark.parametrize(
+    ("fault", "amount"), [(SOUND, None), ("camera_turned", 0.5), ("camera_turned", 3.0), ("focal_off", 1.1),
+                          ("baseline_off", 1.1), ("outliers_moving", 0.4)],
+)  # fmt: skip
+def test_what_is_off_all_the_time_is_no_delay(fault: str, amount: float | None, changes: dict[str, Any]) -> None:
+    found = Diagnosis(untold=["nothing"])
+    assert find_late(tracks(fault, amount, seed=5, **changes), found) is found
