@@ -70,7 +70,7 @@ class Publishing(Component):
         self._told: Outcome | None = None
         self._behind: set[str] = set()
         self._outputs: dict[str, Any] = {}
-        # Who listens to poses, as far as it was told: to ask takes longer than to write the message.
+        # How many listen to poses, as far as it was told: to ask takes longer than to write the message.
         self._listeners: dict[str, int] = {}
         for topic in OUTPUT_TYPES:
             matched = self._catch_up if topic in LATCHED_OUTPUTS else None
@@ -81,7 +81,7 @@ class Publishing(Component):
     def take_poses(self, refinement: Refinement, arrived_s: float) -> None:
         """Publish the poses of a solve, and note how old they are then."""
         told = self._listeners
-        wanted = {one for one in _POSES if (told[one] if one in told else self._outputs[one].get_subscription_count())}
+        wanted = {one for one in _POSES if told.get(one) or self._outputs[one].get_subscription_count()}
         for topic, message in pose_outputs(refinement, wanted):
             self._outputs[topic].publish(message)
         arrival, stamp = self._ages
