@@ -139,7 +139,7 @@ def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: L
     if _measures_depths(scene):
         by, ours = "depth_m tells", f"scale of depth_m: it is {factor:.3g} times what the front-end's steps tell"
         causes = {ours: "the factor from depth images to depth_m in the feature_tracks"}
-        ahead = float(_seen(scene, along.mean(axis=0))[2])
+        ahead = float(_seen(scene, _along(scene, refined, given).mean(axis=0))[2])
         if abs(ahead) < _ASIDE:
             # It scales what lies across the axis alone.
             causes[_focal(1.0 + (1.0 / factor - 1.0) / (1.0 - ahead**2))] = _K
@@ -154,11 +154,16 @@ def _by_a_factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: L
 
 def _factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> float:
     """Return by what factor refined steps (n, 3) are longer than the given ones; 1 where that may be chance."""
-    # Where the front-end moves in a plane it has of a step what lies along its own.
-    along = given if geometry.is_planar(scene.keyframes.input_position) else refined + given
+    along = _along(scene, refined, given)
     ratio = np.sum(refined * along, axis=1) / np.sum(given * along, axis=1)
     mean, error = _trimmed_mean(np.log(ratio))
     return float(np.exp(mean)) if _differs(mean, error, len(given), limits) else 1.0
+
+
+def _along(scene: Scene, refined: FloatArray, given: FloatArray) -> FloatArray:
+    """Return (n, 3) along what the lengths of steps are compared."""
+    # Where the front-end moves in a plane it has of a step what lies along its own.
+    return given if geometry.is_planar(scene.keyframes.input_position) else refined + given
 
 
 def doubtful_factor(scene: Scene) -> float:
