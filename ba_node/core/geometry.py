@@ -20,6 +20,7 @@ _SMALL = 1e-4
 _ROUNDED = 1e-8
 # A path leaves every plane by more than this share of its extent.
 _FLAT = 1e-6
+_IDENTITY = np.eye(3)
 
 
 def hat(v: FloatArray) -> FloatArray:
@@ -154,7 +155,7 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
     Of a rotation that is off by rounding alone one step of Newton's method finds it, ``R (3 I - R'R) / 2``, in a tenth
     of the time of a singular value decomposition.
     """
-    off = np.eye(3) - np.swapaxes(matrix, -1, -2) @ matrix
+    off = _IDENTITY - np.swapaxes(matrix, -1, -2) @ matrix
     if np.abs(off).max(initial=0.0) <= _ROUNDED and (np.linalg.det(matrix) > 0.0).all():
         return np.asarray(matrix + 0.5 * (matrix @ off))
     u, _, vt = np.linalg.svd(matrix)
