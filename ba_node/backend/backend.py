@@ -146,7 +146,7 @@ class Backend:
         if not is_new or self.scene.find_keyframe(measurement.keyframe_id) is None:
             self.refused.append(measurement)
             return
-        ingest.check_frame(measurement, self.config.frames, self.map.odom_frame, self.scene.log)
+        ingest.check_frame(measurement, self.config.frames.odom_frame, self.map.odom_frame, self.scene.log)
         self.map.completion.begin(self.scene, measurement.keyframe_id)
 
     def flush(self, final: bool = False) -> None:

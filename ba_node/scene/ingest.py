@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ba_node import native
 from ba_node.arrays import BoolArray, FloatArray, IdArray, changed
-from ba_node.config import FramesConfig
 from ba_node.core import cameras, geometry
 from ba_node.core.problem import Cameras
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe, LandmarkGuesses
@@ -78,18 +77,11 @@ def plain_name(frame_id: str) -> str:
     return frame_id.strip().lstrip("/")
 
 
-def check_frame(keyframe: Keyframe, frames: FramesConfig, taken: str, log: RejectionLog) -> None:
-    """Say so if the name of a keyframe's fixed frame is none, one that tf2 refuses, or that of the map.
+def check_frame(keyframe: Keyframe, named: str, taken: str, log: RejectionLog) -> None:
+    """Say so if the name of a keyframe's fixed frame is none, or one that tf2 refuses.
 
-    Where a parameter has named it, an empty name does no harm; ``taken`` is the name that counts.
+    Where a parameter has ``named`` it, an empty name does no harm; ``taken`` is what is taken for an empty one.
     """
-    if taken == frames.map_frame and "map_frame" not in log.warnings:
-        log.warn(
-            "map_frame",
-            f"keyframes are in {taken!r}, which is frames.map_frame too: two frames have one name, poses of before and"
-            " after cannot be told apart by it, and no map -> odom is published: name the front-end's frame otherwise"
-            " (header.frame_id of the keyframes, usually odom), or frames.map_frame",
-        )
     name = plain_name(keyframe.frame_id)
     if name == keyframe.frame_id and name:
         return
@@ -101,7 +93,7 @@ def check_frame(keyframe: Keyframe, frames: FramesConfig, taken: str, log: Rejec
         log.warn(
             "frame_name", f"{where} is no name for tf2, taken as {name!r}: leave out spaces and the slash in front"
         )
-    elif not frames.odom_frame:
+    elif not named:
         log.warn("frame_name", f"{where} names no frame, taken as {taken!r}: name the fixed frame of the poses")
 
 

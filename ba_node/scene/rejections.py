@@ -79,7 +79,6 @@ WARNINGS: dict[str, str] = {
     "bad_stamp": "A keyframe was turned away for its stamp.",
     "stray_session": "A keyframe of a higher session was turned away, since no second one followed.",
     "frame_name": "The fixed frame of the keyframes has no name, or one that tf2 refuses.",
-    "map_frame": "The fixed frame of the keyframes has the name of the map's, frames.map_frame.",
     "equal_stamps": "Two keyframes have one stamp.",
     "reused_id": "An id was used for a second keyframe of the session.",
     "no_geo": "Fixes of GNSS are left out, as pymap3d is missing.",

@@ -59,20 +59,6 @@ def test_the_correction_leads_from_odometry_to_the_refined_pose() -> None:
     assert estimates[0].correction is None, "one keyframe gives none"
 
 
-@pytest.mark.parametrize(
-    ("frame", "parameters", "said"),
-    [("map", {}, True), ("odom", {"frames.map_frame": "odom"}, True), ("map", {"frames.map_frame": "world"}, False)],
-)
-def test_one_name_for_the_map_and_the_frame_of_the_input_is_said(
-    frame: str, parameters: dict[str, object], said: bool
-) -> None:
-    data, backend = data_of(), Backend(Config().with_values(parameters))
-    backend.add(data.rig)
-    for keyframe in data.keyframes[:2]:
-        backend.add(dataclasses.replace(keyframe, frame_id=frame))
-    assert any("frames.map_frame too" in text for text in backend.report.warnings) == said, backend.report.warnings
-
-
 @pytest.mark.slow
 def test_a_gate_holds_the_correction_and_the_report_says_so() -> None:
     config = Config().with_values({"frames.gate_m": 1e-6, "frames.gate_confirmations": 1000})
