@@ -51,6 +51,9 @@ def main() -> int:
         say = print if args.verbose else lambda _: None
         comparisons.append(suite.compare(problem, prepared, here, peak, args.repeats, limits, say))
         print("\n" + problem_section(comparisons[-1]), flush=True)
+    if not comparisons:
+        print("benchmarks: nothing was run; name the folder of the data sets by --data", file=sys.stderr)
+        return 2
     _write(args.out, comparisons, absent, peak)
     return 0
 
@@ -111,8 +114,7 @@ def _write(out: Path, comparisons: list[suite.Comparison], absent: list[str], pe
     (out / "report.md").write_text(
         f"## Against the fastest peer\n\n{text}\n\n## Objective at the end\n\n{ranked}\n\n## Problems\n\n{sections}"
     )
-    if comparisons:
-        (out / "profiles.png").write_bytes(png(plots.profiles(short)))
+    (out / "profiles.png").write_bytes(png(plots.profiles(short)))
     if growth:
         (out / "growth.png").write_bytes(png(plots.growth(growth)))
     try:

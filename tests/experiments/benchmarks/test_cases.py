@@ -107,3 +107,11 @@ def test_an_unknown_problem_is_named() -> None:
     command = [sys.executable, "-m", "experiments.benchmarks", "--problems", "nowhere"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2 and "no problem is called 'nowhere'" in done.stderr
+
+
+def test_that_no_data_was_found_is_said(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "experiments.benchmarks", "--problems", "ladybug", "--solvers", "ba_node"]
+    command += ["--data", str(tmp_path), "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2 and done.stderr.startswith("benchmarks: nothing was run"), done.stderr
+    assert not (tmp_path / "out").exists()
