@@ -30,6 +30,7 @@ COMMON = (
     "bindings/module",
     "bindings/patches",
     "bindings/steps",
+    "bindings/views",
     "bindings/window",
     "targets/target",
     "adjustment/layout",

@@ -22,8 +22,14 @@ template <class T>
 using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
 using Doubles = Array<double>;
 using Ints = Array<std::int64_t>;
-// To be written to: never converted, as what is written would be lost.
-using OutDoubles = py::array_t<double, py::array::c_style>;
+// Never converted: what is written would be lost, and to copy a map's column takes longer than the call.
+template <class T>
+using Column = py::array_t<T, py::array::c_style>;
+using OutDoubles = Column<double>;
+
+inline Ints ints(const std::vector<std::int64_t>& values) {
+  return Ints(static_cast<py::ssize_t>(values.size()), values.data());
+}
 
 inline Doubles empty(std::vector<py::ssize_t> shape) { return Doubles(std::move(shape)); }
 

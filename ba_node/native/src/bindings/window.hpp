@@ -29,6 +29,7 @@ auto unless_short(std::int64_t n_obs, F f) {
 }
 
 void bind_window(pybind11::module_& m);
+void bind_views(pybind11::module_& m);
 void bind_steps(pybind11::module_& m);
 void bind_patches(pybind11::module_& m);
 void bind_bal(pybind11::module_& m);
