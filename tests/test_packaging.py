@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import ast
 import importlib
+import importlib.metadata
 import os
 import re
 import shutil
@@ -13,6 +14,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 import ba_node
 
@@ -171,3 +174,35 @@ def test_wheel_holds_all_that_is_needed_at_run_time(tmp_path: Path) -> None:
     assert "ba_node/py.typed" in names
     assert modules <= set(names), f"not in the wheel: {modules - set(names)}"
     assert shared <= {name.removeprefix(data) for name in names}
+
+
+def _needs_newer(line: str, oldest: str) -> bool | None:
+    """Return whether a pinned package is for a newer Python than the oldest; None if not asked for, or not here."""
+    wanted = Requirement(line)
+    short = oldest.rpartition(".")[0]
+    if wanted.marker and not wanted.marker.evaluate({"python_version": short, "python_full_version": oldest}):
+        return None
+    try:
+        here = importlib.metadata.metadata(wanted.name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    # Of another version, which newer Pythons take, nothing is known here.
+    if not wanted.specifier.contains(here["Version"]):
+        return None
+    return not SpecifierSet(here["Requires-Python"] or "").contains(oldest)
+
+
+def test_pinned_packages_install_on_the_oldest_python() -> None:
+    oldest = re.search(r'python_requires="(.+?)"', (ROOT / "setup.py").read_text())
+    assert oldest is not None
+    patch = f"{oldest[1].strip('>=')}.0"
+    lines = [
+        line
+        for name in ("build", "ros", "run", "extras", "dev", "constraints")
+        for line in (ROOT / "requirements" / f"{name}.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
+    asked = {line: _needs_newer(line, patch) for line in lines}
+    assert sum(newer is not None for newer in asked.values()) > 50, "hardly any is installed here"
+    newer = [line for line, is_newer in asked.items() if is_newer]
+    assert not newer, f"not for Python {patch}; give them a marker python_version, and another version below it"
