@@ -59,7 +59,8 @@ def find(build: Path, python: str) -> tuple[list[Solver], list[str]]:
         ours += [Solver(f"ceres {name}", (str(driver),), name, quick=name == "dense") for name in _CERES]
     else:
         absent.append(f"ceres: {reason}")
-    rootba = next(filter(None, map(shutil.which, ("bal", "bal_sc"))), None)
+    # bal_sc takes the square root too, and then forms the Schur complement all the same.
+    rootba = shutil.which("bal")
     if rootba is None:
         absent.append("rootba: its program bal is not on the PATH")
     for name in _ROOTBA if rootba else ():
