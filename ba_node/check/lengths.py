@@ -47,6 +47,7 @@ _SURELY = 0.7
 _DEPTHS_M, _COMPARED, _NEARER = (0.05, 200.0), 20, 0.25
 # Smaller shifts of all disparities are not named, px.
 _LEAST_SHIFT_PX = 0.5
+_ORDER = "camera_index in the feature_tracks, or the order of the cameras in camera_rig"
 # Keyframes that are needed to judge lengths.
 _KEYFRAMES = 10
 
@@ -229,6 +230,10 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
         causes |= _of_shift(tracks, camera, abs(shift) * baseline)
     if not causes or scaled < shifted / _SURELY or 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
         causes |= _of_factor(camera, baseline, factor)
+        for other in range(1, len(tracks.cameras.model)):
+            known = float(np.linalg.norm(tracks.between_cameras(0, other).translation))
+            if other != camera and _alike([np.log(baseline / factor / max(known, 1e-9))], _LENGTH_FACTOR):
+                causes = {f"cameras {camera} and {other} swapped": _ORDER, **causes}
     if factor < 1.0 / _GROSS and speed_of(tracks) > FASTEST:
         causes = {_scale_of_steps(factor): POSITIONS}
     return Diagnosis([Finding(tuple(causes), evidence, tuple(causes.values()))], rows=rows)

@@ -185,6 +185,28 @@ def _late(by: int) -> Wrong:
     return go
 
 
+def _steps(rotation: FloatArray, position: FloatArray, _: SyntheticData) -> tuple[FloatArray, FloatArray]:
+    """Return the steps from the keyframe before, the first pose as it is."""
+    back = geometry.inverse(rotation[:-1], position[:-1])
+    steps = geometry.compose(*back, rotation[1:], position[1:])
+    return np.concatenate([rotation[:1], steps[0]]), np.concatenate([position[:1], steps[1]])
+
+
+def _against_first(rotation: FloatArray, position: FloatArray, inverted: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Return the second camera against the first, as calibration tools give it."""
+    found = geometry.compose(*geometry.inverse(rotation[:1], position[:1]), rotation[1:], position[1:])
+    second = geometry.inverse(*found) if inverted else found
+    return np.concatenate([rotation[:1], second[0]]), np.concatenate([position[:1], second[1]])
+
+
+def _of_camera(camera: int, change: Callable[[FloatArray], FloatArray]) -> Wrong:
+    """Return what gives the pixels of one camera otherwise."""
+    return images(lambda one: dataclasses.replace(one, uv=change(one.uv)) if one.camera_index == camera else one)
+
+
+_Y, _Y_Z, _Z = (np.diag(signs) for signs in ([1.0, -1.0, 1.0], [1.0, -1.0, -1.0], [1.0, 1.0, -1.0]))
+_SWAPPED, _LEFT = np.eye(3)[[1, 0, 2]], geometry.so3_exp(np.radians([0.0, 0.0, 90.0]))
+
 WRONG: dict[str, Wrong] = {
     "baseline reversed": rig(_reversed),
     "rig swapped": rig(lambda r, p: (r[::-1], p[::-1])),
@@ -208,6 +230,28 @@ WRONG: dict[str, Wrong] = {
             p,
         )
     ),
+    "left-handed": poses(lambda r, p, _: (_Y @ r @ _Y, p @ _Y)),
+    "left-handed, z": poses(lambda r, p, _: (_Z @ r @ _Z, p @ _Z)),
+    "forward-right-down": poses(lambda r, p, _: (_Y_Z @ r @ _Y_Z, p @ _Y_Z)),
+    "orientations clockwise": poses(lambda r, p, _: (_Y @ r @ _Y, p)),
+    "compass headings": poses(lambda r, p, _: (_LEFT @ _Y @ r @ _Y, p)),
+    "headings from north": poses(lambda r, p, _: (_LEFT @ r, p)),
+    "orientations north-east-down": poses(lambda r, p, _: (_SWAPPED @ _Z @ r @ _Y_Z, p)),
+    "positions north-east": poses(lambda r, p, _: (r, p @ _SWAPPED)),
+    "positions with another y": poses(lambda r, p, _: (r, p @ _Y)),
+    "poses as steps": poses(_steps),
+    "no positions": poses(lambda r, p, _: (r, np.zeros_like(p))),
+    "no orientations": poses(lambda r, p, _: (np.tile(np.eye(3), (len(r), 1, 1)), p)),
+    "OpenGL cameras": rig(lambda r, p: (r @ _Y_Z, p)),
+    "camera 1 against camera 0": rig(_against_first),
+    "camera 1 from camera 0": rig(lambda r, p: _against_first(r, p, inverted=True)),
+    "yaw 20 of the wrong sign": rig(lambda r, p: (geometry.so3_exp(np.radians([0.0, 0.0, -40.0])) @ r, p)),
+    "looks to the other side": rig(lambda r, p: (_LEFT @ _LEFT @ r, p @ _LEFT @ _LEFT)),
+    "camera 1 upside down": _of_camera(1, lambda uv: np.array([639.0, 479.0]) - uv),
+    "camera 0 upside down": _of_camera(0, lambda uv: np.array([639.0, 479.0]) - uv),
+    "camera 1 mirrored": _of_camera(1, lambda uv: np.array([639.0, 0.0]) + np.array([-1.0, 1.0]) * uv),
+    "k of camera 1 halved": intrinsics(lambda k: k * np.array([[1.0], [0.5]])),
+    "k of camera 0 doubled": intrinsics(lambda k: k * np.array([[2.0], [1.0]])),
     "turned 1 about y": turned(1.0, (0.0, 1.0, 0.0)),
     "turned 1 about x": turned(1.0, (1.0, 0.0, 0.0)),
     "turned 2 about z": turned(2.0, (0.0, 0.0, 1.0)),
