@@ -40,6 +40,8 @@ _TURNED_DEG = 5.0
 # Points meet if they do so to this many times the usual distance.
 _MEET = 3.0
 _ITERATIONS, _HALF = 10, 2.0
+# Of fewer points mismatches tell nine unknowns as well as the rest; that images are mirrored is plain.
+_POINTS = 35
 # What to change.
 ADVICE = "images as they were before, or another session_id with a camera_rig that is theirs"
 
@@ -169,6 +171,8 @@ def _resection(
     ray, nearness, seen, flat = ray[ok], nearness[ok], seen[ok], expected[0][ok]
     slopes = np.array([_slope(flat[:, i], seen[:, i]) for i in range(2)])
     signs = np.where(slopes < _MIRRORED, -1.0, 1.0)
+    if (signs > 0.0).all() and len(ray) < _POINTS:
+        return None
     seen = seen * signs
     zoom = np.clip(np.mean(np.abs(slopes)), 0.2, 5.0)
     value = np.array([np.log(zoom), *np.median(seen - zoom * flat, axis=0)])

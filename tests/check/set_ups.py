@@ -199,6 +199,18 @@ def _against_first(rotation: FloatArray, position: FloatArray, inverted: bool = 
     return np.concatenate([rotation[:1], second[0]]), np.concatenate([position[:1], second[1]])
 
 
+def _along_rays(data: SyntheticData) -> SyntheticData:
+    focal, centre = data.rig.intrinsics[0, :2], data.rig.intrinsics[0, 2:]
+
+    def change(one: FeatureTracks) -> FeatureTracks:
+        if not len(one.depth_m):
+            return one
+        length = np.sqrt(1.0 + (((one.uv - centre) / focal) ** 2).sum(axis=1))
+        return dataclasses.replace(one, depth_m=length * one.depth_m)
+
+    return images(change)(data)
+
+
 def _of_camera(camera: int, change: Callable[[FloatArray], FloatArray]) -> Wrong:
     """Return what gives the pixels of one camera otherwise."""
     return images(lambda one: dataclasses.replace(one, uv=change(one.uv)) if one.camera_index == camera else one)
@@ -282,6 +294,8 @@ WRONG: dict[str, Wrong] = {
     "depth in cm": images(lambda one: dataclasses.replace(one, depth_m=100.0 * one.depth_m)),
     "depth in km": images(lambda one: dataclasses.replace(one, depth_m=0.001 * one.depth_m)),
     "depth times 1.1": images(lambda one: dataclasses.replace(one, depth_m=1.1 * one.depth_m)),
+    "depth along rays": _along_rays,
+    "depth of other points": images(lambda one: dataclasses.replace(one, depth_m=one.depth_m[::-1].copy())),
     "inverse depth": images(lambda one: dataclasses.replace(one, depth_m=1.0 / one.depth_m)),
     "normalised": images(lambda one: dataclasses.replace(one, uv=(one.uv - [320.0, 240.0]) / 349.0)),
     "slots": _slots,

@@ -90,6 +90,8 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "depth in cm": (("rgbd",), "depth_m in centimetres"),
     "depth in km": (("rgbd",), "depth_m in kilometres"),
     "depth times 1.1": (("rgbd",), r"scale of depth_m: it is 1\.(09|1[0-2]?) times"),
+    "depth along rays": (("rgbd",), "^depth_m is the distance from the camera along the ray"),
+    "depth of other points": (("rgbd",), "^depth_m is of other points: of another image"),
     "inverse depth": (("rgbd",), "depth_m holds inverse depths"),
     "normalised": (("stereo", "mono"), "image coordinates are not in pixels"),
     "ids of each camera": (("stereo",), "track ids of cameras 0 and 1 do not name the same points"),
@@ -170,7 +172,7 @@ def test_two_cameras_without_a_common_track_are_named_where_the_steps_tell_no_sc
 @pytest.mark.parametrize("mode", ["stereo", "mono"])
 def test_cameras_that_look_aside_on_a_straight_way_are_not_taken_for_mirrored_images(mode: str) -> None:
     drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.02, "look_deg": 20.0}
-    found = examine(seen(recording(2, "yaw 20 of the wrong sign", mode, path="line", **drift)))  # type: ignore[arg-type]
+    found = examine(seen(recording(2, "yaw 20 of the wrong sign", mode, path="line", **drift)))
     assert re.match(r"camera 0 does not fit its place on the body by about (3\d|4[0-4]) degrees", found.causes()), (
         found.summary()
     )
@@ -179,8 +181,18 @@ def test_cameras_that_look_aside_on_a_straight_way_are_not_taken_for_mirrored_im
 @pytest.mark.parametrize("path", ["line", "loop"])
 def test_mirrored_images_of_a_camera_that_looks_aside_are_no_inverted_poses(path: str) -> None:
     drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.02, "look_deg": 90.0}
-    found = examine(seen(recording(2, "mirrored", "mono", path=path, **drift)))  # type: ignore[arg-type]
+    found = examine(seen(recording(2, "mirrored", "mono", path=path, **drift)))
     assert found.causes() == "images mirrored: left and right are exchanged", found.summary()
+
+
+@pytest.mark.parametrize("look_deg", [0.0, 90.0, 45.0])
+def test_noise_of_depths_is_no_other_kind_of_depth(look_deg: float) -> None:
+    """A wall at one distance, and depths that scatter by more than what there is to see."""
+    for wrong in ("", "depth of other points"):
+        data = recording(5, wrong, "rgbd", path="line", look_deg=look_deg, depth_noise=0.1, drift_rotation_deg=0.3)
+        found = examine(seen(data))
+        assert bool(found.findings) == bool(wrong), found.summary()
+    assert "depth_m is of other points" in found.causes(), found.summary()
 
 
 @pytest.mark.parametrize(("order", "named"), [([2, 0, 1], "1, 2, 0"), ([0, 2, 1], "cameras 2 and 1 swapped")])
