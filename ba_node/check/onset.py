@@ -40,6 +40,8 @@ _TURNED_DEG = 5.0
 # Points meet if they do so to this many times the usual distance.
 _MEET = 3.0
 _ITERATIONS, _HALF = 10, 2.0
+# An image taken so many times farther from those that place points than these are apart may see any of them elsewhere.
+_FARTHER = 5.0
 # Of fewer points mismatches tell nine unknowns as well as the rest; that images are mirrored is plain.
 _POINTS = 35
 # What to change.
@@ -140,6 +142,12 @@ def _change(tracks: Tracks, camera: int, before: int, k: int) -> Change | None:
         first, second = tracks.match(far, near)
         _, at, of = np.intersect1d(second, rows, assume_unique=True, return_indices=True)
         if len(at) >= two_view.MIN_PAIRS:
+            placing, step = (
+                float(np.linalg.norm(tracks.between_images(*two).translation)) for two in ((far, near), (near, own))
+            )
+            if step > _FARTHER * placing:
+                # Where points that had no parallax are seen from there is not known, as after a stand-still.
+                return None
             nearness, meet = _nearness(tracks, far, near, (first[at], second[at]))
             of = of[meet]
             return _resection(tracks, (near, own), tracks.ray[rows[of]], nearness[meet], tracks.ray[seen[of]])

@@ -30,8 +30,10 @@ def recording(seed: int = 3, wrong: str = "", mode: str = "stereo", **options: A
     """Return a recording of a mode (stereo, mono, rgbd) along a loop of 52 m, or a line of 40 m, given wrongly."""
     length = 40.0 if options.get("path") == "line" else 52.0
     depth = {"depth_share": 0.8} if mode == "rgbd" else {}
-    if wrong == "not rectified":
+    if wrong in ("not rectified", "other signs of d"):
         options["distortion"] = "plumb_bob"
+    if wrong == "plumb_bob given":
+        options["distortion"] = "equidistant"
     chosen = {"baseline_m": 0.12 if mode == "stereo" else 0.0, "length_m": length, **depth, **options}
     data = generated(SyntheticOptions(seed=seed, **chosen))
     return WRONG[wrong](data) if wrong else data
@@ -199,6 +201,18 @@ def _against_first(rotation: FloatArray, position: FloatArray, inverted: bool = 
     return np.concatenate([rotation[:1], second[0]]), np.concatenate([position[:1], second[1]])
 
 
+def _lens(model: str, change: Callable[[FloatArray], FloatArray]) -> Wrong:
+    """Return what gives another distortion model, and coefficients otherwise."""
+
+    def go(data: SyntheticData) -> SyntheticData:
+        lens = tuple(change(one) for one in data.rig.distortion)
+        return dataclasses.replace(
+            data, rig=dataclasses.replace(data.rig, models=(model,) * len(data.rig), distortion=lens)
+        )
+
+    return go
+
+
 def _along_rays(data: SyntheticData) -> SyntheticData:
     focal, centre = data.rig.intrinsics[0, :2], data.rig.intrinsics[0, 2:]
 
@@ -288,6 +302,8 @@ WRONG: dict[str, Wrong] = {
             data.rig, models=("equidistant",) * len(data.rig), distortion=(np.zeros(4),) * len(data.rig)
         ),
     ),
+    "plumb_bob given": _lens("plumb_bob", lambda d: np.append(d, 0.0)),
+    "other signs of d": _lens("plumb_bob", lambda d: -d),
     "depth in mm": images(lambda one: dataclasses.replace(one, depth_m=1000.0 * one.depth_m)),
     "depth times 6": images(lambda one: dataclasses.replace(one, depth_m=6.0 * one.depth_m)),
     "poses over 6": poses(lambda r, p, _: (r, p / 6.0)),

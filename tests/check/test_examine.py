@@ -86,6 +86,8 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "not rectified": (("stereo", "mono"), "images not rectified though no distortion is given"),
     "rectified": (("stereo", "mono"), "images rectified though a distortion is given"),
     "fisheye given": (("stereo", "mono"), "images rectified though the model of a fisheye lens is given"),
+    "plumb_bob given": (("mono",), "^distortion_model is not that of the coefficients: .* as those of equidistant"),
+    "other signs of d": (("mono",), "^coefficients of the distortion with other signs"),
     "depth in mm": (("rgbd",), "depth_m in millimetres"),
     "depth in cm": (("rgbd",), "depth_m in centimetres"),
     "depth in km": (("rgbd",), "depth_m in kilometres"),
@@ -116,7 +118,7 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
 # The quick tests do with one rig. These are told by adjustments of seconds, in which all cameras change alike: with one
 # camera, and with one amount and one lens of what is adjusted alike.
 ADJUSTED = ("focal 0.8", "focal 0.5", "fx alone", "binning", "not rectified", "rectified", "fisheye given")
-ALIKE = ("focal 0.5", "fisheye given", "principal point of camera 1, u")
+ALIKE = ("focal 0.5", "other signs of d", "fisheye given", "principal point of camera 1, u")
 CASES = [
     pytest.param(
         wrong,
