@@ -133,7 +133,9 @@ def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
     """Tell of mistakes that show where the camera turns; None if turns do not say so."""
     if np.count_nonzero(now.rotation > _DIFFERENT_DEG) < _TURNS:
         return None  # nothing can be so much nearer
-    tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in LAGS}
+    # A keyframe's step is a little thing: outliers tell it of turns too.
+    lags = LAGS if agreed(usable) else ()
+    tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in lags}
     tried |= {flip: compare(tracks, flipped(usable, flip)) for flip in _flips(tracks)}
     off = {one: float(np.mean(it.rotation)) for one, it in tried.items() if now.turns_worse_than(it)}
     for one in in_motion(tracks):

@@ -211,6 +211,20 @@ def test_three_cameras_in_another_order_are_named(order: list[int], named: str) 
     assert named in found.findings[0].causes[0], found.summary()
 
 
+def test_turns_among_many_outliers_tell_no_delay() -> None:
+    drift = {"drift_rotation_deg": 1.0, "drift_translation": 0.06, "outlier_share": 0.3, "noise_px": 1.0}
+    path = {"path": "loop", "length_m": 30.0, "keyframes": 60, "look_deg": 90.0}
+    sent = spoiled("sound", "mono", seed=281, **drift, **path)  # type: ignore[arg-type]
+    scene = Scene(Config().scene)
+    ids = {keyframe.keyframe_id for keyframe in sent.keyframes[:40]}
+    for measurement in sent.measurements:
+        if isinstance(measurement, CameraRig) or getattr(measurement, "keyframe_id", None) in ids:
+            scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    assert not examine(tracks).findings
+
+
 def test_poses_that_stand_still_with_the_camera_are_no_mistake() -> None:
     """Nothing is said of poses that are all the same until many keyframes see the camera move."""
     found = examine(seen(recording(wrong="no positions"), keyframes=10))
