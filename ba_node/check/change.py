@@ -136,7 +136,7 @@ def _gain(found: _Changed, given: Adjusted) -> float:
 
 
 def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:
-    """Return how far each keyframe is off where the front-end's step takes it from the one before, in usual steps.
+    """Return how far each keyframe is off where the front-end's step takes it from the one before, in steps.
 
     Steps are as long as those around them, one camera seeing no lengths; of the first it is 0. (n_kf,)
     """
@@ -150,7 +150,9 @@ def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:
     told = lengths[1] > _TELLING * usual[1]
     ratio = np.array([_usual(lengths, told, i) for i in range(n - 1)])
     ratio = np.where(np.isfinite(ratio), ratio, usual[0] / usual[1])
-    return np.append(0.0, np.linalg.norm(ours - ratio[:, None] * given, axis=1) / usual[0])
+    # What a long step is off by is a part of its own length.
+    length = np.maximum(usual[0], ratio * lengths[1])
+    return np.append(0.0, np.linalg.norm(ours - ratio[:, None] * given, axis=1) / length)
 
 
 def _usual(lengths: list[FloatArray], told: BoolArray, i: int) -> float:

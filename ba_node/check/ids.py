@@ -99,7 +99,8 @@ def _others_since(tracks: Tracks) -> int | None:
     for k in range(1, len(tracks)):
         camera = tracks.main_camera(k)
         rows = tracks.match((k - 1, camera or 0), (k, camera or 0))
-        if camera is not None and len(rows[0]) >= two_view.MIN_PAIRS:
+        # Mismatches alone make few that are shared disagree.
+        if camera is not None and len(rows[0]) >= 2 * two_view.MIN_PAIRS:
             off = np.linalg.norm(tracks.ray[rows[0]] - tracks.ray[rows[1]], axis=1)
             jumps.append((float(np.median(off)), k, camera))
 

@@ -245,6 +245,12 @@ def other_lenses(tracks: Tracks) -> list[Model]:
     if given[:, DISTORTION].any() and rational:
         cause = "images rectified though a distortion is given"
         models.append(Model(cause, f"d of {_INFO} to zeros (and k to that of the rectified image)", plain))
+        models.append(_of_model("equidistant (a fisheye lens)", given, cameras.Model.EQUIDISTANT))
+        signs = given.copy()
+        signs[:, DISTORTION] *= -1.0
+        models.append(
+            Model("coefficients of the distortion with other signs, as those that undo it", f"d of {_INFO}", signs)
+        )
     elif rational:
         cause = "images not rectified though no distortion is given"
         change = f"distortion_model and d of {_INFO}, or track in rectified images"
@@ -257,7 +263,15 @@ def other_lenses(tracks: Tracks) -> list[Model]:
         cause = "images rectified though the model of a fisheye lens is given"
         change = f"distortion_model of {_INFO} to plumb_bob and d to zeros (and k to that of the rectified image)"
         models.append(Model(cause, change, plain, cameras.Model.RATIONAL))
+        if given[:, DISTORTION].any():
+            models.append(_of_model("plumb_bob", given, cameras.Model.RATIONAL))
     return models
+
+
+def _of_model(name: str, given: FloatArray, lens: cameras.Model) -> Model:
+    """Return the cameras whose coefficients are those of another model than they are given as."""
+    cause = f"distortion_model is not that of the coefficients: they fit the tracks as those of {name}"
+    return Model(cause, f"distortion_model of {_INFO}", given, lens)
 
 
 def _square(given: FloatArray) -> list[Model]:

@@ -47,6 +47,11 @@ _SURELY = 0.7
 _DEPTHS_M, _COMPARED, _NEARER = (0.05, 200.0), 20, 0.25
 # Smaller shifts of all disparities are not named, px.
 _LEAST_SHIFT_PX = 0.5
+# Depths of other points follow those by steps to less than this part, where these spread by so many times their error.
+_FOLLOW, _TOLD, _MANY_POINTS = 0.4, 1.0, 200
+# What is laid to another kind of depth spreads by more than this.
+_LEAST_SPREAD = 0.03
+_ORDER = "camera_index in the feature_tracks, or the order of the cameras in camera_rig"
 # Keyframes that are needed to judge lengths.
 _KEYFRAMES = 10
 
@@ -69,6 +74,9 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         inverse = float(np.exp(np.median(np.log(given * found))))
         cause = f"depth_m holds inverse depths: it falls as depth grows (their product is {inverse:.3g})"
         return Diagnosis([_depth_finding(cause, f"against {by}")], rows=rows)
+    other = None if many_outliers else _along_rays(tracks, relations, pairs) or _of_other_points(relations, pairs)
+    if other is not None:
+        return Diagnosis([_depth_finding(other, f"against {by}")], rows=rows)
     if scatter > _AGREE:
         return Diagnosis(untold=[f"depths contradict {by}"], rows=rows)
     if _alike(ratio, _DEPTH_FACTOR):
@@ -80,6 +88,38 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     if moderate and not small and inner > _ALIKE * abs(np.log(factor)):
         return Diagnosis(untold=[f"depths contradict {by}, each by another factor: much may move"], rows=rows)
     return Diagnosis([_depth_or_steps(tracks, factor, f"over {len(pairs)} pairs of keyframes")], rows=rows)
+
+
+def _of_other_points(relations: list[Relation], pairs: list[tuple[FloatArray, FloatArray]]) -> str | None:
+    """Return in words that depths do not follow those by steps within the images; None if they do, or it is not known.
+
+    Of independent logarithms a and b the differences have the variance of both; of equal ones but for noise of a none
+    of that of b. How precisely b is known is told by its parallax.
+    """
+    given, found = (
+        np.concatenate([np.log(of) - np.median(np.log(of)) for of in part]) for part in zip(*pairs, strict=True)
+    )
+    across = [(one.pair.gate, two_view.depths(one.pair, one.pose)[2]) for one in relations if one.has_direction]
+    error = np.median(np.concatenate([gate / parallax[parallax > _PARALLAX * gate] for gate, parallax in across]))
+    a, b, off = (_deviation(part) ** 2 for part in (given, found, given - found))
+    follows = (a + b - off) / max(2.0 * b, 1e-12)
+    if len(given) < _MANY_POINTS or np.sqrt(b) < _TOLD * error or follows > _FOLLOW:
+        return None
+    return "depth_m is of other points: of another image (delayed, in another order), or not registered to the camera"
+
+
+def _along_rays(tracks: Tracks, relations: list[Relation], pairs: list[tuple[FloatArray, FloatArray]]) -> str | None:
+    """Return in words that depths are distances from the camera, if they are."""
+    undone = _depth_pairs(tracks, relations, tracks.depth_m / np.sqrt(1.0 + (tracks.ray**2).sum(axis=1)))
+    if len(undone) < _PAIRS:
+        return None
+    before, after = (np.concatenate([np.log(one / other) for one, other in part]) for part in (pairs, undone))
+    much, factor = _deviation(before), float(np.exp(np.median(after)))
+    if much < _LEAST_SPREAD or _deviation(after) > _SURELY * much or not 1.0 / _DEPTH_FACTOR < factor < _DEPTH_FACTOR:
+        return None
+    return (
+        f"depth_m is the distance from the camera along the ray: it grows towards the edges (by {np.std(before):.0%})"
+    )
 
 
 def _depth_or_steps(tracks: Tracks, factor: float, evidence: str) -> Finding:
@@ -229,6 +269,10 @@ def _lengths(tracks: Tracks, camera: int, baseline: float, pairs: list[tuple[Flo
         causes |= _of_shift(tracks, camera, abs(shift) * baseline)
     if not causes or scaled < shifted / _SURELY or 1.0 / _LENGTH_FACTOR < factor < _LENGTH_FACTOR:
         causes |= _of_factor(camera, baseline, factor)
+        for other in range(1, len(tracks.cameras.model)):
+            known = float(np.linalg.norm(tracks.between_cameras(0, other).translation))
+            if other != camera and _alike([np.log(baseline / factor / max(known, 1e-9))], _LENGTH_FACTOR):
+                causes = {f"cameras {camera} and {other} swapped": _ORDER, **causes}
     if factor < 1.0 / _GROSS and speed_of(tracks) > FASTEST:
         causes = {_scale_of_steps(factor): POSITIONS}
     return Diagnosis([Finding(tuple(causes), evidence, tuple(causes.values()))], rows=rows)

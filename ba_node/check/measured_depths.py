@@ -39,6 +39,8 @@ _SPREAD, _OF_MEDIAN, _FLOOR = 1.4826, 1.25, 0.001
 _OFFSET_M, _ERRORS, _TILT = 0.03, 4.5, 0.005
 # A smaller one may be of a focal length that bends the way.
 _OF_INTRINSICS_M = 0.06
+# Larger ones are hardly those of a sensor, m.
+_OF_SENSORS_M = 0.3
 # Medians that scatter by such a share about what an offset leaves are wrong, if that is so many standard errors.
 _BENT, _BENT_ERRORS = 0.01, 4.0
 # Keyframes at which it is asked, up to which a map is young, and from which on it is asked at once: with fewer, poses
@@ -104,6 +106,10 @@ def wrong_with(profile: Profile) -> Finding | None:
     }
     if abs(offset) < _OF_INTRINSICS_M:
         causes["focal length or principal point off by a few percent"] = "k of camera_info in camera_rig"
+    if abs(offset) > _OF_SENSORS_M:
+        causes["depth_m of another image (delayed), or not registered to the camera"] = (
+            "depth_m in the feature_tracks: that of the pixel, in its image"
+        )
     return Finding(tuple(causes), evidence, tuple(causes.values()))
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from ba_node.arrays import FloatArray
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row
-from ba_node.check.mistakes import FLIPS, LAGS, Flip, Mistake, finding, in_motion
-from ba_node.check.relations import Relation, agreed
+from ba_node.check.mistakes import FLIPS, Flip, Mistake, finding
+from ba_node.check.pose_mistakes import LAGS, in_motion
+from ba_node.check.relations import AGREED, Relation, agreed, of_cameras
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pair, Pose
 from ba_node.core import geometry
@@ -35,6 +36,12 @@ _TURNS = 4
 _ALIKE = 1.5
 # Angle by which cameras must be turned for all steps to point where the front-end's do.
 _BESIDE_DEG = 5.0
+# Positions and orientations that are the same in so many keyframes, to this, m, are not filled in where tracks move.
+_STAND_STILL, _NO_CHANGE = 15, 1e-9
+# What two cameras see fits with an exchange in the images undone if it explains this share of what it does as given.
+_FITS = 0.9
+# Rounds of an estimate of that turn, and what no turn at all weighs against the steps.
+_ROUNDS, _STAY = 8, 0.03
 # A hypothesis takes the place of what was given if it halves the angle.
 _BETTER = 0.5
 
@@ -42,6 +49,9 @@ _BETTER = 0.5
 def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     """Compare the front-end's steps with those of a camera."""
     usable = [one for one in relations if one.has_direction]
+    same = _all_the_same(tracks, usable)
+    if same is not None:
+        return same
     before = compare(tracks, usable)
     moving = before.length > 0.1 * np.median(before.length) if usable else np.zeros(0, bool)
     usable = [one for one, moves in zip(usable, moving, strict=True) if moves]
@@ -51,20 +61,68 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     if few and not (len(usable) >= _FEW_PAIRS and now.off.min() > _ABSURD_DEG):
         return _too_few(usable)
     rows = [now.row(test, "as given"), Row(test, "free", float(np.mean([one.share for one in usable])))]
-    if np.median(now.off) > DOUBTFUL_DEG:
-        tried = {one: compare(one.undo(tracks, 0), usable) for one in in_motion(tracks)}
-        rows += [other.row(test, one.name) for one, other in tried.items()]
-        best = min(float(np.median(other.off)) for other in tried.values())
-        named = [one for one, it in tried.items() if np.median(it.off) <= 1.15 * best + 1.0 and now.loses_to(it)]
-        if named:
-            evidence = (
-                f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, {best:.0f} with that undone"
-            )
-            if not few or max(float(tried[one].off.max()) for one in named) < DOUBTFUL_DEG:
-                return Diagnosis([finding(named, evidence)], rows=rows)
+    known = _by_known(tracks, usable, now, rows) if np.median(now.off) > DOUBTFUL_DEG else None
+    if known is not None:
+        return known
     if few:
         return _too_few(usable)
     return _by_turns(tracks, usable, now, rows) or _unnamed(tracks, usable, now, rows)
+
+
+def _all_the_same(tracks: Tracks, usable: list[Relation]) -> Diagnosis | None:
+    """Tell of positions or orientations that are not filled in; None if they change, or nothing else does."""
+    turn_deg = [float(np.degrees(np.linalg.norm(geometry.so3_log(one.pose.rotation)))) for one in usable]
+    turns = np.count_nonzero(np.array(turn_deg) > _DIFFERENT_DEG) >= _TURNS
+    same = [
+        (name, evidence)
+        for name, evidence, values, moves in (
+            ("position", "the camera moves", tracks.position, len(usable) > 0),
+            ("orientation", f"it turns by {max(turn_deg, default=0.0):.0f} degrees", tracks.rotation, turns),
+        )
+        if moves and float(np.ptp(values, axis=0).max()) < _NO_CHANGE
+    ]
+    if not same:
+        return None
+    names, evidence = (" and ".join(part) for part in zip(*same, strict=True))
+    verb = "are" if len(same) > 1 else "is"
+    if len(tracks) < _STAND_STILL or len(usable) < 2 * _PAIRS_NEEDED or not agreed(usable):
+        return Diagnosis(untold=[f"{names} of the poses {verb} the same in all keyframes"])
+    cause = f"{names} of the poses {verb} not filled in: the same in all keyframes"
+    return Diagnosis([Finding((cause,), f"by the tracks {evidence}", (f"the {names} in the keyframes",), usual=True)])
+
+
+def _by_known(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis | None:
+    """Tell of mistakes that are made often, which bring steps nearer to the tracks; None if none does."""
+    test, few = rows[0].test, len(usable) < _PAIRS_NEEDED
+    tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in in_motion(tracks)}
+    tried |= {flip: compare(tracks, flipped(usable, flip)) for flip in _flips(tracks)}
+    rows += [other.row(test, one.name) for one, other in tried.items()]
+    best = min(float(np.median(other.off)) for other in tried.values())
+    named = [one for one, it in tried.items() if np.median(it.off) <= 1.15 * best + 1.0 and now.loses_to(it)]
+    if not named or (few and max(float(tried[one].off.max()) for one in named) >= DOUBTFUL_DEG):
+        return None
+    if all(isinstance(one, Flip) for one in named):
+        if len(usable) < 2 * _PAIRS_NEEDED:
+            return None
+        # On a way that is nearly straight cameras that are turned pass for mirrored images.
+        turned = _turned(tracks, usable, now, rows)
+        if turned is not None and np.median(compare(tracks, usable, _turn(tracks, usable)).off) < best:
+            return turned
+    evidence = f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, {best:.0f} with that undone"
+    return Diagnosis([finding(named, evidence)], rows=rows)
+
+
+def _flips(tracks: Tracks) -> list[Flip]:
+    """Return the exchanges in the images of all cameras that two cameras of a keyframe do not exclude."""
+    both = of_cameras(tracks, 1) if len(tracks.cameras.model) > 1 else None
+    if both is None:
+        return list(FLIPS)
+    given = tracks.between_cameras(0, 1)
+    fits = two_view.share(both.pair, given)
+    if fits < max(_FITS * both.share, AGREED):
+        return list(FLIPS)
+    pairs = {flip: flip.rays(both.pair) for flip in FLIPS}
+    return [flip for flip, pair in pairs.items() if two_view.share(pair, given) >= _FITS * fits]
 
 
 def _too_few(usable: list[Relation]) -> Diagnosis:
@@ -75,17 +133,19 @@ def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
     """Tell of mistakes that show where the camera turns; None if turns do not say so."""
     if np.count_nonzero(now.rotation > _DIFFERENT_DEG) < _TURNS:
         return None  # nothing can be so much nearer
-    tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in LAGS}
-    for flip in FLIPS:
-        tried[flip] = compare(tracks, flipped(usable, flip))
+    # A keyframe's step is a little thing: outliers tell it of turns too.
+    lags = LAGS if agreed(usable) else ()
+    tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in lags}
+    tried |= {flip: compare(tracks, flipped(usable, flip)) for flip in _flips(tracks)}
     off = {one: float(np.mean(it.rotation)) for one, it in tried.items() if now.turns_worse_than(it)}
-    if not off:
-        return None
-    # Others may explain the turns as well.
     for one in in_motion(tracks):
         tried[one] = compare(one.undo(tracks, 0), usable)
-        if now.turns_worse_than(tried[one]) and np.median(tried[one].off) < 1.15 * np.median(now.off) + 1.0:
+        if now.turns_worse_than(tried[one]) and np.median(tried[one].off) < min(
+            1.15 * np.median(now.off) + 1.0, DOUBTFUL_DEG
+        ):
             off[one] = float(np.mean(tried[one].rotation))
+    if not off:
+        return None
     rows += [it.row(rows[0].test, one.name) for one, it in tried.items()]
     least = min(off.values())
     evidence = f"turns of the front-end are {np.mean(now.rotation):.1f} degrees off, {least:.1f} with that undone"
@@ -188,11 +248,23 @@ def contradicts(tracks: Tracks, relations: list[Relation], flip: Flip) -> bool:
 
 
 def _turn(given: Tracks, relations: list[Relation]) -> FloatArray:
-    """Return the rotation of the cameras that brings the given steps nearest to those of the tracks (Kabsch)."""
-    total = 0.1 * len(relations) * np.eye(3)
-    for one in relations:
-        step = given.between_images(one.a, one.b)
-        length = np.linalg.norm(step.translation)
-        total += np.outer(one.pose.translation, step.translation / length)
-        total += np.outer(geometry.so3_log(one.pose.rotation), geometry.so3_log(step.rotation))
-    return geometry.nearest_rotation(total)
+    """Return the rotation of the cameras that brings the given steps nearest to those of the tracks (Kabsch).
+
+    Of two images of a plane the tracks may tell the other relation: what is far off the rest counts little (Cauchy).
+    """
+    steps = [given.between_images(one.a, one.b) for one in relations]
+    told = np.array([step.translation / np.linalg.norm(step.translation) for step in steps])
+    seen = np.array([one.pose.translation for one in relations])
+    turns = np.array(
+        [
+            (geometry.so3_log(one.pose.rotation), geometry.so3_log(step.rotation))
+            for one, step in zip(relations, steps, strict=True)
+        ]
+    )
+    weight, turn = np.ones(len(steps)), np.eye(3)
+    for _ in range(_ROUNDS):
+        total = _STAY * weight.sum() * np.eye(3) + (seen.T * weight) @ told + (turns[:, 0].T * weight) @ turns[:, 1]
+        turn = geometry.nearest_rotation(total)
+        off = np.linalg.norm(seen - told @ turn.T, axis=1) + np.linalg.norm(turns[:, 0] - turns[:, 1] @ turn.T, axis=1)
+        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-9)) ** 2)
+    return turn

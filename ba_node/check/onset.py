@@ -40,6 +40,10 @@ _TURNED_DEG = 5.0
 # Points meet if they do so to this many times the usual distance.
 _MEET = 3.0
 _ITERATIONS, _HALF = 10, 2.0
+# An image taken so many times farther from those that place points than these are apart may see any of them elsewhere.
+_FARTHER = 5.0
+# Of fewer points mismatches tell nine unknowns as well as the rest; that images are mirrored is plain.
+_POINTS = 35
 # What to change.
 ADVICE = "images as they were before, or another session_id with a camera_rig that is theirs"
 
@@ -138,6 +142,12 @@ def _change(tracks: Tracks, camera: int, before: int, k: int) -> Change | None:
         first, second = tracks.match(far, near)
         _, at, of = np.intersect1d(second, rows, assume_unique=True, return_indices=True)
         if len(at) >= two_view.MIN_PAIRS:
+            placing, step = (
+                float(np.linalg.norm(tracks.between_images(*two).translation)) for two in ((far, near), (near, own))
+            )
+            if step > _FARTHER * placing:
+                # Where points that had no parallax are seen from there is not known, as after a stand-still.
+                return None
             nearness, meet = _nearness(tracks, far, near, (first[at], second[at]))
             of = of[meet]
             return _resection(tracks, (near, own), tracks.ray[rows[of]], nearness[meet], tracks.ray[seen[of]])
@@ -169,6 +179,8 @@ def _resection(
     ray, nearness, seen, flat = ray[ok], nearness[ok], seen[ok], expected[0][ok]
     slopes = np.array([_slope(flat[:, i], seen[:, i]) for i in range(2)])
     signs = np.where(slopes < _MIRRORED, -1.0, 1.0)
+    if (signs > 0.0).all() and len(ray) < _POINTS:
+        return None
     seen = seen * signs
     zoom = np.clip(np.mean(np.abs(slopes)), 0.2, 5.0)
     value = np.array([np.log(zoom), *np.median(seen - zoom * flat, axis=0)])

@@ -9,13 +9,14 @@ mistakes tried, and the nearest is named.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 
 import numpy as np
 
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
-from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding
+from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding, images_of_one
 from ba_node.check.motion import check_motion, compare, compare_steps, contradicts
 from ba_node.check.relations import AGREED, Relation, in_motion, of_cameras, relate, shared_views, spread
 from ba_node.check.tracks import Tracks
@@ -44,6 +45,9 @@ _ZOOMS, _CLOSER = (tuple(map(float, np.geomspace(1.0 / most, most, n))) for most
 # Another focal length explains so many times what the given one does.
 _BETTER = 1.1
 _INFO = "k in the camera_info of camera {camera}"
+# Cameras of which all orders are tried.
+_MOST_ORDERED = 4
+_ORDER = "camera_index in the feature_tracks, or the order of the cameras in camera_rig"
 # Pairs of keyframes that are needed to judge poses, and the share of them that must prefer another hypothesis.
 _PAIRS_NEEDED = 5
 _VOTES = 0.8
@@ -76,7 +80,7 @@ def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diag
         if (len(tracks) < _KEYFRAMES_TO_MEASURE or unclear) and not found.usual:
             found = Diagnosis(untold=[f"{why} to measure how camera {camera} is off its place"], rows=found.rows)
         compared[camera] = found
-    for found in _by_majority(tracks, compared).values():
+    for found in _by_majority(tracks, _order(tracks, compared)).values():
         outcome.add(found)
     return outcome
 
@@ -108,6 +112,33 @@ def _by_majority(tracks: Tracks, compared: dict[int, Diagnosis]) -> dict[int, Di
         [Finding((cause,), evidence, (change,))], rows=[row for one in compared.values() for row in one.rows]
     )
     return {0: first}
+
+
+def _order(tracks: Tracks, compared: dict[int, Diagnosis]) -> dict[int, Diagnosis]:
+    """Return what is found with another order of three or four cameras named too, if that undoes what is wrong."""
+    wrong = [camera for camera, one in compared.items() if one.harmful]
+    if not wrong or not 3 <= len(tracks.cameras.model) <= _MOST_ORDERED:
+        return compared
+    relations = {camera: relation for camera in compared if (relation := of_cameras(tracks, camera)) is not None}
+    rig, orders = tracks.cameras, []
+    for order in itertools.permutations(range(len(rig.model))):
+        rows = list(order)
+        placed = dataclasses.replace(rig, rotation=rig.rotation[rows], translation=rig.translation[rows])
+        other = dataclasses.replace(tracks, cameras=placed)
+        shares = [two_view.share(one.pair, other.between_cameras(0, camera)) for camera, one in relations.items()]
+        if all(share >= _NAMED * one.share for share, one in zip(shares, relations.values(), strict=True)):
+            orders.append(", ".join(map(str, order)))
+    if not orders:
+        return compared
+    cause = f"cameras in another order than in camera_rig: they sit where it says that {' or '.join(orders)} do"
+    for camera in wrong:
+        found = []
+        for one in compared[camera].findings:
+            # Of a known mistake either may be it; a camera that is somewhere else is explained by the order.
+            causes, changes = (one.causes, one.changes) if one.usual else ((), ())
+            found.append(dataclasses.replace(one, causes=(cause, *causes), changes=(_ORDER, *changes), usual=True))
+        compared = compared | {camera: dataclasses.replace(compared[camera], findings=found)}
+    return compared
 
 
 def _zoom_of(tracks: Tracks, camera: int) -> float:
@@ -164,9 +195,14 @@ def _check_camera(tracks: Tracks, camera: int, relation: Relation, related: Call
     rows = [_row(test, "as given", relation, now), _row(test, "free", relation, relation.pose)]
     if not np.linalg.norm(now.translation) > 0.0:
         return _same_place(camera, relation, rows)
-    if rows[0].share >= max(_FITS * rows[1].share, _CONTRADICT):
-        return Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
-    others = {one: one.undo(tracks, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS}
+    fits = Diagnosis(sound=[f"camera {camera} is where the rig says"], rows=rows)
+    # Nothing that is estimated explains images of another kind, as mirrored ones, any better.
+    as_good = rows[0].share >= max(_FITS * rows[1].share, _CONTRADICT)
+    if as_good and rows[0].share >= AGREED:
+        return fits
+    others: dict[Mistake | Flip, Pose] = {
+        one: one.undo(tracks, camera).between_cameras(0, camera) for one in BETWEEN_CAMERAS
+    }
     # Where points are far, consensus finds one of many relations; a usual mistake may be the way to a better one.
     near = (relation.at(two_view.refined(relation.pair, pose)) for pose in others.values())
     relation = max((relation, *near), key=lambda one: one.share)
@@ -180,15 +216,20 @@ def _check_camera(tracks: Tracks, camera: int, relation: Relation, related: Call
         seen = of_cameras(flip.undo(tracks), camera)
         if seen is not None and not contradicts(tracks, related(), flip):
             tried[flip] = _row(test, flip.name, seen, now)
+    for alone in images_of_one(tracks, camera):
+        seen = relation.seen_by(alone.undo(tracks, camera))
+        tried[alone] = _row(test, alone.name.format(camera=camera), seen, now)
     rows += tried.values()
     best = max(one.share for one in tried.values())
+    if as_good and rows[0].share >= _FITS * best:
+        return fits
     named = [
         mistake
         for mistake, one in tried.items()
         if one.share >= max(0.97 * best, _NAMED * rows[1].share)
         and one.rotation_deg < _TURNED_DEG
         and not one.direction_deg > rows[0].direction_deg
-        and (isinstance(mistake, Flip) or _differ(now, others[mistake]))
+        and (mistake not in others or _differ(now, others[mistake]))
     ]
     if not named:
         return _misfit(camera, relation, now, rows)

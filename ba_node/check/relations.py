@@ -48,6 +48,13 @@ class Relation:
         parallax = float(np.median(across) / self.pair.gate) if len(across) else 0.0
         return dataclasses.replace(self, pose=pose, share=float(good.mean()), parallax=parallax)
 
+    def seen_by(self, tracks: Tracks) -> Relation:
+        """Return the same images as other tracks with the same rows have them."""
+        pair = rays(tracks, (self.rows_a, self.rows_b))
+        return dataclasses.replace(self, pair=pair).at(
+            two_view.refined(pair, tracks.between_cameras(self.a[1], self.b[1]))
+        )
+
     @property
     def has_direction(self) -> bool:
         """Return True if there is parallax enough to tell where the translation points."""
@@ -70,11 +77,20 @@ def _nearer(found: Relation, given: Pose) -> Relation:
     Two relations explain the images of a plane, as of a wall beside the way (Longuet-Higgins, *The reconstruction of a
     plane surface from two perspective projections*, 1986), and a few points off the plane hardly choose between them.
     """
-    off = np.nan_to_num(given.direction_from(found.pose), nan=0.0) + 2.0 * given.turned_from(found.pose)
+    off = _off(found.pose, given)
     if off < _FAR_DEG or not np.linalg.norm(given.translation) > 0.0:
         return found
     other = found.at(two_view.refined(found.pair, given))
-    return other if other.share >= _AS_GOOD * found.share else found
+    if other.share >= _AS_GOOD * found.share and _off(other.pose, given) < off:
+        return other
+    # Where what was given is mirrored, the other way round may lead to the better one of the two.
+    back = found.at(two_view.refined(found.pair, Pose(given.rotation, -given.translation)))
+    return back if back.share * _AS_GOOD > found.share else found
+
+
+def _off(pose: Pose, given: Pose) -> float:
+    """Return how far a relation is off the given one, degrees."""
+    return float(np.nan_to_num(given.direction_from(pose), nan=0.0)) + 2.0 * given.turned_from(pose)
 
 
 def rays(tracks: Tracks, rows: tuple[IntArray, IntArray]) -> Pair:

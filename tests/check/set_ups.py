@@ -30,8 +30,10 @@ def recording(seed: int = 3, wrong: str = "", mode: str = "stereo", **options: A
     """Return a recording of a mode (stereo, mono, rgbd) along a loop of 52 m, or a line of 40 m, given wrongly."""
     length = 40.0 if options.get("path") == "line" else 52.0
     depth = {"depth_share": 0.8} if mode == "rgbd" else {}
-    if wrong == "not rectified":
+    if wrong in ("not rectified", "other signs of d"):
         options["distortion"] = "plumb_bob"
+    if wrong == "plumb_bob given":
+        options["distortion"] = "equidistant"
     chosen = {"baseline_m": 0.12 if mode == "stereo" else 0.0, "length_m": length, **depth, **options}
     data = generated(SyntheticOptions(seed=seed, **chosen))
     return WRONG[wrong](data) if wrong else data
@@ -185,6 +187,52 @@ def _late(by: int) -> Wrong:
     return go
 
 
+def _steps(rotation: FloatArray, position: FloatArray, _: SyntheticData) -> tuple[FloatArray, FloatArray]:
+    """Return the steps from the keyframe before, the first pose as it is."""
+    back = geometry.inverse(rotation[:-1], position[:-1])
+    steps = geometry.compose(*back, rotation[1:], position[1:])
+    return np.concatenate([rotation[:1], steps[0]]), np.concatenate([position[:1], steps[1]])
+
+
+def _against_first(rotation: FloatArray, position: FloatArray, inverted: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Return the second camera against the first, as calibration tools give it."""
+    found = geometry.compose(*geometry.inverse(rotation[:1], position[:1]), rotation[1:], position[1:])
+    second = geometry.inverse(*found) if inverted else found
+    return np.concatenate([rotation[:1], second[0]]), np.concatenate([position[:1], second[1]])
+
+
+def _lens(model: str, change: Callable[[FloatArray], FloatArray]) -> Wrong:
+    """Return what gives another distortion model, and coefficients otherwise."""
+
+    def go(data: SyntheticData) -> SyntheticData:
+        lens = tuple(change(one) for one in data.rig.distortion)
+        return dataclasses.replace(
+            data, rig=dataclasses.replace(data.rig, models=(model,) * len(data.rig), distortion=lens)
+        )
+
+    return go
+
+
+def _along_rays(data: SyntheticData) -> SyntheticData:
+    focal, centre = data.rig.intrinsics[0, :2], data.rig.intrinsics[0, 2:]
+
+    def change(one: FeatureTracks) -> FeatureTracks:
+        if not len(one.depth_m):
+            return one
+        length = np.sqrt(1.0 + (((one.uv - centre) / focal) ** 2).sum(axis=1))
+        return dataclasses.replace(one, depth_m=length * one.depth_m)
+
+    return images(change)(data)
+
+
+def _of_camera(camera: int, change: Callable[[FloatArray], FloatArray]) -> Wrong:
+    """Return what gives the pixels of one camera otherwise."""
+    return images(lambda one: dataclasses.replace(one, uv=change(one.uv)) if one.camera_index == camera else one)
+
+
+_Y, _Y_Z, _Z = (np.diag(signs) for signs in ([1.0, -1.0, 1.0], [1.0, -1.0, -1.0], [1.0, 1.0, -1.0]))
+_SWAPPED, _LEFT = np.eye(3)[[1, 0, 2]], geometry.so3_exp(np.radians([0.0, 0.0, 90.0]))
+
 WRONG: dict[str, Wrong] = {
     "baseline reversed": rig(_reversed),
     "rig swapped": rig(lambda r, p: (r[::-1], p[::-1])),
@@ -208,6 +256,28 @@ WRONG: dict[str, Wrong] = {
             p,
         )
     ),
+    "left-handed": poses(lambda r, p, _: (_Y @ r @ _Y, p @ _Y)),
+    "left-handed, z": poses(lambda r, p, _: (_Z @ r @ _Z, p @ _Z)),
+    "forward-right-down": poses(lambda r, p, _: (_Y_Z @ r @ _Y_Z, p @ _Y_Z)),
+    "orientations clockwise": poses(lambda r, p, _: (_Y @ r @ _Y, p)),
+    "compass headings": poses(lambda r, p, _: (_LEFT @ _Y @ r @ _Y, p)),
+    "headings from north": poses(lambda r, p, _: (_LEFT @ r, p)),
+    "orientations north-east-down": poses(lambda r, p, _: (_SWAPPED @ _Z @ r @ _Y_Z, p)),
+    "positions north-east": poses(lambda r, p, _: (r, p @ _SWAPPED)),
+    "positions with another y": poses(lambda r, p, _: (r, p @ _Y)),
+    "poses as steps": poses(_steps),
+    "no positions": poses(lambda r, p, _: (r, np.zeros_like(p))),
+    "no orientations": poses(lambda r, p, _: (np.tile(np.eye(3), (len(r), 1, 1)), p)),
+    "OpenGL cameras": rig(lambda r, p: (r @ _Y_Z, p)),
+    "camera 1 against camera 0": rig(_against_first),
+    "camera 1 from camera 0": rig(lambda r, p: _against_first(r, p, inverted=True)),
+    "yaw 20 of the wrong sign": rig(lambda r, p: (geometry.so3_exp(np.radians([0.0, 0.0, -40.0])) @ r, p)),
+    "looks to the other side": rig(lambda r, p: (_LEFT @ _LEFT @ r, p @ _LEFT @ _LEFT)),
+    "camera 1 upside down": _of_camera(1, lambda uv: np.array([639.0, 479.0]) - uv),
+    "camera 0 upside down": _of_camera(0, lambda uv: np.array([639.0, 479.0]) - uv),
+    "camera 1 mirrored": _of_camera(1, lambda uv: np.array([639.0, 0.0]) + np.array([-1.0, 1.0]) * uv),
+    "k of camera 1 halved": intrinsics(lambda k: k * np.array([[1.0], [0.5]])),
+    "k of camera 0 doubled": intrinsics(lambda k: k * np.array([[2.0], [1.0]])),
     "turned 1 about y": turned(1.0, (0.0, 1.0, 0.0)),
     "turned 1 about x": turned(1.0, (1.0, 0.0, 0.0)),
     "turned 2 about z": turned(2.0, (0.0, 0.0, 1.0)),
@@ -232,12 +302,16 @@ WRONG: dict[str, Wrong] = {
             data.rig, models=("equidistant",) * len(data.rig), distortion=(np.zeros(4),) * len(data.rig)
         ),
     ),
+    "plumb_bob given": _lens("plumb_bob", lambda d: np.append(d, 0.0)),
+    "other signs of d": _lens("plumb_bob", lambda d: -d),
     "depth in mm": images(lambda one: dataclasses.replace(one, depth_m=1000.0 * one.depth_m)),
     "depth times 6": images(lambda one: dataclasses.replace(one, depth_m=6.0 * one.depth_m)),
     "poses over 6": poses(lambda r, p, _: (r, p / 6.0)),
     "depth in cm": images(lambda one: dataclasses.replace(one, depth_m=100.0 * one.depth_m)),
     "depth in km": images(lambda one: dataclasses.replace(one, depth_m=0.001 * one.depth_m)),
     "depth times 1.1": images(lambda one: dataclasses.replace(one, depth_m=1.1 * one.depth_m)),
+    "depth along rays": _along_rays,
+    "depth of other points": images(lambda one: dataclasses.replace(one, depth_m=one.depth_m[::-1].copy())),
     "inverse depth": images(lambda one: dataclasses.replace(one, depth_m=1.0 / one.depth_m)),
     "normalised": images(lambda one: dataclasses.replace(one, uv=(one.uv - [320.0, 240.0]) / 349.0)),
     "slots": _slots,

@@ -17,8 +17,10 @@ from ba_node.check.examine import examine
 from ba_node.check.ids import check_ids
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
+from ba_node.measurements import CameraRig
 from ba_node.scene.scene import Scene
 from experiments.robustness.faults import spoiled
+from experiments.robustness.faults.surround import third
 from experiments.synthetic import SyntheticOptions, generate
 from experiments.synthetic.world import Path, World
 from tests.check.set_ups import poses, recording, seen
@@ -43,6 +45,30 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "poses in cm": (("stereo", "rgbd"), "poses in centimetres"),
     "poses in km": (("stereo", "mono", "rgbd"), "positions of the poses in kilometres"),
     "poses with w first": (("stereo", "mono"), "quaternions of the poses with w first"),
+    "left-handed": (("stereo", "mono"), "poses are in left-handed axes: y points to the right"),
+    "left-handed, z": (("stereo",), "poses are in left-handed axes: z points down"),
+    "forward-right-down": (("stereo", "mono"), r"^poses are of a body with y to the right and z down"),
+    "orientations clockwise": (("stereo", "mono"), "^orientations of the poses turn clockwise"),
+    "compass headings": (("stereo", "mono"), "^orientations of the poses are compass headings"),
+    "headings from north": (
+        ("stereo", "mono"),
+        "orientations of the poses count from another axis than their positions",
+    ),
+    "orientations north-east-down": (("stereo", "mono"), "^orientations of the poses are in north-east-down"),
+    "positions north-east": (("stereo", "mono"), "^x and y of the poses exchanged"),
+    "positions with another y": (("stereo", "mono"), "^y of the poses has another sign in their positions"),
+    "poses as steps": (("stereo", "mono"), "^poses hold the step from the keyframe before"),
+    "no positions": (("stereo", "mono"), "^position of the poses is not filled in"),
+    "no orientations": (("stereo", "mono"), "^orientation of the poses is not filled in"),
+    "OpenGL cameras": (("stereo", "mono"), "^optical axes confused: .* as in OpenGL"),
+    "camera 1 against camera 0": (("stereo",), "^body_from_camera of camera 1 is its pose from camera 0"),
+    "camera 1 from camera 0": (("stereo",), "^body_from_camera of camera 1 is camera 1 from camera 0"),
+    "looks to the other side": (("stereo", "mono"), "^cameras look to the other side"),
+    "camera 1 upside down": (("stereo",), "^images upside down: .* of camera 1 alone"),
+    "camera 0 upside down": (("stereo",), "^images upside down: .* of camera 0 alone"),
+    "camera 1 mirrored": (("stereo",), "^images mirrored: left and right are exchanged, of camera 1 alone"),
+    "k of camera 1 halved": (("stereo",), "^k of camera 1 is that of an image 2 times as small"),
+    "k of camera 0 doubled": (("stereo",), "^k of camera 0 is that of an image 2 times as large"),
     "turned 1 about y": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
     "turned 1 about x": (("stereo",), "camera 1 does not fit its place on the body by about 1 degree,"),
     "turned 2 about z": (("stereo",), "camera 1 does not fit its place on the body by about 2 degrees"),
@@ -60,10 +86,14 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
     "not rectified": (("stereo", "mono"), "images not rectified though no distortion is given"),
     "rectified": (("stereo", "mono"), "images rectified though a distortion is given"),
     "fisheye given": (("stereo", "mono"), "images rectified though the model of a fisheye lens is given"),
+    "plumb_bob given": (("mono",), "^distortion_model is not that of the coefficients: .* as those of equidistant"),
+    "other signs of d": (("mono",), "^coefficients of the distortion with other signs"),
     "depth in mm": (("rgbd",), "depth_m in millimetres"),
     "depth in cm": (("rgbd",), "depth_m in centimetres"),
     "depth in km": (("rgbd",), "depth_m in kilometres"),
     "depth times 1.1": (("rgbd",), r"scale of depth_m: it is 1\.(09|1[0-2]?) times"),
+    "depth along rays": (("rgbd",), "^depth_m is the distance from the camera along the ray"),
+    "depth of other points": (("rgbd",), "^depth_m is of other points: of another image"),
     "inverse depth": (("rgbd",), "depth_m holds inverse depths"),
     "normalised": (("stereo", "mono"), "image coordinates are not in pixels"),
     "ids of each camera": (("stereo",), "track ids of cameras 0 and 1 do not name the same points"),
@@ -88,7 +118,7 @@ NAMED: dict[str, tuple[tuple[str, ...], str]] = {
 # The quick tests do with one rig. These are told by adjustments of seconds, in which all cameras change alike: with one
 # camera, and with one amount and one lens of what is adjusted alike.
 ADJUSTED = ("focal 0.8", "focal 0.5", "fx alone", "binning", "not rectified", "rectified", "fisheye given")
-ALIKE = ("focal 0.5", "fisheye given", "principal point of camera 1, u")
+ALIKE = ("focal 0.5", "other signs of d", "fisheye given", "principal point of camera 1, u")
 CASES = [
     pytest.param(
         wrong,
@@ -139,6 +169,66 @@ def test_two_cameras_without_a_common_track_are_named_where_the_steps_tell_no_sc
     found = examine(seen(still(recording(wrong="other ids of each camera"))))
     assert "cameras 0 and 1 share no track, though they look at the same" in found.causes(), found.summary()
     assert found.notices == []
+
+
+@pytest.mark.parametrize("mode", ["stereo", "mono"])
+def test_cameras_that_look_aside_on_a_straight_way_are_not_taken_for_mirrored_images(mode: str) -> None:
+    drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.02, "look_deg": 20.0}
+    found = examine(seen(recording(2, "yaw 20 of the wrong sign", mode, path="line", **drift)))
+    assert re.match(r"camera 0 does not fit its place on the body by about (3\d|4[0-4]) degrees", found.causes()), (
+        found.summary()
+    )
+
+
+@pytest.mark.parametrize("path", ["line", "loop"])
+def test_mirrored_images_of_a_camera_that_looks_aside_are_no_inverted_poses(path: str) -> None:
+    drift = {"drift_rotation_deg": 0.3, "drift_translation": 0.02, "look_deg": 90.0}
+    found = examine(seen(recording(2, "mirrored", "mono", path=path, **drift)))
+    assert found.causes() == "images mirrored: left and right are exchanged", found.summary()
+
+
+@pytest.mark.parametrize("look_deg", [0.0, 90.0, 45.0])
+def test_noise_of_depths_is_no_other_kind_of_depth(look_deg: float) -> None:
+    """A wall at one distance, and depths that scatter by more than what there is to see."""
+    for wrong in ("", "depth of other points"):
+        data = recording(5, wrong, "rgbd", path="line", look_deg=look_deg, depth_noise=0.1, drift_rotation_deg=0.3)
+        found = examine(seen(data))
+        assert bool(found.findings) == bool(wrong), found.summary()
+    assert "depth_m is of other points" in found.causes(), found.summary()
+
+
+@pytest.mark.parametrize(("order", "named"), [([2, 0, 1], "1, 2, 0"), ([0, 2, 1], "cameras 2 and 1 swapped")])
+def test_three_cameras_in_another_order_are_named(order: list[int], named: str) -> None:
+    def change(rig: CameraRig) -> CameraRig:
+        return dataclasses.replace(rig, position=rig.position[order], orientation=rig.orientation[order])
+
+    scene = Scene(Config().scene)
+    for measurement in third(spoiled("sound", "stereo")).changed(CameraRig, change).measurements:
+        scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    found = examine(tracks)
+    assert named in found.findings[0].causes[0], found.summary()
+
+
+def test_turns_among_many_outliers_tell_no_delay() -> None:
+    drift = {"drift_rotation_deg": 1.0, "drift_translation": 0.06, "outlier_share": 0.3, "noise_px": 1.0}
+    path = {"path": "loop", "length_m": 30.0, "keyframes": 60, "look_deg": 90.0}
+    sent = spoiled("sound", "mono", seed=281, **drift, **path)  # type: ignore[arg-type]
+    scene = Scene(Config().scene)
+    ids = {keyframe.keyframe_id for keyframe in sent.keyframes[:40]}
+    for measurement in sent.measurements:
+        if isinstance(measurement, CameraRig) or getattr(measurement, "keyframe_id", None) in ids:
+            scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    assert not examine(tracks).findings
+
+
+def test_poses_that_stand_still_with_the_camera_are_no_mistake() -> None:
+    """Nothing is said of poses that are all the same until many keyframes see the camera move."""
+    found = examine(seen(recording(wrong="no positions"), keyframes=10))
+    assert not found.findings, found.summary()
 
 
 @pytest.mark.parametrize("wrong", ["baseline reversed", "extrinsics inverted", "axes missing"])

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from ba_node.check import intrinsics
 from ba_node.check.examine import examine
 from ba_node.check.tracks import tracks_of
 from ba_node.config import Config
+from ba_node.measurements import CameraRig
 from ba_node.scene.scene import Scene
 from experiments.robustness.faults import spoiled
 
@@ -59,3 +61,21 @@ def test_principal_point_that_is_off_shows_in_the_steps(rig: str) -> None:
     tracks = tracks_of(scene)
     assert tracks is not None
     assert re.search("region of interest", examine(tracks).summary())
+
+
+@pytest.mark.slow
+def test_coefficients_of_another_model_are_named() -> None:
+    """Solves that took those of a plain lens for those of a fisheye bent the way (0.04 -> 0.17 m)."""
+    recording = spoiled("sound", "mono", distortion="plumb_bob")
+
+    def change(rig: CameraRig) -> CameraRig:
+        lens = tuple(one[:4] for one in rig.distortion)
+        return dataclasses.replace(rig, models=("equidistant",) * len(rig), distortion=lens)
+
+    scene = Scene(Config().scene)
+    for measurement in recording.changed(CameraRig, change).measurements:
+        scene.add(measurement)
+    tracks = tracks_of(scene)
+    assert tracks is not None
+    found = examine(tracks)
+    assert "they fit the tracks as those of plumb_bob" in found.causes(), found.summary()

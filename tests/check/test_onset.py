@@ -17,6 +17,8 @@ from ba_node.check.tracks import Tracks
 from ba_node.config import Config
 from ba_node.core import geometry
 from ba_node.core.cameras import CX, CY
+from experiments.synthetic import SyntheticOptions, generate
+from experiments.synthetic.world import Path, World
 from tests.check.set_ups import recording, seen
 from tests.check.test_watch import play
 
@@ -102,3 +104,18 @@ def test_the_map_before_it_stays() -> None:
     placed = np.flatnonzero(backend.scene.landmarks.has_position)
     views = backend.scene.views_of(placed)
     assert len(placed) and np.isin(backend.scene.observations.keyframe[views], order[:kept]).all()
+
+
+@pytest.mark.parametrize(("keyframes", "look_deg"), [(3, 180.0), (6, 90.0), (10, 180.0)])
+def test_a_jump_after_a_stand_still_is_no_change(keyframes: int, look_deg: float) -> None:
+    """What had no parallax while the camera stood may be anywhere."""
+
+    def motion(world: World, path: Path) -> tuple[World, Path]:
+        k = np.arange(len(path.position))
+        rows = np.where(k < 20, 0, np.minimum(k[-1], k - 20 + keyframes))
+        still = 1e-3 * np.cumsum(np.append(0, np.diff(rows) == 0))
+        return world, Path(path.position[rows], path.rotation[rows], path.distance[rows] + still)
+
+    options = SyntheticOptions(keyframes=40, path="line", length_m=20.0, baseline_m=0.0, look_deg=look_deg, tracks=150)
+    found = check_onset(seen(generate(options, motion)))
+    assert not found.findings, found.summary()
