@@ -8,7 +8,7 @@ one window to the next, or in keyframes that were left out, shows in all observa
 
 from __future__ import annotations
 
-from ba_node.check.departure import departed, deviates, doubtful_factor
+from ba_node.check.departure import departed, deviates, has_scale, length_factor
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.measured_depths import depths_err
 from ba_node.check.watch import Check, of_all_images, of_few_keyframes, of_the_newest
@@ -48,12 +48,12 @@ def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
 
 
 def keep_lengths(scene: Scene, config: Config) -> bool:
-    """Make a map as long as the front-end's where images tell another length by little, but hardly by chance.
+    """Make a map as long as the front-end's where images tell no length, or another by little, but hardly by chance.
 
     Cameras may be off, or the front-end: its lengths are what came in, and the map's shape is the images'.
     Return True if that changed it.
     """
-    factor = doubtful_factor(scene) if config.checks_setup else 1.0
+    factor = length_factor(scene) if config.checks_setup else 1.0
     if factor == 1.0:
         return False
     scene.propagate_corrections()
@@ -63,7 +63,8 @@ def keep_lengths(scene: Scene, config: Config) -> bool:
         places[:] = origin + (places - origin) / factor
     scene.moved()
     points.changed()
-    scene.log.notice("lengths_kept")
+    if has_scale(scene):
+        scene.log.notice("lengths_kept")
     return True
 
 

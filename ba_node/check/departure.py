@@ -75,6 +75,10 @@ _ASIDE, _AHEAD = 0.95, 0.2
 # Part of a turn that may be out of the plane of these two, for a focal length to explain it.
 _IN_PLANE = 0.5
 _K = "k of camera_info in camera_rig"
+# Steps that are more standard deviations off the others are drawn in to so many.
+_USUAL = 3.0
+# Share of a way by which its ends are apart where it does not come back.
+_STRAIGHT = 0.7
 # Share of the usual step below which one tells nothing; share that is left out at either end of their ratios.
 _TELLING, _TRIMMED = 0.3, 0.1
 
@@ -96,7 +100,7 @@ def departed(scene: Scene, *, final: bool = False, doubted: bool = False) -> Che
         return None
     sure = final and "moving" not in scene.log.warnings
     by_length, aside = (_AT_THE_END if less else _FACTORS for less in (sure or doubted, doubted))
-    finding = _by_a_factor(scene, refined, given, by_length) if _has_scale(scene) else None
+    finding = _by_a_factor(scene, refined, given, by_length) if has_scale(scene) else None
     if final:
         finding = finding or _aside(scene, refined, given, aside)
     if final and not doubted:
@@ -124,7 +128,7 @@ def _of_the_newest(scene: Scene, limits: Limits, *, look: bool = False) -> Findi
     refined, given = _steps(scene, NEWEST)
     if len(refined) <= _STEPS:
         return None
-    by_a_factor = look or _has_scale(scene)
+    by_a_factor = look or has_scale(scene)
     return (_by_a_factor(scene, refined, given, limits) if by_a_factor else None) or _aside(
         scene, refined, given, limits
     )
@@ -166,17 +170,39 @@ def _along(scene: Scene, refined: FloatArray, given: FloatArray) -> FloatArray:
     return given if geometry.is_planar(scene.keyframes.input_position) else refined + given
 
 
-def doubtful_factor(scene: Scene) -> float:
-    """Return by what factor refined steps of a young map are longer than the front-end's where that is hardly chance.
+def length_factor(scene: Scene) -> float:
+    """Return by what factor refined steps of a young map are longer than the front-end's where these tell it better.
 
-    It is 1 elsewhere, and where lengths are told by more than the two.
+    Where images tell lengths, that is where the difference is hardly chance. It is 1 elsewhere, and where lengths are
+    told by more than the two.
     """
     known = scene.constraints
     alone = not (known.absolute or known.landmarks or known.relative)
-    if not (alone and _STEPS < len(scene.keyframes) <= _YOUNG and _has_scale(scene)):
+    if not (alone and _STEPS < len(scene.keyframes) <= _YOUNG) or scene.cameras is None:
         return 1.0
     refined, given = _steps(scene)
-    return _factor(scene, refined, given, _HARDLY_CHANCE) if len(refined) >= _STEPS else 1.0
+    if has_scale(scene):
+        return _factor(scene, refined, given, _HARDLY_CHANCE) if len(refined) >= _STEPS else 1.0
+    return _of_one_camera(scene, refined, given) if len(refined) >= _STEPS_BEFORE else 1.0
+
+
+def _of_one_camera(scene: Scene, refined: FloatArray, given: FloatArray) -> float:
+    """Return by what factor refined steps (n, 3) are longer than the given ones, which alone tell lengths.
+
+    All together tell them better than a few at a time did in windows, each with a loss. It stays 1 where many are far
+    off the others, and on a way that comes back: there turns are what the front-end errs by.
+    """
+    way = scene.keyframes.position[scene.order]
+    if np.linalg.norm(way[-1] - way[0]) < _STRAIGHT * np.sum(np.linalg.norm(np.diff(way, axis=0), axis=1)):
+        return 1.0
+    along = _along(scene, refined, given)
+    ratio = np.log(np.sum(refined * along, axis=1) / np.sum(given * along, axis=1))
+    middle = float(np.median(ratio))
+    sigma = _SPREAD * float(np.median(np.abs(ratio - middle)))
+    within = np.clip(ratio, middle - _USUAL * sigma, middle + _USUAL * sigma)
+    # Noise aside makes steps longer, by twice as much as that along them lowers the mean of the logarithm.
+    mean = float(np.average(within, weights=np.linalg.norm(refined, axis=1))) + 0.5 * sigma**2
+    return float(np.exp(mean)) if abs(mean) < _USUAL * sigma / np.sqrt(len(ratio)) else 1.0
 
 
 def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
@@ -184,7 +210,7 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits)
     lengths = np.linalg.norm(refined, axis=1) * np.linalg.norm(given, axis=1)
     turns = np.cross(given, refined) / lengths[:, None]
     found = [_trimmed_mean(of_axis) for of_axis in turns.T]
-    times = 1.0 if _has_scale(scene) else _ONE_CAMERA
+    times = 1.0 if has_scale(scene) else _ONE_CAMERA
     if not any(_differs(mean, error, len(given), limits, times) for mean, error in found):
         return None
     assert scene.cameras is not None
@@ -222,7 +248,7 @@ def _focal(factor: float) -> str:
 
 def _carried(scene: Scene) -> Finding | None:
     """Return where what moves has carried refined steps along, if it was said that much does."""
-    if "moving" not in scene.log.warnings or not _has_scale(scene):
+    if "moving" not in scene.log.warnings or not has_scale(scene):
         return None
     pairs = _telling(scene)
     if len(pairs[0]) < 2 * _STRETCH:
@@ -253,7 +279,8 @@ def _differs(mean: float, error: float, count: int, limits: Limits, times: float
     return any(abs(mean) >= max(times * np.log(factor), more * errors * error) for factor, errors in limits)
 
 
-def _has_scale(scene: Scene) -> bool:
+def has_scale(scene: Scene) -> bool:
+    """Return True if images tell lengths."""
     return scene.cameras is not None and (len(scene.cameras.model) > 1 or _measures_depths(scene))
 
 

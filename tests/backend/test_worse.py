@@ -82,8 +82,12 @@ def test_lengths_that_are_doubted_are_those_of_the_front_end(rig: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_baseline_off_by_little_that_is_not_told_does_no_harm() -> None:
-    recording = spoiled("baseline_off", "stereo", 0.98, 100)
+@pytest.mark.parametrize(
+    ("fault", "rig", "amount", "seed"),
+    [("baseline_off", "stereo", 0.98, 100), (SOUND, "mono", None, 7), ("focal_slightly_off", "mono", 0.95, 2)],
+)
+def test_lengths_that_images_tell_badly_do_no_harm(fault: str, rig: str, amount: float | None, seed: int) -> None:
+    recording = spoiled(fault, rig, amount, seed)
     backend = Backend(Config())
     for _ in backend.replay(iter(recording.measurements)):
         pass
