@@ -56,6 +56,7 @@ class Diagnosis:
     untold: list[str] = field(default_factory=list)  # what the tracks could not tell (yet), and why
     rows: list[Row] = field(default_factory=list)  # the hypotheses
     notices: list[str] = field(default_factory=list)  # what is unusual but does no harm, keys of the scene's notices
+    failed: list[str] = field(default_factory=list)  # tests that ended by a fault of their own, and which
     told: frozenset[str] = frozenset()  # the tests that need no more tracks
 
     @property
@@ -101,6 +102,7 @@ class Diagnosis:
         self.untold += other.untold
         self.rows += other.rows
         self.notices += other.notices
+        self.failed += other.failed
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for a JSON file."""

@@ -100,7 +100,8 @@ def run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
     try:
         return test()
     except Exception as error:
-        return Diagnosis(untold=[f"{name}: internal error, {type(error).__name__}: {error}"])
+        text = f"{name}: internal error, {type(error).__name__}: {error}"
+        return Diagnosis(untold=[text], failed=[text])
 
 
 def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:

@@ -218,7 +218,8 @@ def _check_camera(tracks: Tracks, camera: int, relation: Relation, related: Call
             tried[flip] = _row(test, flip.name, seen, now)
     for alone in images_of_one(tracks, camera):
         seen = relation.seen_by(alone.undo(tracks, camera))
-        tried[alone] = _row(test, alone.name.format(camera=camera), seen, now)
+        if seen is not None:
+            tried[alone] = _row(test, alone.name.format(camera=camera), seen, now)
     rows += tried.values()
     best = max(one.share for one in tried.values())
     if as_good and rows[0].share >= _FITS * best:

@@ -26,6 +26,8 @@ _AS_GOOD = 0.95
 # Share of the tracks of two images that must agree with their best relation; where fewer do, outliers pull at whatever
 # is estimated, and nothing but the usual mistakes of placement is told.
 AGREED = 0.7
+# Share of the rays of two images that another rig must leave, as no lens sees all that a pixel may be taken for.
+_SEEN = 0.9
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,15 @@ class Relation:
         parallax = float(np.median(across) / self.pair.gate) if len(across) else 0.0
         return dataclasses.replace(self, pose=pose, share=float(good.mean()), parallax=parallax)
 
-    def seen_by(self, tracks: Tracks) -> Relation:
-        """Return the same images as other tracks with the same rows have them."""
-        pair = rays(tracks, (self.rows_a, self.rows_b))
-        return dataclasses.replace(self, pair=pair).at(
-            two_view.refined(pair, tracks.between_cameras(self.a[1], self.b[1]))
-        )
+    def seen_by(self, tracks: Tracks) -> Relation | None:
+        """Return the same images as other tracks with the same rows have them; None if many have no ray there."""
+        good = np.isfinite(tracks.ray[self.rows_a]).all(axis=1) & np.isfinite(tracks.ray[self.rows_b]).all(axis=1)
+        if good.mean() < _SEEN:
+            return None
+        rows_a, rows_b = self.rows_a[good], self.rows_b[good]
+        pair = rays(tracks, (rows_a, rows_b))
+        pose = two_view.refined(pair, tracks.between_cameras(self.a[1], self.b[1]))
+        return dataclasses.replace(self, rows_a=rows_a, rows_b=rows_b, pair=pair).at(pose)
 
     @property
     def has_direction(self) -> bool:

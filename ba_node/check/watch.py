@@ -229,6 +229,8 @@ class SetUpWatch:
             scene.log.notice(kind, kind not in scene.log.notices)
         if found.findings:
             scene.log.warn(kind="setup", text=found.summary())
+        if found.failed:
+            scene.log.warn("check_failed", f"the set-up is not wholly checked: {'; '.join(found.failed)}; report it")
         if not found.harmful:
             return False
         self._reason = f"the set-up contradicts the tracks: {found.causes()}"

@@ -62,6 +62,7 @@ NOTICES: dict[str, str] = {
 # What somebody has to know or mend: kind -> what it is about. Said on the terminal, in report.json, on /diagnostics and
 # in ba_msgs/SolverReport; a replay that has any ends with another exit code than 0.
 WARNINGS: dict[str, str] = {
+    "check_failed": "A test of the set-up ended by a fault of its own, and tells nothing.",
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
     "stray": "Keyframes whose front-end's pose contradicts their tracks; they are placed by these, or left out.",
     "moving": "Tracks that move against the rest, as on objects that move; they are left out.",

@@ -76,6 +76,17 @@ def test_sound_set_up_says_nothing() -> None:
     assert backend.scene.keyframes.refined.all()
 
 
+def test_a_test_that_fails_is_said_and_keeps_nobody_from_solving(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("by design")
+
+    monkeypatch.setattr("ba_node.check.motion.check_motion", fails)
+    backend = Backend(Config())
+    estimates = play(backend, recording())
+    assert "internal error, ValueError: by design" in backend.scene.log.warnings["check_failed"]
+    assert any(one.report.status is Status.CONVERGED for one in estimates)
+
+
 def test_can_be_turned_off() -> None:
     backend = Backend(Config().with_values({"guard.check_setup": False}))
     play(backend, recording(wrong="baseline reversed"), keyframes=12)
