@@ -74,7 +74,10 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         inverse = float(np.exp(np.median(np.log(given * found))))
         cause = f"depth_m holds inverse depths: it falls as depth grows (their product is {inverse:.3g})"
         return Diagnosis([_depth_finding(cause, f"against {by}")], rows=rows)
-    other = None if many_outliers else _along_rays(tracks, relations, pairs) or _of_other_points(relations, pairs)
+    along = None if many_outliers else _along_rays(tracks, relations, pairs)
+    if along is not None:
+        return Diagnosis([_or_intrinsics(_depth_finding(along, f"against {by}"))], rows=rows)
+    other = None if many_outliers else _of_other_points(relations, pairs)
     if other is not None:
         return Diagnosis([_depth_finding(other, f"against {by}")], rows=rows)
     if scatter > _AGREE:
@@ -141,11 +144,16 @@ def _depth_or_steps(tracks: Tracks, factor: float, evidence: str) -> Finding:
     causes, changes = depth.causes, depth.changes
     if not blame:
         causes, changes = (*causes, steps), (*changes, POSITIONS)
-    if not unit and not small:
-        # What steps tell of distances depends on the intrinsics.
-        causes = (*causes, "focal length or principal point wrong (region of interest, binning)")
-        changes = (*changes, "k, roi and binning in the camera_info of camera_rig")
-    return dataclasses.replace(depth, causes=causes, changes=changes)
+    found = dataclasses.replace(depth, causes=causes, changes=changes)
+    return _or_intrinsics(found) if not unit and not small else found
+
+
+def _or_intrinsics(found: Finding) -> Finding:
+    """Return a finding with the intrinsics named too, as what steps tell of distances depends on them."""
+    causes = *found.causes, "focal length or principal point wrong (region of interest, binning)"
+    return dataclasses.replace(
+        found, causes=causes, changes=(*found.changes, "k, roi and binning in the camera_info of camera_rig")
+    )
 
 
 def _by_baseline(tracks: Tracks, factor: float) -> str:
