@@ -8,6 +8,7 @@ are fixed frame from body.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -204,6 +205,10 @@ FLIPS = (
 _SIZES, _NEARLY = (4.0, 2.0, 0.5, 0.25), 1.33
 
 
+def _seen(given: Tracks, _: int, uv: FloatArray | None = None, params: FloatArray | None = None) -> Tracks:
+    return given.seen(uv, params)
+
+
 def images_of_one(given: Tracks, camera: int) -> list[Mistake]:
     """Return the ways to give the images of a camera wrongly, or those of camera 0, which it is compared with."""
     found = []
@@ -218,10 +223,11 @@ def images_of_one(given: Tracks, camera: int) -> list[Mistake]:
                 change = f"k, or binning_x and binning_y, in the camera_info of camera {one}"
                 params = given.cameras.params.copy()
                 params[one, FX : CY + 1] /= size
-                found.append(Mistake(cause, change, lambda known, _, params=params: known.seen(params=params)))  # type: ignore[misc]
+                undo = functools.partial(_seen, params=params)
+                found.append(Mistake(cause, change, undo))
         for flip in FLIPS:
             uv = np.where(its[:, None], flip.undo(given).uv, given.uv)
-            undo = lambda known, _, uv=uv: known.seen(uv)  # noqa: E731
+            undo = functools.partial(_seen, uv=uv)
             upright = f", or {_ONE.format(camera=one)}" if np.linalg.det(flip.turn) > 0.0 else ""
             found.append(Mistake(f"{flip.name}, of camera {one} alone", f"{flip.change}{upright}", undo))
     return found
