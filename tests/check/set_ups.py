@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
 from ba_node.core import geometry
-from ba_node.measurements import FeatureTracks
+from ba_node.measurements import FeatureTracks, Measurement
 from ba_node.scene.scene import Scene
 from experiments.synthetic import SyntheticData, SyntheticOptions
 from tests.generated import generated
@@ -42,6 +42,16 @@ def recording(seed: int = 3, wrong: str = "", mode: str = "stereo", **options: A
 def seen(data: SyntheticData, keyframes: int | None = None) -> Tracks:
     """Return the tracks of the first keyframes of a recording."""
     tracks = tracks_of(scene_of(data, keyframes))
+    assert tracks is not None
+    return tracks
+
+
+def tracks_in(measurements: Iterable[Measurement]) -> Tracks:
+    """Return the tracks of measurements as they come."""
+    scene = Scene(Config().scene)
+    for measurement in measurements:
+        scene.add(measurement)
+    tracks = tracks_of(scene)
     assert tracks is not None
     return tracks
 

@@ -11,21 +11,15 @@ import pytest
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine
 from ba_node.check.exposure import find_late
-from ba_node.check.tracks import Tracks, tracks_of
-from ba_node.config import Config
-from ba_node.scene.scene import Scene
+from ba_node.check.tracks import Tracks
 from experiments.robustness.faults import SOUND, spoiled
+from tests.check.set_ups import tracks_in
 
 LOOP: dict[str, Any] = {"path": "loop", "length_m": 30.0, "keyframes": 60}
 
 
 def tracks(name: str, amount: float | None = None, seed: int = 0, **changes: Any) -> Tracks:
-    scene = Scene(Config().scene)
-    for measurement in spoiled(name, "stereo", amount, seed, **changes).measurements:
-        scene.add(measurement)
-    found = tracks_of(scene)
-    assert found is not None
-    return found
+    return tracks_in(spoiled(name, "stereo", amount, seed, **changes).measurements)
 
 
 @pytest.mark.parametrize(("delay_s", "changes"), [(0.05, {}), (0.02, LOOP), (0.05, LOOP), (0.1, LOOP)])

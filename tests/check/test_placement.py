@@ -11,20 +11,15 @@ import numpy as np
 import pytest
 
 from ba_node.check.examine import examine
-from ba_node.check.tracks import Tracks, tracks_of
-from ba_node.config import Config
-from ba_node.scene.scene import Scene
+from ba_node.check.tracks import Tracks
 from experiments.robustness.faults import Recording, spoiled
 from experiments.robustness.faults.surround import third
+from tests.check.set_ups import tracks_in
 
 
 def tracks(recording: Recording, camera: int = 0, factor: float = 1.0) -> Tracks:
     """Return the tracks of a recording, the focal length of one camera given wrongly."""
-    scene = Scene(Config().scene)
-    for measurement in recording.measurements:
-        scene.add(measurement)
-    found = tracks_of(scene)
-    assert found is not None
+    found = tracks_in(recording.measurements)
     params = found.cameras.params.copy()
     params[camera, :2] *= factor
     return dataclasses.replace(found, cameras=dataclasses.replace(found.cameras, params=params))
