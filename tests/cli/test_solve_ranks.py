@@ -247,6 +247,7 @@ def test_observations_behind_are_those_of_all_ranks(file: Path) -> None:
         (("--ranks", "0"), "--ranks 0: expected 1 or more"),
         (("--ranks", "1000000"), "--ranks 1000000: this machine has"),
         (("--checkpoint", "none/at.npz", "--resume"), "no checkpoint to go on from"),
+        (("--checkpoint", __file__, "--resume"), "no checkpoint, or a damaged one: leave --resume out"),
     ],
 )
 def test_a_command_line_that_cannot_be_is_refused(file: Path, words: tuple[str, ...], reason: str) -> None:
