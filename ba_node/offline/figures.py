@@ -328,7 +328,7 @@ def _health(shown: Sequence[_ShownRun]) -> Figure:
                 drawn = line(one.solve_s[rows], np.full(rows.sum(), 100.0), one.name(status.lower()), colour)
                 data.append(drawn | {"mode": "markers", "marker": marker, "text": words, "hoverinfo": "text"})
     layout = {
-        "xaxis": {"title": "time [s]"},
+        "xaxis": {"title": "time [s]", "domain": [0.0, 0.9]},
         "yaxis": {"title": "inliers [%]", "range": [0, 105]},
         "yaxis2": {
             "title": "parallax [deg]",
