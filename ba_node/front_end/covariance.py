@@ -12,7 +12,6 @@ from collections import deque
 import numpy as np
 
 from ba_node.arrays import FloatArray
-from ba_node.core.loss import robust_spread
 from ba_node.estimate import Transform
 
 # While lost, the pose is off by at least so much with each image: m, rad.
@@ -47,7 +46,7 @@ class Lengths:
         if len(self._off) < _FEWEST:
             return _UNKNOWN
         # What all differ by alike, as points far away make images err, tells nothing of the odometry.
-        spread = float(robust_spread(np.array(self._off) - np.median(self._off)))
+        spread = 1.48 * float(np.median(np.abs(np.array(self._off) - np.median(self._off))))
         return float(np.sqrt(max(spread**2 - _BY_IMAGES**2, 0.0)))
 
 
