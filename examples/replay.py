@@ -31,4 +31,6 @@ def main(recording):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    if len(sys.argv) != 2:
+        sys.exit("usage: python examples/replay.py RECORDING")
+    main(*sys.argv[1:])

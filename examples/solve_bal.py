@@ -23,4 +23,6 @@ def main(source, target):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("usage: python examples/solve_bal.py SOURCE TARGET")
     main(*sys.argv[1:])

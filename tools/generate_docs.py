@@ -56,8 +56,8 @@ What is known beside pixels comes on topics of its own, see [factors.md](factors
 These are the inputs of interface version {version}. They keep their fields, types and meanings from here on: what is
 new comes as a new message on a topic of its own, and recordings of 0.2.0 replay by the definitions that they bring. The
 outputs may gain fields at their end with another release of ba_msgs. Build front-end and node with the same ba_msgs:
-each announces its definitions, and the node says which other node has another one. A recording whose inputs lack a
-field is refused with its name.
+each announces its definitions, and the node says which other node has another one, and whether another has its
+name. A recording whose inputs lack a field is refused with its name.
 
 A message that cannot be used is counted by reason in `report`, named in the node's log, and leaves everything known
 as it was.

@@ -37,6 +37,7 @@ from ba_node.check.tracks import tracks_of
 from ba_node.check.watch import NEWEST, Check
 from ba_node.core import geometry
 from ba_node.core.cameras import FX, FY
+from ba_node.core.loss import robust_spread
 from ba_node.scene.scene import Scene
 
 # Factors beyond which lengths are said to differ, each if it is so many standard errors from 1 (one pair is enough):
@@ -68,8 +69,6 @@ _LEAST_M = 0.02
 # Steps of a stretch, and what its score is at least where objects carried it along: stereo drives of which 30 to 60 %
 # moves show 25 where the result is better than what came in, 32 to 200 where it is worse. One camera's scale errs so.
 _STRETCH, _CARRIED = 12, 60.0
-# One standard deviation of a normal distribution, in median absolute deviations.
-_SPREAD = 1.4826
 # Cosines between where a camera looks and where it moves, from which on a focal length turns steps, and scales them.
 _ASIDE, _AHEAD = 0.95, 0.2
 # Part of a turn that may be out of the plane of these two, for a focal length to explain it.
@@ -198,7 +197,7 @@ def _of_one_camera(scene: Scene, refined: FloatArray, given: FloatArray) -> floa
     along = _along(scene, refined, given)
     ratio = np.log(np.sum(refined * along, axis=1) / np.sum(given * along, axis=1))
     middle = float(np.median(ratio))
-    sigma = _SPREAD * float(np.median(np.abs(ratio - middle)))
+    sigma = float(robust_spread(ratio - middle))
     within = np.clip(ratio, middle - _USUAL * sigma, middle + _USUAL * sigma)
     # Noise aside makes steps longer, by twice as much as that along them lowers the mean of the logarithm.
     mean = float(np.average(within, weights=np.linalg.norm(refined, axis=1))) + 0.5 * sigma**2
@@ -257,7 +256,7 @@ def _carried(scene: Scene) -> Finding | None:
     turn, refined = geometry.steps_between(table.rotation, table.position, *pairs)
     turned, given = geometry.steps_between(table.input_rotation, table.input_position, *pairs)
     off = np.hstack([refined - given, geometry.so3_log(np.swapaxes(turned, 1, 2) @ turn)])
-    sigma = np.maximum(_SPREAD * np.median(np.abs(off), axis=0), 1e-9)
+    sigma = np.maximum(robust_spread(off), 1e-9)
     sums = np.cumsum(np.vstack([np.zeros(6), off]), axis=0)
     means = (sums[_STRETCH:] - sums[:-_STRETCH]) / _STRETCH
     scores = _STRETCH * np.sum((means / sigma) ** 2, axis=1)

@@ -39,8 +39,10 @@ _CLEARLY = 0.9
 _ALONE = ("pixels", "onset")
 
 
-def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
+def examine(tracks: Tracks, told: frozenset[str] = frozenset(), more: Tracks | None = None) -> Diagnosis:
     """Return what the tracks tell about the set-up, but for the tests ``told``, which were decided before.
+
+    ``more`` are those of keyframes before them too: they are asked since when it is so, where these do not tell.
 
     Raises:
         ImportError: OpenCV is missing, see :func:`two_view.available`.
@@ -87,9 +89,10 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset()) -> Diagnosis:
         if name in ("ids", "sigma") and found.findings:
             # Such tracks are of several points, or how precise they are is not known: little things are not told.
             outcome.told |= set(_BUILD_ON_THESE)
-    if outcome.harmful and "onset" in told:
+    asked = tracks if "onset" in told else more
+    if outcome.harmful and outcome.since_ns is None and asked is not None:
         # It may be so only since images changed.
-        outcome.findings = run(tests["onset"], "onset").findings or outcome.findings
+        outcome.findings = run(lambda: onset.check_onset(asked), "onset").findings or outcome.findings
     if outcome.harmful:
         outcome.sound, outcome.untold = [], []
     return outcome

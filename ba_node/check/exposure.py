@@ -25,6 +25,7 @@ from ba_node.check.relations import rays, spread
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pair, Pose
 from ba_node.core import geometry
+from ba_node.core.loss import robust_spread
 
 _KEYFRAMES, _MAX_CAMERAS, _LEAST_RAYS = 20, 8, 200
 # Delays that are tried: up to a keyframe's distance, and so many s; so many, in rounds that look closer.
@@ -93,7 +94,7 @@ class _Both:
             best_s, reach_s = float(tried[int(np.argmin(losses))]), 2.0 * reach_s / (len(tried) - 1)
             tried = np.linspace(best_s - reach_s, best_s + reach_s, _CLOSER)
         given, delayed = (self._residuals(by_s) for by_s in (0.0, best_s))
-        noise = max(1.48 * float(np.median(np.abs(delayed))), 1e-9)
+        noise = max(float(robust_spread(delayed)), 1e-9)
         loss = _loss(given, noise)
         gain, otherwise = loss - _loss(delayed, noise), loss - _loss(self._elsewhere(), noise)
         if abs(best_s) < _LEAST_S or gain < max(_SURE, _AS_GOOD * otherwise):

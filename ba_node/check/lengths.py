@@ -18,6 +18,7 @@ from ba_node.check.relations import Relation, agreed, rays, spread
 from ba_node.check.tracks import Tracks
 from ba_node.check.two_view import Pose
 from ba_node.check.units import FASTEST, POSITIONS, speed_of
+from ba_node.core.loss import NORMAL
 from ba_node.core.units import unit_of
 
 # Parallax, in gates, from which on a triangulated depth is worth something; points and pairs that are needed.
@@ -181,7 +182,7 @@ def _alike(ratio: list[float], most: float) -> bool:
     They are not if their median is beyond a factor ``most``, or clearly beyond a small one.
     """
     middle = abs(float(np.median(ratio)))
-    error = 1.25 * 1.48 * _deviation(ratio) / np.sqrt(len(ratio))
+    error = 1.25 * NORMAL * _deviation(ratio) / np.sqrt(len(ratio))
     clear = len(ratio) >= _MANY_PAIRS and middle > max(np.log(_SMALL_FACTOR), _STANDARD_ERRORS * error)
     return middle < np.log(most) and not clear
 

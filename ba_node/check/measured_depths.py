@@ -18,23 +18,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_node.arrays import BoolArray, FloatArray, IntArray
+from ba_node.arrays import FloatArray, IntArray
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.check.watch import Check
+from ba_node.core import triangulation
+from ba_node.core.loss import robust_spread
 from ba_node.scene.scene import Scene
 
-# A point is placed by so many images, of so many keyframes in all, with a parallax of so many rad and sigmas (square
-# root of the sum of the squared sines), and by rays that are within so many sigmas of it.
-_VIEWS, _PARALLAX, _SIGMAS, _GATE = 3, 0.08, 60.0, 5.0
-_ROUNDS = 3
+# A point is placed by so many images, with a parallax of so many rad and sigmas, and by rays that are within so many
+# sigmas of it; rounds in which others are left out.
+_VIEWS, _PARALLAX, _SIGMAS, _GATE = 3, 0.1, 75.0, 5.0
+_ROUNDS = 2
 # Depths that are needed, in each class too; classes at most; and those needed.
 _DEPTHS, _CLASS, _MOST_CLASSES, _LEAST_CLASSES = 200, 40, 12, 5
 # Ratios further off the usual one are of points that move or are mismatched; share of others that is needed.
 _APART, _MOST = 0.25, 0.7
-# One standard deviation of a normal distribution, in median absolute deviations; standard error of a median, in
-# those of a mean; what medians of sound depths differ by at least, for errors in the poses and lenses.
-_SPREAD, _OF_MEDIAN, _FLOOR = 1.4826, 1.25, 0.001
+# Standard error of a median, in those of a mean; what medians of sound depths differ by at least, for errors in the
+# poses and lenses.
+_OF_MEDIAN, _FLOOR = 1.25, 0.001
 # An offset is wrong from so many m, standard errors and that share of depth between the nearest and farthest class on.
 _OFFSET_M, _ERRORS, _TILT = 0.03, 4.5, 0.005
 # A smaller one may be of a focal length that bends the way.
@@ -135,8 +137,8 @@ def profile_of(scene: Scene) -> Profile | None:
     distance, ratio = distance[alike], ratio[alike]
     parts = np.array_split(np.argsort(distance, kind="stable"), n)
     middle = np.array([np.median(ratio[part]) for part in parts])
-    spread = [np.median(np.abs(ratio[part] - one)) for part, one in zip(parts, middle, strict=True)]
-    error = np.hypot(_FLOOR, _OF_MEDIAN * _SPREAD * np.array(spread) / np.sqrt([len(part) for part in parts]))
+    spread = [robust_spread(ratio[part] - one) for part, one in zip(parts, middle, strict=True)]
+    error = np.hypot(_FLOOR, _OF_MEDIAN * np.array(spread) / np.sqrt([len(part) for part in parts]))
     return Profile(np.array([np.median(distance[part]) for part in parts]), middle, error, len(ratio))
 
 
@@ -152,27 +154,12 @@ def _by_images(tracks: Tracks, rows: IntArray, rotation: FloatArray, position: F
     ray = (turn @ (ray / np.linalg.norm(ray, axis=1)[:, None])[:, :, None])[..., 0]
     sigma = tracks.sigma_px[rows] / np.sqrt(rig.params[camera, 0] * rig.params[camera, 1])
     track = np.unique(tracks.track[rows], return_inverse=True)[1]
-    kept = np.ones(len(rows), bool)
+    nothing = np.full(len(rows), np.nan)
+    rays, kept = triangulation.Rays(track, eye, ray, 1.0 / sigma, nothing, nothing), np.ones(len(rows), bool)
     for _ in range(_ROUNDS):
-        point, parallax = _placed(track, eye, ray, kept)
-        to = point[track] - eye
-        off = np.linalg.norm(np.cross(ray, to), axis=1)
-        kept = (np.sum(ray * to, axis=1) > 0.0) & (off < _GATE * sigma * np.linalg.norm(to, axis=1))
-    depth = np.sum(to * turn[:, :, 2], axis=1)
+        found = triangulation.triangulate(rays.part(kept), int(track.max()) + 1)
+        kept = triangulation.errors(rays, found.points) < _GATE
+    depth = np.sum((found.points[track] - eye) * turn[:, :, 2], axis=1)
     good = kept & (np.bincount(track, kept)[track] >= _VIEWS) & (depth > 0.0)
-    good &= parallax[track] > np.maximum(_PARALLAX, _SIGMAS * sigma)
+    good &= found.parallax_rad[track] > np.maximum(_PARALLAX, _SIGMAS * sigma)
     return np.where(good, depth, np.nan)
-
-
-def _placed(track: IntArray, eye: FloatArray, ray: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the points (n, 3) nearest to the rays (n_obs, 3) of each that are kept, and their parallax (n,) rad."""
-    across = np.where(kept[:, None, None], np.eye(3) - ray[:, :, None] * ray[:, None, :], 0.0)
-    towards = (across @ eye[:, :, None])[..., 0]
-    total, right = (
-        np.stack([np.bincount(track, one) for one in part.reshape(len(track), -1).T], axis=1)
-        for part in (across, towards)
-    )
-    total = total.reshape(-1, 3, 3)
-    point = np.linalg.solve(total + 1e-12 * np.eye(3), right[:, :, None])[..., 0]
-    parallax = np.sqrt(np.maximum(np.linalg.eigvalsh(total)[:, 0], 0.0))
-    return np.asarray(point, float), np.asarray(parallax, float)

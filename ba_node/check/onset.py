@@ -22,6 +22,7 @@ from ba_node.check.relations import rays
 from ba_node.check.tracks import Image, Tracks
 from ba_node.check.two_view import Pose
 from ba_node.core import geometry
+from ba_node.core.loss import robust_spread
 
 _MAX_CAMERAS, _NEWEST = 8, 60
 # Keyframes between the two that place points, widest first.
@@ -88,7 +89,7 @@ def check_onset(tracks: Tracks) -> Diagnosis:
             continue
         usual = np.median([one.value for one in found.values()], axis=0)
         scores = np.array([(one.value - usual) / one.error for one in found.values()])
-        spread = np.maximum(1.48 * np.median(np.abs(scores), axis=0), 1.0)
+        spread = np.maximum(robust_spread(scores), 1.0)
         clear = [
             k
             for (k, one), score in zip(found.items(), scores / spread, strict=True)
@@ -189,7 +190,7 @@ def _resection(
         flat, depth = _project(rotation, move, ray, nearness)
         zoom = np.exp(value[0])
         left = seen - zoom * flat - value[1:]
-        scale = max(float(np.median(np.abs(left))) * 1.48, floor)
+        scale = max(float(robust_spread(left.ravel())), floor)
         x, y = flat.T
         zero, one = np.zeros_like(x), np.ones_like(x)
         by_turn = np.stack([np.stack([-x * y, 1 + x * x, -y], 1), np.stack([-1 - y * y, x * y, x], 1)], 1)

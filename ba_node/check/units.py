@@ -13,6 +13,7 @@ from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import in_motion
 from ba_node.check.tracks import Tracks
+from ba_node.core.loss import NORMAL
 
 _PAIRS = 4
 POSITIONS = "the position in the keyframes, expected metres"
@@ -91,7 +92,7 @@ def check_sigma(tracks: Tracks) -> Diagnosis:
         return Diagnosis(untold=["too few tracks to judge sigma_px"])
     focal = float(np.median(tracks.cameras.params[:, 0]))
     found = [np.median(np.abs(two_view.residuals(one.pair, one.pose))) for one in pairs]
-    noise = 1.48 * focal * float(np.median(found))
+    noise = NORMAL * focal * float(np.median(found))
     if not 1.0 / _SIGMA_FACTOR < told / max(noise, _LEAST_NOISE_PX) < _SIGMA_FACTOR:
         cause = f"sigma_px is {told:.2g} px, the tracks scatter by about {noise:.2g} px"
         change = "sigma_px in the feature_tracks: the standard deviation of u and of v, px"

@@ -22,8 +22,7 @@ from ba_node.check import two_view
 from ba_node.check.change import check_change
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine, run
-from ba_node.check.onset import check_onset
-from ba_node.check.tracks import Tracks, tracks_of
+from ba_node.check.tracks import tracks_of
 from ba_node.scene.scene import Scene
 
 # Keyframes at which a session is checked. A robot may stand for long before there is anything to tell.
@@ -121,13 +120,6 @@ def _sound_until(scene: Scene, found: Diagnosis) -> int:
     return sound if sound >= _SOUND else 0
 
 
-def _dated(found: Diagnosis, more: Tracks | None) -> Diagnosis:
-    """Return what was found in the newest keyframes, or since when images are others if ``more`` of them tell that."""
-    if more is not None and found.harmful and found.since_ns is None:
-        found.findings = run(lambda: check_onset(more), "onset").findings or found.findings
-    return found
-
-
 def _doubtful(scene: Scene) -> bool:
     return _fell_silent(scene) or not scene.log.warnings.keys().isdisjoint(_CONSEQUENCES)
 
@@ -208,7 +200,7 @@ class SetUpWatch:
         if tracks is None:
             return
         more = tracks_of(scene, _NEWEST) if newest < min(_NEWEST, len(scene.keyframes)) else None
-        check = Check(scene, lambda: _dated(examine(tracks, told), more))
+        check = Check(scene, lambda: examine(tracks, told, more))
         if self.elsewhere is None:
             self.take(check.run())
         else:

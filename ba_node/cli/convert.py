@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
     """Convert."""
     if args.front_end:
         return _convert_front_end(args)
+    from ba_node.io.reference import is_kitti  # noqa: PLC0415
     from ba_node.offline import convert  # noqa: PLC0415
 
     form = convert.format_of(args.target, args.to)
@@ -82,6 +83,8 @@ def run(args: argparse.Namespace) -> int:
         what = convert.read(args.source, console.topic_choice(args), progress)
     left_out = convert.write(args.target, what, form)
     print(f"{args.target}: {convert.counts(what)}{f', without {left_out}' if left_out else ''}")
+    if form == "tum" and is_kitti(args.source):
+        print("  stamps are a second apart, as KITTI has none: put those of the images in their place")
     console.write_result(args.json, {"target": args.target.name, "content": convert.counts(what), "left_out": left_out})
     return 0
 

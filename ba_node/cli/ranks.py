@@ -4,12 +4,19 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
+from ba_node.cli import interrupts
+
 T = TypeVar("T")
+# More ranks than this, and than four a core, only take turns: whoever asks for a million has mistyped.
+_MOST_RANKS = 64
+# For ranks that are told to end; they do within a fraction of it.
+_END_S = 5.0
 
 if TYPE_CHECKING:
     import argparse
@@ -26,9 +33,16 @@ def start_ranks(args: argparse.Namespace, codes: tuple[int, ...], hint: Callable
 
     if args.ranks < 1:
         raise RanksError(f"--ranks {args.ranks}: expected 1 or more")
+    cores = len(os.sched_getaffinity(0))
+    if args.ranks > max(_MOST_RANKS, 4 * cores):
+        raise RanksError(
+            f"--ranks {args.ranks}: this machine has {cores} cores: at most {max(_MOST_RANKS, 4 * cores)};"
+            " mpiexec starts them on several machines"
+        )
     command, environ = launch_command(args.ranks, sys.argv[1:])
     with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as ranks:
         assert ranks.stderr is not None
+        interrupts.at_interrupt(lambda: _end(ranks))
         framed = False
         for line in ranks.stderr:
             # Open MPI frames what it has to say itself; of a rank that died the line below tells in fewer words.
@@ -40,6 +54,15 @@ def start_ranks(args: argparse.Namespace, codes: tuple[int, ...], hint: Callable
     if code not in codes:
         print(f"ba: error: a rank ended with code {code}, and all with it{hint()}", file=sys.stderr)
     return code if code >= 0 else codes[-1]
+
+
+def _end(ranks: subprocess.Popen[str]) -> None:
+    """End the ranks, where a signal has come to this process alone; else they would go on without it."""
+    ranks.terminate()
+    try:
+        ranks.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        ranks.kill()
 
 
 def together(communicator: Ranks, work: Callable[[], T | None]) -> T | None:

@@ -12,7 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from ba_node.cli.console import require_mcap, write_result
+from ba_node.cli.console import TargetError, require_mcap, write_result
 
 EXAMPLE = "ba record --out drive.mcap --namespace /robot1 --topics /robot1/ground_truth/pose"
 
@@ -32,6 +32,8 @@ def run(args: argparse.Namespace) -> int:
     from ba_node.ros.tools.record import Recorder, RecordOptions  # noqa: PLC0415
 
     require_mcap(args.out)
+    if args.out.exists():
+        raise TargetError(f"{args.out}: File exists: what was recorded is not written over, give another name")
     options = RecordOptions(args.namespace, args.topics, args.duration)
     recorder = Recorder(args.out, options, lambda text: print(f"ba: {text}", file=sys.stderr, flush=True))
     # An interrupt is how a recording ends: nothing of it is to be thrown away.

@@ -18,20 +18,20 @@ _INC = "D = 1/step, the steps of the search for the best forward differences"
 # Named methods. What each chooses stands in core/methods.py.
 METHODS = (
     Choice("auto", "the default: local_irls"),
-    Choice("lma_cd", "Levenberg-Marquardt with Cholesky decomposition, a baseline", "3.2.2, 3.2.3"),
+    Choice("lma_cd", "Levenberg-Marquardt with Cholesky decomposition, a baseline", "Sections 3.2.2, 3.2.3"),
     Choice("bal", "Levenberg-Marquardt with PCG and M = B to the letter, a baseline (Agarwal et al. 2010)", "Alg. 7"),
     Choice("bal_scaled", "bal with PCG in units of the root of diag(H), and M of the matrix on which it works"),
     Choice("inm", "inexact Newton: a scaled region, no damping", "Alg. 5"),
     Choice("tnm", "truncated Newton: damping, no region", "Alg. 7, 8"),
     Choice("dinm", "damped inexact Newton: damping and a scaled region", "Alg. 9"),
     Choice("adinm", "dinm that eliminates points or cameras, whichever is better conditioned", "Alg. 10"),
-    Choice("local_dinm", "dinm with local parameterisation", "4.2"),
+    Choice("local_dinm", "dinm with local parameterisation", "Section 4.2"),
     Choice("irls_huber", "local_dinm with Huber's loss", "Alg. 11, 4.21"),
     Choice("irls_tq", "local_dinm with a truncated quadratic, led up to by graduated non-convexity", "Alg. 11, 4.22"),
     Choice(
         "local_irls",
         "local DINM/IRLS with Marquardt's damping, inner iterations, and exact steps where they cost less",
-        "4.2, Alg. 11",
+        "Section 4.2, Alg. 11",
     ),
 )
 # The losses of the methods that are named after theirs.
@@ -60,7 +60,7 @@ class SolverConfig:
             Choice(
                 "auto", "the method's own, that of local_irls being what costs least by the structure of the problem"
             ),
-            Choice("cholesky", "exactly: dense or sparse, whichever costs less", "3.2.2", ("cd",)),
+            Choice("cholesky", "exactly: dense or sparse, whichever costs less", "Section 3.2.2", ("cd",)),
             Choice("dense", "exactly: S as a whole, LAPACK's Cholesky"),
             Choice("sparse", "exactly: S by blocks, sparse Cholesky"),
             Choice("pcg", "by conjugate gradients (Steihaug): an inexact Newton step", "Alg. 1, 3, 4"),

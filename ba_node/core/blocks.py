@@ -13,7 +13,7 @@ _ROUNDING = 1e-14
 
 
 def inverse_roots(blocks: FloatArray) -> FloatArray:
-    """Return ``K`` with ``K' K`` the pseudo-inverse (5.2) of each block: (n, d, d) -> (n, d, d).
+    """Return ``K`` with ``K' K`` the pseudo-inverse (Section 5.2) of each block: (n, d, d) -> (n, d, d).
 
     A block is first scaled to a unit diagonal, so that the units of its parameters do not decide what is rounding.
     Directions without a value have a row of zeros in K.

@@ -48,6 +48,8 @@ _WIDE = 3.0
 _INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2")
 _PLACE = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
 _TIME = "time_offset"
+# Changes that are rounding alone, in any of the units.
+_ROUNDING = 1e-12
 _COLUMNS = dict(zip((*_INTRINSICS, *_PLACE, _TIME), (*range(6), *bordered.PLACE, bordered.TIME), strict=True))
 # The clock of the first camera shows in how velocities change: held where these may be wrong by more than this share.
 _ROUGH = 0.15
@@ -87,8 +89,8 @@ class Calibration:
         for camera in range(len(self.time_offset)):
             own = [parameter for parameter in self.parameters if parameter.camera == camera]
             told = [one.text() for one in own if one.told]
-            hardly = [one.text() for one in own if not one.told and one.change]
-            untold = [one.name for one in own if not one.told and not one.change]
+            hardly = [one.text() for one in own if not one.told and abs(one.change) > _ROUNDING]
+            untold = [one.name for one in own if not one.told and abs(one.change) <= _ROUNDING]
             parts = [", ".join(told)] if told else []
             parts += [f"hardly told by the data: {', '.join(hardly)}"] if hardly else []
             parts += [f"not told by the data, left as given: {', '.join(untold)}"] if untold else []

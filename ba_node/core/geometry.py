@@ -65,7 +65,7 @@ def so3_log(rotation: FloatArray) -> FloatArray:
 
 
 def right_jacobian(phi: FloatArray) -> FloatArray:
-    """Return ``Jr`` with ``Exp(phi + d) = Exp(phi) Exp(Jr d) + O(d^2)`` (3.28): (..., 3) -> (..., 3, 3)."""
+    """Return ``Jr`` with ``Exp(phi + d) = Exp(phi) Exp(Jr d) + O(d^2)`` (3.26): (..., 3) -> (..., 3, 3)."""
     angle2 = np.sum(phi * phi, axis=-1)
     b, c = _sinc_terms(angle2)[1], _third_term(angle2)
     k = hat(phi)

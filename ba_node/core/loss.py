@@ -29,6 +29,13 @@ CostAndWeight = tuple[FloatArray, FloatArray]
 
 # The graduation for which Huber's loss stands in.
 HUBER = 0.0
+# One standard deviation of a normal distribution, in median absolute deviations.
+NORMAL = 1.4826
+
+
+def robust_spread(errors: FloatArray) -> FloatArray:
+    """Return the standard deviation about 0 of errors (n, ...), if they are normal but for outliers: (...)."""
+    return np.asarray(NORMAL * np.median(np.abs(errors), axis=0))
 
 
 def _squared(norm: FloatArray, _scale: float) -> CostAndWeight:

@@ -5,7 +5,7 @@
 A keyframe is the pose of a body; cameras sit on the body with fixed extrinsics. The chain of an
 observation of point ``x`` is, with ``R, t = body_from_world`` and ``Rc, tc = camera_from_body``::
 
-    X_body = R x + t            (2.17)
+    X_body = R x + t            (2.18)
     X_cam  = Rc X_body + tc     (camera optical frame: x right, y down, z forward)
     (u, v) = K distort(X_cam / Z_cam)
 

@@ -7,7 +7,7 @@ Eliminating the keyframes, with ``B = K^-1 K^-T`` and ``Z = K E``::
     S pp = -gp + E' B^-1 gc,    S = C - E' B^-1 E = C - Z' Z
     pc   = B^-1 (-gc - E pp)
 
-Directions of a keyframe that nothing determines have a row of zeros in K, the pseudo-inverse's answer (5.2).
+Directions of a keyframe that nothing determines have a row of zeros in K, the pseudo-inverse's answer (Section 5.2).
 That takes B to be block diagonal: problems with factors are eliminated by points, or not at all.
 S has 3 rows a point and couples all points that one keyframe sees: a product with it without forming it costs as much
 as one on the other side, 2 block products an observation, but forming it takes sum n_k^2 of them, n_k points seen by k.

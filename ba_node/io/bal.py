@@ -43,6 +43,8 @@ MAX_BYTES = 2**32
 MAX_GROWTH = 10
 # Rows of text that are written at a time.
 _ROWS = 2**13
+# Bytes at the begin among which a file that is no text has a zero.
+_BEGIN = 1000
 _NONE = np.empty(0)
 # The camera of all keyframes: its focal length is one, as theirs are in ``State.intrinsics``.
 _RIG = Cameras(
@@ -219,6 +221,8 @@ def numbers_of(path: Path, text: bytes) -> FloatArray:
 
 
 def _raise_not_a_number(path: Path, text: bytes) -> None:
+    if b"\0" in text[:_BEGIN]:
+        raise BalError(f"{path}: not a text, as BAL and Bundler are; a recording is refined by ba replay")
     for word in _words(text):
         if not _is_number(word[0]):
             shown = word[0][:40].decode("ascii", errors="replace")

@@ -78,9 +78,14 @@ def _read(path: Path, topic: str) -> tuple[Poses, bool]:
     columns = first_line(path)
     if "," in columns:
         return _read_table(path, ",", 8, "stamp[ns],x,y,z,qw,qx,qy,qz,... (EuRoC)"), True
-    if path.suffix == ".kitti" or len(columns.split()) == 12:
+    if is_kitti(path):
         return _read_table(path, None, 12, "the first three rows of a pose (KITTI)"), False
     return read_tum(path), True
+
+
+def is_kitti(path: Path) -> bool:
+    """Return True if a file holds poses without stamps."""
+    return path.is_file() and (path.suffix == ".kitti" or len(first_line(path).split()) == 12)
 
 
 def first_line(path: Path) -> str:

@@ -131,7 +131,8 @@ def parse_stamp(text: str) -> int:
 
 def _parse_pose(words: list[str]) -> list[float]:
     if len(words) != 8:
-        raise ValueError(f"{len(words)} values: expected 8 ({_COLUMNS})")
+        kitti = "; those of KITTI have no stamps" if len(words) == 12 else ""
+        raise ValueError(f"{len(words)} values: expected 8 ({_COLUMNS}){kitti}")
     values = [_parse_number(word, name) for word, name in zip(words[1:], _COLUMNS.split()[1:], strict=True)]
     if not any(values[3:]):
         raise ValueError("the quaternion is zero: expected a unit quaternion")

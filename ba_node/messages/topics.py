@@ -60,7 +60,7 @@ class Command:
 
 
 _IN, _OUT, _SIDE = Direction.TAKEN, Direction.PUBLISHED, Direction.ON_DEMAND
-_RELIABLE, _LATCHED = Delivery.RELIABLE, Delivery.LATCHED
+_LATCHED = Delivery.LATCHED
 TF, TF_STATIC, DIAGNOSTICS, CLOCK = "/tf", "/tf_static", "/diagnostics", "/clock"
 
 _ALL = (

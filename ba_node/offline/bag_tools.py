@@ -240,7 +240,8 @@ def cut(source: Path | Sequence[Path], target: Path, span: Span, progress: Progr
                 count, last = count + 1, time_ns
             if not count:
                 length = (max((t for _, t, _ in reader.raw()), default=first) - first) / _NS
-                raise BagError(f"{reader.path}: no message from {span.start_s:g} to {span.end_s:g} s of {length:g} s")
+                until = f"to {span.end_s:g} s" if math.isfinite(span.end_s) else "s on"
+                raise BagError(f"{reader.path}: no message from {span.start_s:g} {until}: it has {length:g} s")
     return count + len(held), (last - start) / _NS
 
 

@@ -22,6 +22,8 @@ from ba_node.offline.recording import placed
 
 # Cameras that were far off let observations be left out that fit the refined ones: these are heard in the next round.
 _ROUNDS = 4
+# Of the offsets of clocks, s: what is less is rounding.
+_DECIMALS = 12
 # A round that moves no parameter by more than this many standard deviations is the last.
 _SETTLED = 1.0
 
@@ -89,7 +91,7 @@ def write_rig(path: Path, refined: Refined) -> None:
         own = [parameter for parameter in refined.found.parameters if parameter.camera == camera]
         beside.append(
             {
-                "time_offset": float(refined.found.time_offset[camera]),
+                "time_offset": round(float(refined.found.time_offset[camera]), _DECIMALS),
                 "standard_deviations": {one.name: float(f"{one.sigma:.4g}") for one in own if one.told},
                 "not_told": [one.name for one in own if not one.told],
             }

@@ -130,7 +130,7 @@ def line(x: Any, y: Any, name: str, colour: str, **more: Any) -> dict[str, Any]:
 
 def _above(shown: Sequence[_Shown]) -> Figure:
     data: list[dict[str, Any]] = []
-    across, up, _ = viewpoint.seen_from(shown[0].up)
+    across, up, turned = viewpoint.page(shown[0].up, [path for one in shown for _, path, _, _ in one.paths])
     for number, one in enumerate(shown):
         cloud = _few(one.cloud, _ABOVE)
         if len(cloud) and number == 0:
@@ -140,8 +140,8 @@ def _above(shown: Sequence[_Shown]) -> Figure:
             if name != "reference" or number == 0:
                 drawn = line(path[:, across], path[:, up], one.name(name), colour)
                 data.append(drawn | {"line": {"color": colour, "width": 2, "dash": dash}})
-    titles = [{"title": f"{'xyz'[axis]} [m]"} for axis in (across, up)]
-    layout = {"xaxis": titles[0], "yaxis": titles[1] | {"scaleanchor": "x"}}
+    layout = {name: {"title": f"{'xyz'[axis]} [m]"} for name, axis in (("xaxis", across), ("yaxis", up))}
+    layout["yaxis"] |= {"scaleanchor": "x"} | ({"autorange": "reversed"} if turned else {})
     return Figure("above", "From above", "Trajectories, and points of the map.", data, layout)
 
 
@@ -328,7 +328,7 @@ def _health(shown: Sequence[_ShownRun]) -> Figure:
                 drawn = line(one.solve_s[rows], np.full(rows.sum(), 100.0), one.name(status.lower()), colour)
                 data.append(drawn | {"mode": "markers", "marker": marker, "text": words, "hoverinfo": "text"})
     layout = {
-        "xaxis": {"title": "time [s]"},
+        "xaxis": {"title": "time [s]", "domain": [0.0, 0.9]},
         "yaxis": {"title": "inliers [%]", "range": [0, 105]},
         "yaxis2": {
             "title": "parallax [deg]",

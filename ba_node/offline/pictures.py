@@ -159,6 +159,8 @@ def _set_axis(axes: Any, name: str, layout: dict[str, Any]) -> None:
         getattr(axes, f"set_{name}lim")(0.0)
     if "range" in layout:
         getattr(axes, f"set_{name}lim")(*layout["range"])
+    if layout.get("autorange") == "reversed":
+        getattr(axes, f"invert_{name}axis")()
     if "scaleanchor" in layout:
         axes.set_aspect("equal", adjustable="datalim" if "range" not in layout else "box")
     if layout.get("showgrid", True):

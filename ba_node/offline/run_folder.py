@@ -125,6 +125,8 @@ def read_run(folder: Path, name: str = "") -> Run:
             details,
             dict(configure(folder / "effective.yaml", {}).values()),
         )
+    except FileNotFoundError as error:
+        raise RunError(f"{folder}: no results of ba replay, there is no {Path(error.filename).name} in it") from None
     except (OSError, KeyError, PlyError, json.JSONDecodeError) as error:
         raise RunError(f"{folder}: no results of ba replay, or of an older version: {error}") from None
 

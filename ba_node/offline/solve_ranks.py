@@ -60,8 +60,10 @@ class Checkpoint:
                 of = str(found["digest"])
                 state = State(*(found[field.name] for field in dataclasses.fields(State)))
                 damping, radius = float(found["damping"]), float(found["radius"])
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        except OSError as error:
             raise RanksError(f"{self.path}: no checkpoint to go on from ({error}): leave --resume out") from None
+        except (EOFError, KeyError, ValueError, zipfile.BadZipFile):
+            raise RanksError(f"{self.path}: no checkpoint, or a damaged one: leave --resume out") from None
         if of != digest or (len(state.translation), len(state.points)) != sizes:
             raise RanksError(f"{self.path}: a checkpoint of another problem: leave --resume out, or name its file")
         return state, damping, radius

@@ -21,6 +21,7 @@ _NS = 1e9
 REFINED = "refined.mcap"
 # Cameras and clouds come once in a recording: repeated so often for those who connect later, s.
 _REPEAT_S = 2.0
+_LAST_PORT = 65535
 
 
 class ViewError(ValueError):
@@ -44,6 +45,8 @@ def serve(options: ViewOptions) -> Iterator[tuple[Any, str]]:
     Raises:
         ViewError: foxglove-sdk is not installed, or the port is taken.
     """
+    if not 0 <= options.port <= _LAST_PORT:
+        raise ViewError(f"--port {options.port}: expected 0 to {_LAST_PORT}")
     try:
         foxglove = importlib.import_module("foxglove")
     except ModuleNotFoundError:

@@ -10,6 +10,8 @@ from ba_node.arrays import FloatArray
 from ba_node.core import geometry
 from ba_node.estimate import Poses
 
+# A picture that is so many times as high as wide is turned.
+_HIGH = 1.5
 # A camera whose axis is this steep looks down; and the axes of one that looks along x, on a body of REP 103.
 _DOWN = 0.7
 _FORWARDS = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -43,6 +45,17 @@ def seen_from(up: FloatArray) -> tuple[int, int, int]:
     along = int(np.argmax(np.abs(up)))
     right, upwards_in_picture = (along + 1) % 3, (along + 2) % 3
     return (right, upwards_in_picture, along) if up[along] > 0.0 else (upwards_in_picture, right, along)
+
+
+def page(up: FloatArray, paths: list[FloatArray]) -> tuple[int, int, bool]:
+    """Return the axes to the right and upwards on a page that is wider than high, and whether the latter is reversed.
+
+    A picture of paths (n, 3) from above that is much higher than wide is turned by a quarter.
+    """
+    right, upwards_in_picture, _ = seen_from(up)
+    points = np.concatenate([np.zeros((0, 3)), *paths])
+    width, height = np.ptp(points[:, [right, upwards_in_picture]], axis=0) if len(points) else (0.0, 0.0)
+    return (upwards_in_picture, right, True) if height > _HIGH * width else (right, upwards_in_picture, False)
 
 
 def _travelled(steps: FloatArray, axes: FloatArray) -> FloatArray:

@@ -32,6 +32,7 @@ from ba_node.ros.components.definitions import Definitions
 from ba_node.ros.components.diagnostics import Diagnostics
 from ba_node.ros.components.inputs import Inputs
 from ba_node.ros.components.map_transform import MapTransform
+from ba_node.ros.components.namesake import Namesake
 from ba_node.ros.components.optimize import Optimize
 from ba_node.ros.components.publishing import Publishing
 from ba_node.ros.components.services import Services
@@ -56,6 +57,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     Silence,
     SimulatedTime,
     Definitions,
+    Namesake,
     StaticFrames,
     Services,
     Optimize,

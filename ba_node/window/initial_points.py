@@ -35,8 +35,8 @@ _DIVIDED_VIEWS = 9
 _LEAST_AGREEMENT = 0.2
 # Parallax below this many standard deviations of the rays' directions is noise.
 _LEAST_PARALLAX = 4.0
-# Three standard deviations of a normal distribution, of which 1.4826 median absolute deviations are one.
-SPREAD = 3.0 * 1.4826
+# Three standard deviations, in median absolute deviations.
+SPREAD = 3.0 * loss.NORMAL
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,16 +15,16 @@ import numpy as np
 from ba_node import native
 from ba_node.arrays import FloatArray, IntArray
 from ba_node.config import GuardConfig
+from ba_node.core.loss import NORMAL
 from ba_node.window.trial import median
 
 # Steps shorter, and turns smaller, than this many sigmas of the front-end say nothing of its scale.
 _TELLING = 3.0
-# One standard deviation of a normal distribution, in median absolute deviations; and of the median of n of its samples.
-_SPREAD = 1.4826
+# Standard error of a median, in those of a mean.
 _MEDIAN = 1.2533
 # Fewer steps than this show no common factor; so few show no bias.
 _FEW, _LEAST_BIASED = 5, 7
-_LIMITS = _TELLING, _SPREAD, _MEDIAN, _FEW
+_LIMITS = _TELLING, NORMAL, _MEDIAN, _FEW
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,6 @@ def _common(found: FloatArray, measured: FloatArray, sigma: FloatArray) -> float
         return 1.0
     logs = np.log(ours[telling] / theirs[telling])
     middle = median(logs)
-    scatter = _MEDIAN * _SPREAD * median(np.abs(logs - middle)) / np.sqrt(n)
+    scatter = _MEDIAN * NORMAL * median(np.abs(logs - middle)) / np.sqrt(n)
     expected = _MEDIAN * median(2.0 * sigma[telling] / length[telling]) / np.sqrt(n)
     return float(np.exp(middle)) if abs(middle) > max(3.0 * scatter, 2.0 * expected) else 1.0

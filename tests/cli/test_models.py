@@ -140,6 +140,9 @@ def test_a_recording_becomes_a_model_and_poses(bag: Path, tmp_path: Path, capsys
         assert main(["convert", str(bag), str(name)]) == 0
         assert capsys.readouterr().out.startswith(f"{name}: 8 keyframes, 2 cameras, ")
     assert main(["convert", str(names[0]), str(tmp_path / "p.g2o")]) == 0
+    assert "stamps" not in capsys.readouterr().out
+    assert main(["convert", str(names[1]), str(tmp_path / "again.tum")]) == 0
+    assert "stamps are a second apart, as KITTI has none" in capsys.readouterr().out
     tum, kitti, graph = read_poses(names[0]), read_poses(names[1]), read_g2o(tmp_path / "p.g2o")
     assert isinstance(graph, Poses)
     assert len(tum) == len(kitti) == len(graph) == 8

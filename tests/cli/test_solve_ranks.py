@@ -126,6 +126,23 @@ def test_ranks_that_are_killed_at_random_end_all_and_the_run_goes_on(file: Path,
     assert found["objective_after"] == pytest.approx(alone.result.objective_after, rel=1e-5)
 
 
+@MPI
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_command_alone_ends_its_ranks_too(file: Path, tmp_path: Path, number: signal.Signals) -> None:
+    words = ("solve", file, "--ranks", 2, *ITERATIONS, "--iterations", 100000, "--out", tmp_path / "refined.txt")
+    command = ["env", "--default-signal=INT,TERM", sys.executable, "-m", "ba_node.cli.main", *map(str, words)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
+        end = time.monotonic() + 120.0
+        while len(_ranks_of(run.pid, str(file))) < 2:
+            assert time.monotonic() < end and run.poll() is None
+            time.sleep(0.05)
+        run.send_signal(number)
+        _, told = run.communicate(timeout=60)
+    assert run.returncode == 128 + number and told.count("\n") == 1, told
+    assert not _ranks_of(run.pid, str(file)) and not list(tmp_path.iterdir())
+
+
 def _ranks_of(launcher: int, file: str) -> list[int]:
     """Return the processes below a launcher that solve a file, but for the launcher itself."""
     found = []
@@ -228,7 +245,9 @@ def test_observations_behind_are_those_of_all_ranks(file: Path) -> None:
     [
         (("--resume",), "--resume needs --checkpoint FILE"),
         (("--ranks", "0"), "--ranks 0: expected 1 or more"),
+        (("--ranks", "1000000"), "--ranks 1000000: this machine has"),
         (("--checkpoint", "none/at.npz", "--resume"), "no checkpoint to go on from"),
+        (("--checkpoint", __file__, "--resume"), "no checkpoint, or a damaged one: leave --resume out"),
     ],
 )
 def test_a_command_line_that_cannot_be_is_refused(file: Path, words: tuple[str, ...], reason: str) -> None:

@@ -149,3 +149,13 @@ def test_sound_cameras_stay_within_what_is_told(make_problem: MakeProblem) -> No
     _, _, found = calibration.calibrate(given, stamp_s, EXACT, wanted)
     sigmas = np.array([parameter.change / parameter.sigma for parameter in found.parameters if parameter.told])
     assert len(sigmas) >= 8 and np.abs(sigmas).max() < 4.0 and np.mean(sigmas**2) < 2.5
+
+
+def test_what_moved_by_rounding_alone_is_left_as_given() -> None:
+    nothing = np.empty((0, 3, 3))
+    cameras = Cameras(nothing, nothing[:, 0], np.empty(0, np.uint8), np.empty((0, 12)))
+    moved, given = (calibration.Parameter(0, name, "s", 0.05, by, 0.05) for name, by in (("a", 1e-6), ("b", 2e-16)))
+    found = calibration.Calibration(cameras, np.zeros(1), (moved, given))
+    assert found.lines() == [
+        "hardly told by the data: a +1e-06 +- 0.05 s; not told by the data, left as given: b",
+    ]

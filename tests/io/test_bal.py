@@ -166,6 +166,7 @@ def edit(line: int, new: str) -> str:
         ("", "is empty"),
         (" \n\n", "is empty"),
         ("hello world\n", "line 1: 'hello' is not a number"),
+        ("\0\1 2 3\n", "not a text, as BAL and Bundler are; a recording is refined by ba replay"),
         ("2 1\n", "line 1: '2 1': expected the numbers of cameras, points, observations"),
         ("2.5 1 2\n", "line 1: '2.5 1 2': expected the numbers"),
         ("-2 1 2\n", "line 1: '-2 1 2': expected the numbers"),

@@ -56,6 +56,7 @@ def test_form_of_a_line(tmp_path: Path) -> None:
     [
         ("1.0 1 2 3 0 0 0", r":3: 7 values: expected 8"),
         ("1.0 1 2 3 0 0 0 1 9", r":3: 9 values: expected 8"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0", r":3: 12 values: expected 8 .*; those of KITTI have no stamps"),
         ("x 1 2 3 0 0 0 1", r":3: stamp 'x' is not a number"),
         ("nan 1 2 3 0 0 0 1", r":3: stamp 'nan': expected finite seconds"),
         ("inf 1 2 3 0 0 0 1", r":3: stamp 'inf': expected finite seconds"),

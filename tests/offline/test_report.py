@@ -212,7 +212,7 @@ def test_without_plotly_the_picture_is_there_and_the_line_says_what_to_install(
 
 def test_a_folder_without_results_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(tmp_path)]) == 2
-    assert f"{tmp_path}: no results of ba replay" in capsys.readouterr().err
+    assert f"{tmp_path}: no results of ba replay, there is no report.json in it" in capsys.readouterr().err
 
 
 @pytest.mark.slow

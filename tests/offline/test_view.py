@@ -91,6 +91,11 @@ def test_a_client_of_foxglove_gets_the_messages_with_their_definitions(results: 
     thread.join(60.0)
 
 
+def test_a_port_that_cannot_be_is_said(results: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", str(results[1]), "--port", "80000"]) == 2
+    assert "--port 80000: expected 0 to 65535" in capsys.readouterr().err
+
+
 def test_a_port_that_is_taken_is_said(results: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     with serve(ViewOptions(port=0)) as (_, address):
         port = address.rpartition(":")[2]

@@ -62,7 +62,7 @@ def test_nothing_to_record_is_said(tmp_path: Path, domain: int) -> None:  # noqa
     process = recorder(tmp_path / "mine.mcap", "--duration", "1")
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert "mine.mcap: File exists" in error
+    assert "mine.mcap: File exists: what was recorded is not written over, give another name" in error
     assert (tmp_path / "mine.mcap").read_bytes() == b"mine"
 
 
