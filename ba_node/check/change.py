@@ -35,6 +35,7 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.check.adjusted import ALONG, DAMPING, Adjusted, Measure, placed, problem_of_all
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.onset import ADVICE, ERRORS, LEAST, Change, named
+from ba_node.check.relations import relate
 from ba_node.check.tracks import Tracks
 from ba_node.core import bordered, geometry, native_kernels
 from ba_node.core.cameras import CX, CY, FX, FY
@@ -54,6 +55,8 @@ _DOUBTED, _ODD, _SMALL = 15.0, 2.5, 0.25
 # A step that jumps is off by more than this part of the usual step, so many keyframes around. The usual step is longer
 # than this share of all; those much shorter tell nothing. Steps around one that it is as long as.
 _JUMP, _NEAR, _LONG, _TELLING, _AROUND = 0.5, 15, 0.7, 0.3, 4
+# A step that turns so much further than the images is the front-end's jump: no region of interest passes for it.
+_FAR_DEG = 15.0
 # Residuals between these, in units of the noise, may be of objects that move, which pull together: their share counts
 # so many times.
 _MOVING, _TOGETHER = (4.0, 15.0), 20.0
@@ -121,7 +124,8 @@ def _changes(tracks: Tracks, keyframes: IntArray, most: int) -> tuple[list[Findi
             if found.is_sure and not jumps and _gain(found, given) > _SURE * together:
                 change, at = found.change, int(keyframes[k])
                 return [named(tracks, camera, at, change, np.zeros(3)) for camera in cameras], doubted
-    if doubted and score.max() > _DOUBTED and abs(int(np.argmax(score)) - odd) <= 1:
+    passes = doubted and score.max() > _DOUBTED and abs(int(np.argmax(score)) - odd) <= 1
+    if passes and not _turned_far(tracks, int(keyframes[odd])):
         return [_unclear(tracks, int(keyframes[odd]), off[odd], others)], doubted
     return [], doubted
 
@@ -153,6 +157,13 @@ def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:
     # What a long step is off by is a part of its own length.
     length = np.maximum(usual[0], ratio * lengths[1])
     return np.append(0.0, np.linalg.norm(ours - ratio[:, None] * given, axis=1) / length)
+
+
+def _turned_far(tracks: Tracks, k: int) -> bool:
+    """Return True if the front-end's turn to a keyframe is far off what its image and the one before tell."""
+    a, b = (k - 1, 0), (k, 0)
+    relation = relate(tracks, a, b, tracks.match(a, b))
+    return relation is not None and relation.pose.turned_from(tracks.between_images(a, b)) > _FAR_DEG
 
 
 def _usual(lengths: list[FloatArray], told: BoolArray, i: int) -> float:
