@@ -19,7 +19,8 @@ less.
 
 The front-end's poses are where all this begins, no more; but where steps of theirs jump nearby, poses may have ended
 anywhere, and nothing is told. A lower score counts where the step to that keyframe alone is far off the front-end's: so
-it is where a change passes for a step, and what changed can hardly be told.
+it is where a change passes for a step, and what changed can hardly be told. Not where the front-end's own step stands
+out of its others: it is that which jumps.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ from ba_node.arrays import BoolArray, FloatArray, IntArray
 from ba_node.check.adjusted import ALONG, DAMPING, Adjusted, Measure, placed, problem_of_all
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.onset import ADVICE, ERRORS, LEAST, Change, named
-from ba_node.check.relations import relate
 from ba_node.check.tracks import Tracks
 from ba_node.core import bordered, geometry, native_kernels
 from ba_node.core.cameras import CX, CY, FX, FY
@@ -55,8 +55,9 @@ _DOUBTED, _ODD, _SMALL = 15.0, 2.5, 0.25
 # A step that jumps is off by more than this part of the usual step, so many keyframes around. The usual step is longer
 # than this share of all; those much shorter tell nothing. Steps around one that it is as long as.
 _JUMP, _NEAR, _LONG, _TELLING, _AROUND = 0.5, 15, 0.7, 0.3, 4
-# A step that turns so much further than the images is the front-end's jump: no region of interest passes for it.
-_FAR_DEG = 15.0
+# A step of the front-end that is so many times as large as all its others, and a turn so large (rad) or a move (m),
+# is a jump of its own: images that change leave its steps as they are.
+_TIMES, _LEAST_JUMP = 3.0, (0.1, 0.1)
 # Residuals between these, in units of the noise, may be of objects that move, which pull together: their share counts
 # so many times.
 _MOVING, _TOGETHER = (4.0, 15.0), 20.0
@@ -125,7 +126,7 @@ def _changes(tracks: Tracks, keyframes: IntArray, most: int) -> tuple[list[Findi
                 change, at = found.change, int(keyframes[k])
                 return [named(tracks, camera, at, change, np.zeros(3)) for camera in cameras], doubted
     passes = doubted and score.max() > _DOUBTED and abs(int(np.argmax(score)) - odd) <= 1
-    if passes and not _turned_far(tracks, int(keyframes[odd])):
+    if passes and not _stands_out(tracks, keyframes, odd):
         return [_unclear(tracks, int(keyframes[odd]), off[odd], others)], doubted
     return [], doubted
 
@@ -159,11 +160,15 @@ def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:
     return np.append(0.0, np.linalg.norm(ours - ratio[:, None] * given, axis=1) / length)
 
 
-def _turned_far(tracks: Tracks, k: int) -> bool:
-    """Return True if the front-end's turn to a keyframe is far off what its image and the one before tell."""
-    a, b = (k - 1, 0), (k, 0)
-    relation = relate(tracks, a, b, tracks.match(a, b))
-    return relation is not None and relation.pose.turned_from(tracks.between_images(a, b)) > _FAR_DEG
+def _stands_out(tracks: Tracks, keyframes: IntArray, k: int) -> bool:
+    """Return True if the front-end's step to the k-th keyframe is far longer than its others, or turns far more."""
+    pairs = keyframes[:-1], keyframes[1:]
+    turns, moves = geometry.steps_between(tracks.rotation, tracks.position, *pairs)
+    sizes = np.linalg.norm(geometry.so3_log(turns), axis=1), np.linalg.norm(moves, axis=1)
+    return k > 0 and any(
+        bool(of[k - 1] > max(_TIMES * float(np.delete(of, k - 1).max()), least))
+        for of, least in zip(sizes, _LEAST_JUMP, strict=True)
+    )
 
 
 def _usual(lengths: list[FloatArray], told: BoolArray, i: int) -> float:
