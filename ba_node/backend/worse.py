@@ -11,6 +11,7 @@ from __future__ import annotations
 from ba_node.check.departure import departed, deviates, has_scale, length_factor
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.measured_depths import depths_err
+from ba_node.check.turning import turns_differ
 from ba_node.check.watch import Check, of_all_images, of_few_keyframes, of_the_newest
 from ba_node.config import Config
 from ba_node.scene.scene import Scene
@@ -29,7 +30,7 @@ def is_worse(before: float, after: float, share: float = _SHARE) -> bool:
 
 def amiss(scene: Scene) -> Check | None:
     """Return what is wrong with a young map that goes on, None if nothing is, or if it is not asked now."""
-    wrong = departed(scene)
+    wrong = departed(scene) or turns_differ(scene)
     return depths_err(scene, at_once=wrong is not None) or wrong
 
 
@@ -41,6 +42,7 @@ def wrong_at_the_end(scene: Scene, config: Config) -> Check | None:
         or of_all_images(scene)
         or depths_err(scene, at_once=True)
         or departed(scene, final=True)
+        or turns_differ(scene, final=True)
         or explains_worse(scene, config)
         or of_few_keyframes(scene)
     )

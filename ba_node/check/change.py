@@ -19,7 +19,8 @@ less.
 
 The front-end's poses are where all this begins, no more; but where steps of theirs jump nearby, poses may have ended
 anywhere, and nothing is told. A lower score counts where the step to that keyframe alone is far off the front-end's: so
-it is where a change passes for a step, and what changed can hardly be told.
+it is where a change passes for a step, and what changed can hardly be told. Not where the front-end's own step stands
+out of its others: it is that which jumps.
 """
 
 from __future__ import annotations
@@ -54,6 +55,9 @@ _DOUBTED, _ODD, _SMALL = 15.0, 2.5, 0.25
 # A step that jumps is off by more than this part of the usual step, so many keyframes around. The usual step is longer
 # than this share of all; those much shorter tell nothing. Steps around one that it is as long as.
 _JUMP, _NEAR, _LONG, _TELLING, _AROUND = 0.5, 15, 0.7, 0.3, 4
+# A step of the front-end that is so many times as large as all its others, and a turn so large (rad) or a move (m),
+# is a jump of its own: images that change leave its steps as they are.
+_TIMES, _LEAST_JUMP = 3.0, (0.1, 0.1)
 # Residuals between these, in units of the noise, may be of objects that move, which pull together: their share counts
 # so many times.
 _MOVING, _TOGETHER = (4.0, 15.0), 20.0
@@ -121,7 +125,8 @@ def _changes(tracks: Tracks, keyframes: IntArray, most: int) -> tuple[list[Findi
             if found.is_sure and not jumps and _gain(found, given) > _SURE * together:
                 change, at = found.change, int(keyframes[k])
                 return [named(tracks, camera, at, change, np.zeros(3)) for camera in cameras], doubted
-    if doubted and score.max() > _DOUBTED and abs(int(np.argmax(score)) - odd) <= 1:
+    passes = doubted and score.max() > _DOUBTED and abs(int(np.argmax(score)) - odd) <= 1
+    if passes and not _stands_out(tracks, keyframes, odd):
         return [_unclear(tracks, int(keyframes[odd]), off[odd], others)], doubted
     return [], doubted
 
@@ -153,6 +158,17 @@ def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:
     # What a long step is off by is a part of its own length.
     length = np.maximum(usual[0], ratio * lengths[1])
     return np.append(0.0, np.linalg.norm(ours - ratio[:, None] * given, axis=1) / length)
+
+
+def _stands_out(tracks: Tracks, keyframes: IntArray, k: int) -> bool:
+    """Return True if the front-end's step to the k-th keyframe is far longer than its others, or turns far more."""
+    pairs = keyframes[:-1], keyframes[1:]
+    turns, moves = geometry.steps_between(tracks.rotation, tracks.position, *pairs)
+    sizes = np.linalg.norm(geometry.so3_log(turns), axis=1), np.linalg.norm(moves, axis=1)
+    return k > 0 and any(
+        bool(of[k - 1] > max(_TIMES * float(np.delete(of, k - 1).max()), least))
+        for of, least in zip(sizes, _LEAST_JUMP, strict=True)
+    )
 
 
 def _usual(lengths: list[FloatArray], told: BoolArray, i: int) -> float:

@@ -159,7 +159,7 @@ def _factor(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits
     """Return by what factor refined steps (n, 3) are longer than the given ones; 1 where that may be chance."""
     along = _along(scene, refined, given)
     ratio = np.sum(refined * along, axis=1) / np.sum(given * along, axis=1)
-    mean, error = _trimmed_mean(np.log(ratio))
+    mean, error = trimmed_mean(np.log(ratio))
     return float(np.exp(mean)) if _differs(mean, error, len(given), limits) else 1.0
 
 
@@ -208,7 +208,7 @@ def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits)
     """Return what is wrong if refined steps (n, 3) point to another side of the body than the given ones."""
     lengths = np.linalg.norm(refined, axis=1) * np.linalg.norm(given, axis=1)
     turns = np.cross(given, refined) / lengths[:, None]
-    found = [_trimmed_mean(of_axis) for of_axis in turns.T]
+    found = [trimmed_mean(of_axis) for of_axis in turns.T]
     times = 1.0 if has_scale(scene) else _ONE_CAMERA
     if not any(_differs(mean, error, len(given), limits, times) for mean, error in found):
         return None
@@ -310,7 +310,7 @@ def _telling(scene: Scene, newest: int = 0) -> IntArray:
     return pairs[:, telling]
 
 
-def _trimmed_mean(values: FloatArray) -> tuple[float, float]:
+def trimmed_mean(values: FloatArray) -> tuple[float, float]:
     """Return the mean without the extremes and its standard error, by the spread of the values drawn in to these."""
     values = np.sort(values)
     cut = int(_TRIMMED * len(values))

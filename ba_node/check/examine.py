@@ -113,6 +113,12 @@ def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:
         size = _of_size(tracks, pairs, outcome)
         if size is not None:
             outcome.findings, outcome.untold = [size], []
+        elif outcome.rows:
+            # A wrong lens keeps tracks from agreeing with any relation, as outliers do.
+            lens = intrinsics.check_intrinsics(tracks, pairs)
+            if lens.findings:
+                outcome.findings, outcome.untold = lens.findings, []
+                outcome.rows += lens.rows
     return outcome
 
 
@@ -120,9 +126,10 @@ def _of_size(tracks: Tracks, pairs: list[Relation], outcome: Diagnosis) -> Findi
     """Return another size of the images as the cause, if poses that contradict the tracks fit with it."""
     evidence = outcome.findings[0].evidence if outcome.findings else "the poses fit the tracks with that undone"
     fits: list[tuple[float, str, str]] = []
-    for size in intrinsics.other_sizes(tracks):
-        # Few keyframes cannot tell precisely where a region is.
-        model = intrinsics.freed_from(tracks, pairs, size) or size
+    # Few keyframes cannot tell precisely where a region is; and a wrong focal length alone contradicts the poses.
+    models = [intrinsics.freed_from(tracks, pairs, size.params) or size for size in intrinsics.other_sizes(tracks)]
+    free = intrinsics.freed_from(tracks, pairs, tracks.cameras.params) if outcome.rows else None
+    for model in models if free is None else [*models, free]:
         other = tracks.seen(params=model.params)
         related = relations.in_motion(other)
         fit = motion.check_motion(other, related)

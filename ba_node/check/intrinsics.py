@@ -134,12 +134,12 @@ def _left(relations: list[Relation]) -> float:
     return _LEFT if share < _MOST_AGREE else 1.0
 
 
-def freed_from(tracks: Tracks, relations: list[Relation], model: Model) -> Model | None:
-    """Return cameras whose focal length and principal point are adjusted from a model on; None where that fails."""
+def freed_from(tracks: Tracks, relations: list[Relation], params: FloatArray) -> Model | None:
+    """Return cameras whose focal length and principal point are adjusted from some on; None where they are as given."""
     problem = problem_of(tracks, relations, part=0)
     if problem is None:
         return None
-    return _named(tracks, Freed(Adjusted(problem, model.params)))
+    return _named(tracks, Freed(Adjusted(problem, params)))
 
 
 def loss_of(tracks: Tracks, relations: list[Relation]) -> float:

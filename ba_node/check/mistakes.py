@@ -30,6 +30,7 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 Y_Z = np.diag([1.0, -1.0, -1.0])
 EXTRINSICS = "body_from_camera in camera_rig (or tf_static)"
 _ONE = "body_from_camera of camera {camera} in camera_rig (or tf_static)"
+_INDEX = "camera_index in the feature_tracks, or the order of the cameras in camera_rig"
 _PIXELS = "u and v in the feature_tracks, or the images that they are tracked in"
 
 
@@ -129,7 +130,7 @@ BETWEEN_CAMERAS = (
     ),
     Mistake(
         "cameras 0 and {camera} swapped",
-        "camera_index in the feature_tracks, or the order of the cameras in camera_rig",
+        _INDEX,
         cameras_as(_swapped),
     ),
     INVERTED,
@@ -164,7 +165,7 @@ def in_place_of(other: int) -> Mistake:
     """Return that a camera sits where the rig says that another one does."""
     return Mistake(
         f"cameras {other} and {{camera}} swapped",
-        "camera_index in the feature_tracks, or the order of the cameras in camera_rig",
+        _INDEX,
         cameras_as(_one(lambda placed, _: (np.repeat(placed[0][other][None], len(placed[0]), 0), placed[1]))),
     )
 
@@ -205,13 +206,28 @@ FLIPS = (
 _SIZES, _NEARLY = (4.0, 2.0, 0.5, 0.25), 1.33
 
 
+def swapped(given: Tracks, order: Sequence[int]) -> Tracks:
+    """Return what is seen if every camera, its lens and its place, is the one that an order names for it."""
+    rig, rows = given.cameras, list(order)
+    placed = replace(rig, model=rig.model[rows], rotation=rig.rotation[rows], translation=rig.translation[rows])
+    return replace(given, cameras=placed).seen(params=rig.params[rows])
+
+
+def _exchanged(given: Tracks, camera: int) -> Tracks:
+    order = np.arange(len(given.cameras.model))
+    order[[0, camera]] = camera, 0
+    return swapped(given, order.tolist())
+
+
 def _seen(given: Tracks, _: int, uv: FloatArray | None = None, params: FloatArray | None = None) -> Tracks:
     return given.seen(uv, params)
 
 
 def images_of_one(given: Tracks, camera: int) -> list[Mistake]:
     """Return the ways to give the images of a camera wrongly, or those of camera 0, which it is compared with."""
-    found = []
+    rig, found = given.cameras, []
+    if rig.model[0] != rig.model[camera] or not np.allclose(rig.params[0], rig.params[camera]):
+        found.append(Mistake("cameras 0 and {camera} swapped, intrinsics and place", _INDEX, _exchanged))
     for one in (camera, 0):
         its = given.camera == one
         middle = 0.5 * np.percentile(given.uv[its], [0.2, 99.8], axis=0).sum(axis=0)

@@ -150,6 +150,10 @@ def _by_turns(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
     least = min(off.values())
     evidence = f"turns of the front-end are {np.mean(now.rotation):.1f} degrees off, {least:.1f} with that undone"
     named = [one for one, by in off.items() if by < _ALIKE * least]
+    # Cameras that are a little off their places have directions off too, and turns about one axis pass for another's.
+    turned = compare(tracks, usable, _turn(tracks, usable))
+    if np.median(turned.off) < _BETTER * min(np.median(tried[one].off) for one in named):
+        return None
     return Diagnosis([finding(named, evidence)], rows=rows)
 
 

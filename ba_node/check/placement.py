@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from ba_node.check import two_view
 from ba_node.check.diagnosis import Diagnosis, Finding, Row, angle
-from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding, images_of_one
+from ba_node.check.mistakes import BETWEEN_CAMERAS, FLIPS, Flip, Mistake, finding, images_of_one, swapped
 from ba_node.check.motion import check_motion, compare, compare_steps, contradicts
 from ba_node.check.relations import AGREED, Relation, in_motion, of_cameras, relate, shared_views, spread
 from ba_node.check.tracks import Tracks
@@ -120,14 +120,8 @@ def _order(tracks: Tracks, compared: dict[int, Diagnosis]) -> dict[int, Diagnosi
     if not wrong or not 3 <= len(tracks.cameras.model) <= _MOST_ORDERED:
         return compared
     relations = {camera: relation for camera in compared if (relation := of_cameras(tracks, camera)) is not None}
-    rig, orders = tracks.cameras, []
-    for order in itertools.permutations(range(len(rig.model))):
-        rows = list(order)
-        placed = dataclasses.replace(rig, rotation=rig.rotation[rows], translation=rig.translation[rows])
-        other = dataclasses.replace(tracks, cameras=placed)
-        shares = [two_view.share(one.pair, other.between_cameras(0, camera)) for camera, one in relations.items()]
-        if all(share >= _NAMED * one.share for share, one in zip(shares, relations.values(), strict=True)):
-            orders.append(", ".join(map(str, order)))
+    every = itertools.permutations(range(len(tracks.cameras.model)))
+    orders = [", ".join(map(str, order)) for order in every if _fit_in_order(tracks, relations, order)]
     if not orders:
         return compared
     cause = f"cameras in another order than in camera_rig: they sit where it says that {' or '.join(orders)} do"
@@ -139,6 +133,21 @@ def _order(tracks: Tracks, compared: dict[int, Diagnosis]) -> dict[int, Diagnosi
             found.append(dataclasses.replace(one, causes=(cause, *causes), changes=(_ORDER, *changes), usual=True))
         compared = compared | {camera: dataclasses.replace(compared[camera], findings=found)}
     return compared
+
+
+def _fit_in_order(tracks: Tracks, relations: dict[int, Relation], order: Sequence[int]) -> bool:
+    """Return True if cameras fit where an order says that they sit, with the intrinsics given or those of there."""
+    rig, rows = tracks.cameras, list(order)
+    placed = dataclasses.replace(rig, rotation=rig.rotation[rows], translation=rig.translation[rows])
+    for other in (dataclasses.replace(tracks, cameras=placed), swapped(tracks, order)):
+        seen = {camera: one.seen_by(other) for camera, one in relations.items()}
+        if all(
+            it is not None
+            and two_view.share(it.pair, other.between_cameras(0, camera)) >= _NAMED * relations[camera].share
+            for camera, it in seen.items()
+        ):
+            return True
+    return False
 
 
 def _zoom_of(tracks: Tracks, camera: int) -> float:
@@ -217,9 +226,10 @@ def _check_camera(tracks: Tracks, camera: int, relation: Relation, related: Call
         if seen is not None and not contradicts(tracks, related(), flip):
             tried[flip] = _row(test, flip.name, seen, now)
     for alone in images_of_one(tracks, camera):
-        seen = relation.seen_by(alone.undo(tracks, camera))
+        undone = alone.undo(tracks, camera)
+        seen = relation.seen_by(undone)
         if seen is not None:
-            tried[alone] = _row(test, alone.name.format(camera=camera), seen, now)
+            tried[alone] = _row(test, alone.name.format(camera=camera), seen, undone.between_cameras(0, camera))
     rows += tried.values()
     best = max(one.share for one in tried.values())
     if as_good and rows[0].share >= _FITS * best:

@@ -65,10 +65,12 @@ class Check:
 
 def of_all(scene: Scene) -> Diagnosis | None:
     """Return what all tracks tell, or the newest alone where these contradict the set-up; None if there are none."""
-    _fell_silent(scene)
     tracks = tracks_of(scene)
-    found = None if tracks is None else examine(tracks)
-    if found is None or found.harmful or len(scene.keyframes) <= NEWEST:
+    if tracks is None:
+        return None
+    _fell_silent(scene)
+    found = examine(tracks)
+    if found.harmful or len(scene.keyframes) <= NEWEST:
         return found
     newest = tracks_of(scene, NEWEST)
     changed = None if newest is None else examine(newest, _ONCE)

@@ -134,7 +134,7 @@ def clean_tracks(tracks: FeatureTracks, log: RejectionLog) -> FeatureTracks | No
     ids = np.asarray(tracks.track_id).astype(np.uint64)
     if _nothing_to_check(ids, uv, sigma, depth):
         return changed(tracks, track_id=ids, uv=uv, sigma_px=sigma, depth_m=depth)
-    finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & ~np.isinf(depth)
+    finite = np.isfinite(uv).all(axis=1) & np.isfinite(sigma)
     with np.errstate(invalid="ignore"):
         near = (np.abs(uv) <= MAX_PIXEL).all(axis=1)
         sane_sigma = (sigma >= SIGMA_RANGE[0]) & (sigma <= SIGMA_RANGE[1])

@@ -12,10 +12,10 @@ from ba_node.measurements import Measurement
 # Reason -> what was turned away and why. The keys are published in ba_msgs/SolverReport.
 REASONS: dict[str, str] = {
     "malformed": "A message whose arrays do not fit together.",
-    "non_finite": "An observation with u, v or sigma not finite, or a depth that is infinite.",
+    "non_finite": "An observation with u, v or sigma not finite.",
     "out_of_range": "An observation with |u| or |v| above 1e6 px.",
     "bad_sigma": "An observation whose sigma is outside [1e-6, 1e6] px.",
-    "bad_depth": "A depth outside [1e-3, 1e6] m; the pixel is used without it.",
+    "bad_depth": "A depth outside [1e-3, 1e6] m or infinite; the pixel is used without it.",
     "bad_pose": "A keyframe whose position is not finite or beyond 1e9 m, or whose quaternion is not finite or zero.",
     "bad_guess": "A guess that is not finite or beyond 1e12 m.",
     "bad_rig": "A camera rig without cameras, with a k, region or binning that no camera has, or with poses that are"

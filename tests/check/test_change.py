@@ -16,12 +16,13 @@ from ba_node.check.adjusted import placed, problem_of_all
 from ba_node.check.change import check_change
 from ba_node.check.onset import check_onset
 from ba_node.check.tracks import Tracks
-from ba_node.core import bordered
+from ba_node.core import bordered, geometry
 from ba_node.core.cameras import FX
 from ba_node.measurements import CameraRig, FeatureTracks, Keyframe
 from experiments.robustness.faults.recording import Recording
 from experiments.robustness.faults.spoil import spoiled, spoiled_by
-from tests.check.set_ups import recording, seen
+from experiments.synthetic import SyntheticData
+from tests.check.set_ups import FloatArray, poses, recording, seen
 
 SIDEWAYS: dict[str, Any] = {"look_deg": 90.0}
 LOOP: dict[str, Any] = {"path": "loop", "length_m": 30.0, "keyframes": 60, **SIDEWAYS}
@@ -166,3 +167,17 @@ def test_what_moves_over_a_few_keyframes_is_no_change() -> None:
         ),
     )
     assert not check_change(tracks_of(rest)).findings
+
+
+def test_a_jump_of_the_heading_is_no_change_of_the_images() -> None:
+    """Poses that begin on two sides of a jump end anywhere, and other intrinsics on one side fit that better."""
+
+    def turned(rotation: FloatArray, position: FloatArray, _: SyntheticData) -> tuple[FloatArray, FloatArray]:
+        turn, rotation, position = geometry.so3_exp(np.radians([0.0, 0.0, 60.0])), rotation.copy(), position.copy()
+        position[20:] = (position[20:] - position[20]) @ turn.T + position[20]
+        rotation[20:] = turn @ rotation[20:]
+        return rotation, position
+
+    drift = {"drift_rotation_deg": 0.2, "drift_translation": 0.01}
+    found = check_change(seen(poses(turned)(recording(3, "", "stereo", path="line", keyframes=40, **drift))))
+    assert not found.findings, found.summary()

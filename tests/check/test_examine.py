@@ -24,7 +24,7 @@ from experiments.robustness.faults.surround import third
 from experiments.synthetic import SyntheticOptions, generate
 from experiments.synthetic.world import Path, World
 from tests.check.named import CASES, NAMED
-from tests.check.set_ups import poses, recording, seen, tracks_in
+from tests.check.set_ups import intrinsics, poses, recording, seen, tracks_in
 from tests.window.street import round_trip
 
 
@@ -353,3 +353,12 @@ def test_outliers_are_no_mistake_of_the_set_up(kind: str, rig: str, share: float
         if not due:
             break
     assert not due
+
+
+@pytest.mark.parametrize(("factor", "mode"), [(1.5, "mono"), (0.5, "stereo")])
+def test_a_wrong_focal_length_is_no_matter_of_outliers(factor: float, mode: str) -> None:
+    """It keeps tracks from agreeing with any relation, as outliers do, and there are some of these too."""
+    sound = recording(4, "", mode, keyframes=40, path="loop", outlier_share=0.2)
+    assert not examine(seen(sound)).findings
+    found = examine(seen(intrinsics(lambda k: k * [factor, factor, 1.0, 1.0])(sound)))
+    assert f"focal length off by a factor of about {factor:.2f}" in found.causes(), found.summary()

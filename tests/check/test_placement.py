@@ -57,3 +57,20 @@ def test_a_first_camera_that_is_turned_is_named() -> None:
     told = examine(dataclasses.replace(found, cameras=turned))
     assert told.causes().startswith("camera 0 does not fit its place on the body"), told.summary()
     assert examine(found).findings == [], "and three sound ones are not accused"
+
+
+@pytest.mark.parametrize("order", [(1, 0), (0, 2, 1)])
+def test_cameras_that_are_swapped_are_so_whatever_their_intrinsics(order: tuple[int, ...]) -> None:
+    """The principal points of sound cameras differ by some pixels: images are exchanged, not places alone."""
+    sound = spoiled("sound", "stereo", seed=7)
+    found = tracks_in((sound if len(order) == 2 else third(sound)).measurements)
+    shift = np.array([[0.0, 0.0], [7.0, -5.0], [-6.0, 4.0]])[: len(order)]
+    params = found.cameras.params.copy()
+    params[:, 2:4] += shift
+    own = dataclasses.replace(found, cameras=dataclasses.replace(found.cameras, params=params))
+    own = own.seen(found.uv + shift[found.camera])
+    assert examine(own).findings == [], examine(own).summary()
+    rig, rows = own.cameras, list(order)
+    placed = dataclasses.replace(rig, rotation=rig.rotation[rows], translation=rig.translation[rows])
+    told = examine(dataclasses.replace(own, cameras=dataclasses.replace(placed, params=rig.params[rows])))
+    assert ("swapped" if len(order) == 2 else f"they sit where it says that {str(order)[1:-1]} do") in told.causes()

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ba_node.cli.main import main
@@ -86,3 +87,16 @@ def test_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.setattr(check, "can_examine", lambda: False)
     assert main(["check", str(BAGS / "mono_loop.mcap")]) == 2
     assert "python3-opencv" in capsys.readouterr().err
+
+
+def test_a_recording_of_which_no_keyframe_can_be_used_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "unfilled.mcap"
+    unfilled = (
+        (topic, time_ns, dataclasses.replace(one, orientation=np.zeros(4)) if isinstance(one, Keyframe) else one)
+        for topic, time_ns, one in recording(keyframes=4, length_m=10.0).timeline()
+    )
+    record(bag, unfilled)
+    assert main(["check", str(bag)]) == 2
+    assert "quaternion [0. 0. 0. 0.], expected finite and not zero" in capsys.readouterr().err

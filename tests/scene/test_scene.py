@@ -33,7 +33,6 @@ BAD_ROWS = [
     ("non_finite", {"sigma_px": [np.nan, np.inf, 1]}, 2),
     ("bad_sigma", {"sigma_px": [0, -1, 1]}, 2),
     ("bad_sigma", {"sigma_px": [1e-44, 1e30, 1]}, 2),
-    ("non_finite", {"depth_m": [np.inf, 1, np.nan]}, 1),
     ("duplicate_observation", {"track_id": [7, 7, 7]}, 2),
 ]
 
@@ -49,10 +48,10 @@ def test_bad_rows_are_dropped_one_by_one(reason: str, values: dict[str, list[Any
 
 
 def test_a_bad_depth_costs_the_depth_alone() -> None:
-    scene = scene_of(rig(), keyframe(4), tracks(4, ids=IDS[:4], depth_m=np.array([-1.0, 0.0, 5.0, np.nan])))
-    assert scene.log.rejected == {"bad_depth": 2}
+    scene = scene_of(rig(), keyframe(4), tracks(4, ids=IDS[:5], depth_m=np.array([-1.0, 0.0, 5.0, np.nan, np.inf])))
+    assert scene.log.rejected == {"bad_depth": 3}
     assert scene.observations.depth_m.tolist()[2] == 5.0
-    assert np.isnan(scene.observations.depth_m[[0, 1, 3]]).all()
+    assert np.isnan(scene.observations.depth_m[[0, 1, 3, 4]]).all()
 
 
 BAD_MESSAGES = [
