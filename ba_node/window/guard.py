@@ -140,9 +140,11 @@ def _misfit(selection: Selection, state: State, agreeing: _Agreeing, config: Con
     least, gate = config.guard.min_inlier_share, config.tracks.outlier_px or np.inf
     share = agreeing.share
     if share < least:
+        # One camera that turns on the spot places mismatches alone.
+        turning = "" if selection.problem.has_scale else "; or the camera hardly moves, and these are mismatches"
         return (
             f"only {100 * share:.0f} % of the observations agree with it within {gate:g} sigmas: cameras, their places"
-            " on the body, or track ids are not what they are said to be"
+            f" on the body, or track ids are not what they are said to be{turning}"
         )
     n_cam, count = len(agreeing.of), sum(agreeing.of)
     for camera in range(n_cam if 1 < n_cam <= _FEW_CAMERAS else 0):

@@ -90,6 +90,13 @@ def test_one_side_is_named(mode: str, aside_deg: tuple[float, float, float]) -> 
     assert abs(int(found[1]) - expected) < 0.25 * expected, f"{text}: expected about {expected:.0f} px"
 
 
+@pytest.mark.parametrize(("noise_m", "harmful"), [(0.0015, True), (0.012, False)])
+def test_less_to_one_side_is_held_where_odometry_is_precise(noise_m: float, harmful: bool) -> None:
+    scene = refined(recording(mode="stereo", path="line"), 1.0, noise_m=noise_m, aside_deg=(0.0, 0.0, 0.6))
+    assert (departed(scene, final=True) is not None) == harmful
+    assert departed(refined(recording(mode="stereo", path="line"), 1.0, noise_m=noise_m), final=True) is None
+
+
 @pytest.mark.parametrize(("aside_deg", "told"), [((0.0, 0.0, 2.0), True), ((0.0, 2.0, 0.0), False)])
 def test_a_camera_that_looks_aside_may_have_another_focal_length(
     aside_deg: tuple[float, float, float], told: bool

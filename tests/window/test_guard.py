@@ -4,12 +4,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
 from ba_node.config import Config, GuardConfig
 from ba_node.core import geometry
-from ba_node.window import steps, trial
+from ba_node.window import guard, steps, trial
 from ba_node.window.trust import Odd, Trust
 
 CONFIG = Config()
@@ -132,3 +135,11 @@ def test_odd_steps_wait_for_others_that_agree() -> None:
         assert trust.agreeing == agreeing
         assert (trust.confirmed(2) is not None) is (agreeing >= 2)
     assert trust.doubt == 0
+
+
+@pytest.mark.parametrize("has_scale", [True, False])
+def test_one_camera_that_turns_on_the_spot_is_not_said_to_be_wrong_alone(has_scale: bool) -> None:
+    selection: Any = SimpleNamespace(problem=SimpleNamespace(has_scale=has_scale))
+    text = guard._misfit(selection, cast("Any", None), guard._Agreeing([1], [20]), Config())
+    assert text.startswith("only 5 % of the observations agree with it")
+    assert ("the camera hardly moves, and these are mismatches" in text) != has_scale
