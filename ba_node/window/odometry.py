@@ -202,6 +202,15 @@ def as_stated(scene: Scene, config: OdometryConfig) -> bool:
     return bool((off < _FAR_WORSE * _MEDIAN_NORM).all())
 
 
+def tell_nothing(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray:
+    """Return at which keyframes of a problem (n_kf,) no step of the front-end tells a length, if it is as stated."""
+    steps = stated(scene, config, keyframes)
+    short = np.linalg.norm(steps.translation, axis=1) < _TELLING * steps.sigma_m
+    ends = np.concatenate([steps.first, steps.first + 1])
+    told, all_steps = (np.bincount(ends, weight, len(keyframes)) for weight in (np.tile(~short, 2), None))
+    return np.asarray((all_steps > 0) & (told == 0))
+
+
 def tell_scale(scene: Scene, config: OdometryConfig) -> bool:
     """Return True if nearly all of the front-end's steps tell a length, if they are as stated."""
     steps = stated(scene, config, scene.order)

@@ -268,3 +268,27 @@ def test_a_front_end_that_moves_in_a_plane_does_not_shorten_the_map_of_one_camer
     refined = played(stream).estimate().trajectory
     lengths = [float(np.linalg.norm(poses.position[-1] - poses.position[0])) for poses in (refined, data.truth)]
     assert lengths[0] / lengths[1] == pytest.approx(1.0, abs=0.006)
+
+
+def test_steps_of_a_body_that_turns_on_the_spot_tell_no_length() -> None:
+    recording = spoiled("stands_still", "mono", 5.0, 4, keyframes=12, length_m=10.0)
+    scene = Scene(ON.scene)
+    for measurement in recording.measurements:
+        scene.add(measurement)
+    still = odometry.tell_nothing(scene, ON.odometry, scene.order)
+    assert still.tolist() == 5 * [True] + 7 * [False]
+    assert not odometry.tell_nothing(scene, OFF.odometry, scene.order).any(), "nobody steps"
+
+
+@pytest.mark.parametrize("fault", ["pure_rotation", "far_points"])
+def test_tracks_whose_noise_feigns_parallax_turn_no_keyframe(fault: str) -> None:
+    """Their rotation alone is 8 degrees a keyframe; points that are far away let a camera that moves be turned."""
+    recording = spoiled(fault, "mono", {"pure_rotation": 8.0, "far_points": 1.0}[fault], 2)
+    backend = Backend(ON)
+    for _ in backend.replay(recording.measurements):
+        pass
+    before, after = (
+        absolute_error(poses, recording.truth, "none").rotation.rmse
+        for poses in (recording.odometry, backend.estimate().trajectory)
+    )
+    assert after < (1.1 if fault == "pure_rotation" else 0.5) * before, f"{before:.3f} -> {after:.3f} deg"
