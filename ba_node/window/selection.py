@@ -162,7 +162,9 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     if prior is not None:
         held = gauge.Gauge(is_old, np.full(len(is_old), -1))
     active = changed(active, fixed=held.fixed)
-    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves, tied)
+    told = np.where(usable, norms, np.nan)
+    doubt = odometry.Doubt(much_moves, odometry.noise_of(part.problem, table.refined[part.keyframes], told))
+    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, doubt, tied)
     beside = constraints.factors(scene, config, active, part.keyframes, part.origin)
     factors = constraints.in_place(steps, beside)
     factors += () if prior is None else (prior,)

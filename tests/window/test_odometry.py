@@ -20,7 +20,7 @@ from ba_node.measurements import FeatureTracks, Keyframe, Measurement
 from ba_node.scene.scene import Scene
 from ba_node.window import odometry, select
 from ba_node.window.selection import Selection
-from experiments.robustness.faults import spoiled
+from experiments.robustness.faults import SOUND, spoiled
 from experiments.robustness.faults.recording import rows_of
 from experiments.synthetic import SyntheticData, SyntheticOptions, generate
 
@@ -292,3 +292,20 @@ def test_tracks_whose_noise_feigns_parallax_turn_no_keyframe(fault: str) -> None
         for poses in (recording.odometry, backend.estimate().trajectory)
     )
     assert after < (1.1 if fault == "pure_rotation" else 0.5) * before, f"{before:.3f} -> {after:.3f} deg"
+
+
+@pytest.mark.parametrize(("seed", "look_deg"), [(703, 0.0), (703, 90.0)])
+def test_images_far_noisier_than_they_say_do_not_outvote_steps(seed: int, look_deg: float) -> None:
+    """They are six times as far off as sigma_px says."""
+    recording = spoiled(SOUND, "stereo", seed=seed, look_deg=look_deg, noise_px=3.0)
+    recording = recording.changed(
+        FeatureTracks, lambda image: dataclasses.replace(image, sigma_px=image.sigma_px / 6.0)
+    )
+    backend = Backend(ON)
+    for _ in backend.replay(recording.measurements):
+        pass
+    before, after = (
+        absolute_error(poses, recording.truth, "se3").translation.rmse
+        for poses in (recording.odometry, backend.estimate().trajectory)
+    )
+    assert after < 1.1 * before, f"{before:.4f} -> {after:.4f} m"
