@@ -64,7 +64,7 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
         return Diagnosis()
     by = "the front-end's steps"
     pairs = _depth_pairs(tracks, relations, tracks.depth_m)
-    if len(pairs) < _PAIRS:
+    if len(pairs) < _PAIRS and not (pairs and _make_no_sense(tracks, pairs)):
         return Diagnosis(untold=["too little parallax to compare depths with steps"])
     ratio = [float(np.median(np.log(given / found))) for given, found in pairs]
     factor, scatter = float(np.exp(np.median(ratio))), _deviation(ratio)
@@ -92,6 +92,13 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     if moderate and not small and inner > _ALIKE * abs(np.log(factor)):
         return Diagnosis(untold=[f"depths contradict {by}, each by another factor: much may move"], rows=rows)
     return Diagnosis([_depth_or_steps(tracks, factor, f"over {len(pairs)} pairs of keyframes")], rows=rows)
+
+
+def _make_no_sense(tracks: Tracks, pairs: list[tuple[FloatArray, FloatArray]]) -> bool:
+    """Return True if depths are of a size that none are, and all pairs of images, however few, have others by far."""
+    off = [np.log(given / found) for given, found in pairs]
+    absurd = all(abs(np.median(one)) > np.log(_GROSS) and _deviation(one) < _AGREE for one in off)
+    return absurd and _by_sense(tracks) == "depth"
 
 
 def _of_other_points(relations: list[Relation], pairs: list[tuple[FloatArray, FloatArray]]) -> str | None:

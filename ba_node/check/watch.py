@@ -79,7 +79,7 @@ def of_all(scene: Scene) -> Diagnosis | None:
 
 def of_few_keyframes(scene: Scene) -> Check | None:
     """Return the check of a session that ends with so few keyframes that it was hardly looked at; None for others."""
-    tracks = tracks_of(scene) if _AT[0] < len(scene.keyframes) < _FEW and scene.keyframes.refined.any() else None
+    tracks = tracks_of(scene) if 1 < len(scene.keyframes) < _FEW else None
     if tracks is None or not two_view.available():
         return None
     found = examine(tracks)

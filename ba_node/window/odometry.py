@@ -24,7 +24,9 @@ carrying a keyframe along. So it is in windows of one camera of which most keyfr
 turns, but no lengths, and nobody is there to tell how precise the steps are. It is widest in a young map that sees
 much: nothing but the steps tells there what moves.
 Where much of what is seen moves, refined steps may follow it and tell nothing; there the standard deviations are those
-stated, and the loss is the widest too, but where depths are measured. Rotation and translation have a loss each, so
+stated, and the loss is the widest too, but where depths are measured. So it is where all that is seen is k times as far
+off as ``sigma_px`` says (median of the residuals of refined keyframes over 1.18, 2.5 and more): what refined steps are
+off the front-end's is the images', and the loss is k times the widest. Rotation and translation have a loss each, so
 that a wrong one does not release the other.
 
 Where images tell no lengths, steps v that err aside shorten the map: its steps u, of which images tell the direction,
@@ -72,6 +74,9 @@ _HALF_SEEN = 2.0
 # where all keyframes see much.
 _WIDE = 5.0
 _WIDEST = 20.0
+# Images that are so many times as noisy as stated count less, if so many residuals say so; median of the length of two
+# standard normal numbers.
+_NOISIER, _RESIDUALS, _MEDIAN_LENGTH = 2.5, 200, 1.177
 # More keyframes are no window: where loops bend a map the steps have to give way.
 _WINDOW = 100
 # Median of the norm of three standard normal numbers.
@@ -99,6 +104,24 @@ class Steps:
         return tuple(RelativePoses(pairs, *measured, part, _LOSS, loss_scale) for part in root)
 
 
+@dataclass(frozen=True)
+class Doubt:
+    """What keeps refined steps from telling how good the front-end's are."""
+
+    much_moves: bool = False  # a large share of what is seen does
+    noise: float = 1.0  # observations are so many times as far off as stated, see :func:`noise_of`
+
+
+def noise_of(problem: Problem, refined: BoolArray, norms: FloatArray) -> float:
+    """Return how many times as noisy as stated images are by what ``refined`` keyframes (n_kf,) see; 1 if by little.
+
+    ``norms`` (n_obs,) are residuals, sigmas, NaN where there is none.
+    """
+    told = norms[refined.take(problem.observations.keyframe) & ~np.isnan(norms)]
+    times = float(np.median(told)) / _MEDIAN_LENGTH if len(told) >= _RESIDUALS else 1.0
+    return times if times > _NOISIER else 1.0
+
+
 def ties(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray:
     """Return which keyframes of a problem, oldest first, are tied to the next one, (n_kf - 1,)."""
     place = scene.places()[keyframes]
@@ -112,13 +135,13 @@ def factors(
     problem: Problem,
     keyframes: IntArray,
     turned: Turns | None = None,
-    much_moves: bool = False,
+    doubt: Doubt = Doubt(),
     tied: BoolArray | None = None,
 ) -> tuple[RelativePoses, ...]:
     """Return the factors of consecutive keyframes of which one at least is free; none if they are off.
 
     ``keyframes`` are rows of the problem's keyframes, oldest first; ``turned`` is what is known of their rotations
-    beside the front-end's; ``much_moves`` if a large share of what is seen does; ``tied`` is :func:`ties` if known.
+    beside the front-end's; ``tied`` is :func:`ties` if known.
     """
     first = (ties(scene, config, keyframes) if tied is None else tied).nonzero()[0]
     free = ~(problem.fixed[first] & problem.fixed[first + 1])
@@ -127,11 +150,11 @@ def factors(
     many = np.bincount(problem.observations.keyframe, minlength=len(keyframes)) >= MANY_OBSERVATIONS
     stated = _front_end(scene, config, keyframes, first)
     depths, windowed = len(problem.observations.depth_m) > 0, len(keyframes) <= _WINDOW
-    much_moves = much_moves and not depths
+    noisy, much_moves = doubt.noise > 1.0, doubt.much_moves and not depths
     learned_from = [(many, 1.0)]
     if problem.has_scale and not depths and windowed:
         learned_from.append((np.ones(len(many), bool), _HALF_SEEN))
-    inflated = None if much_moves else _as_learned(scene, config, keyframes, learned_from, stated)
+    inflated = None if noisy or much_moves else _as_learned(scene, config, keyframes, learned_from, stated)
     steps = stated if inflated is None else inflated
     if not problem.has_scale:
         steps = _as_long(scene, keyframes, many, steps, stated.sigma_m)
@@ -141,8 +164,8 @@ def factors(
         steps.rotation[known], steps.sigma_rad[known] = rotation[known], sigma_rad[known]
     few = not problem.has_scale and windowed and 2 * np.count_nonzero(many) < len(many)
     width = _WIDE if few or inflated is not None else 1.0
-    if inflated is None and (much_moves or many.all()):
-        width = _WIDEST
+    if inflated is None and (noisy or much_moves or many.all()):
+        width = _WIDEST * doubt.noise
     return steps.factors(free, width * config.loss_scale)
 
 
@@ -200,6 +223,15 @@ def as_stated(scene: Scene, config: OdometryConfig) -> bool:
     refined = geometry.steps_between(table.rotation, table.position, order[steps.first], order[steps.first + 1])
     off = _medians_off(refined, (steps.rotation, steps.translation), (steps.sigma_rad, steps.sigma_m))
     return bool((off < _FAR_WORSE * _MEDIAN_NORM).all())
+
+
+def tell_nothing(scene: Scene, config: OdometryConfig, keyframes: IntArray) -> BoolArray:
+    """Return at which keyframes of a problem (n_kf,) no step of the front-end tells a length, if it is as stated."""
+    steps = stated(scene, config, keyframes)
+    short = np.linalg.norm(steps.translation, axis=1) < _TELLING * steps.sigma_m
+    ends = np.concatenate([steps.first, steps.first + 1])
+    told, all_steps = (np.bincount(ends, weight, len(keyframes)) for weight in (np.tile(~short, 2), None))
+    return np.asarray((all_steps > 0) & (told == 0))
 
 
 def tell_scale(scene: Scene, config: OdometryConfig) -> bool:

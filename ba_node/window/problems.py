@@ -7,6 +7,7 @@ All observations of a problem are sorted by point, keyframe, camera. A part keep
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -96,18 +97,24 @@ def joined_observations(inlier: BoolArray, part: Observations, rest: Observation
 
 # A keyframe with fewer observations (two residuals each, six unknowns) is not refined: nothing would check them.
 MIN_OBSERVATIONS = 4
-# Of the tracks that a keyframe shares with others this share has to have a place where one camera sees them. If only
-# few have, nothing shows parallax, and they are mismatches or worse.
-_LEAST_PLACED = 0.15
+
+
+@dataclass(frozen=True)
+class Least:
+    """What keyframes of a problem have to see."""
+
+    points: IntArray  # (n_kf,) so many points that do not move
+    # (n_kf,) of the tracks that it shares with others, so large a share has to have a place where one camera sees them
+    placed: FloatArray
 
 
 def determined(
-    problem: Problem, usable: BoolArray, moves: BoolArray, max_landmarks: int, min_points: IntArray
+    problem: Problem, usable: BoolArray, moves: BoolArray, max_landmarks: int, least: Least
 ) -> tuple[IntArray, BoolArray, BoolArray]:
     """Return which observations, keyframes and points are left without all that does not determine anything.
 
     ``usable`` (n_obs,) observations may take part; points that ``moves`` (n_pt,) marks do not count, as they move;
-    points without a place are NaN. ``max_landmarks`` are kept, and a keyframe has to see ``min_points`` (n_kf,).
+    points without a place are NaN. ``max_landmarks`` are kept, and a keyframe has to see the ``least``.
 
     Returns:
         Rows of the observations, (n_kf,) and (n_pt,) True for what is kept.
@@ -123,18 +130,18 @@ def determined(
         first = _first_of_pair(obs)
         views = np.bincount(obs.point[first], minlength=n_pt)
         shared = np.bincount(obs.keyframe[first & (views > 1).take(obs.point)], minlength=n_kf)
-        known = np.bincount(obs.keyframe[first & usable & placed.take(obs.point)], minlength=n_kf)
-        mostly = known >= _LEAST_PLACED * shared
+        known = np.bincount(obs.keyframe[first & placed.take(obs.point)], minlength=n_kf)
+        mostly = known >= least.placed * shared
     if native.kernels is not None:
-        least = mostly, min_points, MIN_OBSERVATIONS
-        found: tuple[IntArray, BoolArray, BoolArray] = native.kernels.determined(obs, usable, least, (keep_pt, ~moves))
+        enough = mostly, least.points, MIN_OBSERVATIONS
+        found: tuple[IntArray, BoolArray, BoolArray] = native.kernels.determined(obs, usable, enough, (keep_pt, ~moves))
         return found
     first, static = _first_of_pair(obs), ~moves.take(obs.point)
     while True:
         used = usable & keep_pt.take(obs.point)
         counted = used & static
         keep_kf = mostly & (np.bincount(obs.keyframe[counted], minlength=n_kf) >= MIN_OBSERVATIONS)
-        keep_kf &= np.bincount(obs.keyframe[counted & first], minlength=n_kf) >= min_points
+        keep_kf &= np.bincount(obs.keyframe[counted & first], minlength=n_kf) >= least.points
         used &= keep_kf.take(obs.keyframe)
         seen_enough = np.bincount(obs.point[used], minlength=n_pt) >= 2
         if len(obs.depth_m):

@@ -26,7 +26,7 @@ from ba_node.kept import kept_property
 from ba_node.scene.scene import Scene
 from ba_node.window import arrival, constraints, gauge, moving, odometry, old_keyframes, trial, turns
 from ba_node.window.initial_points import SPREAD, initial_points, poses_gate, widened
-from ba_node.window.problems import determined, part_of, problem_of, some_observations
+from ba_node.window.problems import Least, determined, part_of, problem_of, some_observations
 
 # Views of a point are looked at, newest first, so many times as a solve may have: some keyframes are not refined.
 _SPARE = 2
@@ -39,6 +39,10 @@ _MOST_TURNS = 200
 _APART = 10**9
 # So many times as many points does a keyframe need where images have no scale of their own.
 _WITHOUT_SCALE = 2
+# Of the tracks that a keyframe shares with others so large a share has to have a place. If only few have, nothing shows
+# parallax, and they are mismatches or worse. Where the front-end's steps tell no length either, as where a body turns
+# on the spot, these are tracks whose noise feigns parallax, all to one side: then it is the second.
+_PLACED, _PLACED_OF_STILL = 0.15, 0.6
 # As many residuals of known points tell how good the poses are.
 _BULK = 100
 
@@ -137,7 +141,7 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     told = np.zeros(len(part.keyframes), bool)
     if known is not None:
         told = np.isin(scene.keyframes.keyframe_id[part.keyframes], known.keyframe_id)
-    least = _least_points(part.problem, config, told)
+    least = _least(scene, part, config, told)
     kept, keyframes, points = determined(part.problem, usable, moves, config.window.max_landmarks, least)
     part, norms, usable = part.only(kept, keyframes, points), norms.take(kept), usable.take(kept)
     moves = moves[points]
@@ -158,7 +162,9 @@ def select(scene: Scene, config: Config, end: int | None = None, without: tuple[
     if prior is not None:
         held = gauge.Gauge(is_old, np.full(len(is_old), -1))
     active = changed(active, fixed=held.fixed)
-    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, much_moves, tied)
+    told = np.where(usable, norms, np.nan)
+    doubt = odometry.Doubt(much_moves, odometry.noise_of(part.problem, table.refined[part.keyframes], told))
+    steps = odometry.factors(scene, config.odometry, active, part.keyframes, part.turned, doubt, tied)
     beside = constraints.factors(scene, config, active, part.keyframes, part.origin)
     factors = constraints.in_place(steps, beside)
     factors += () if prior is None else (prior,)
@@ -356,14 +362,17 @@ def _usable(part: _Part, norms: FloatArray, outlier_px: float) -> BoolArray:
     return usable & ~far
 
 
-def _least_points(problem: Problem, config: Config, told: BoolArray) -> IntArray:
-    """Return how many points each keyframe has to see, (n_kf,): more where images have no scale of their own.
+def _least(scene: Scene, part: _Part, config: Config, told: BoolArray) -> Least:
+    """Return what each keyframe has to see: more where images have no scale of their own.
 
-    Not more where a prior has ``told`` of a keyframe (n_kf,): window by window, what it still sees would be lost.
+    Not more points where a prior has ``told`` of one (n_kf,): window by window, what it still sees would be lost.
     """
-    least = config.guard.min_points if config.guard.enabled else 2
-    more = _WITHOUT_SCALE if config.guard.enabled and not problem.has_scale else 1
-    return np.where(told, least, more * least)
+    points = config.guard.min_points if config.guard.enabled else 2
+    more = _WITHOUT_SCALE if config.guard.enabled and not part.problem.has_scale else 1
+    still = np.zeros(len(told), bool)
+    if not part.problem.has_scale:
+        still = odometry.tell_nothing(scene, config.odometry, part.keyframes)
+    return Least(np.where(told, points, more * points), np.where(still, _PLACED_OF_STILL, _PLACED))
 
 
 def _moving(scene: Scene, part: _Part, norms: FloatArray, config: Config) -> BoolArray:

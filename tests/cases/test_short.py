@@ -11,6 +11,7 @@ import pytest
 
 from ba_node.measurements import FeatureTracks
 from experiments.robustness.faults import SOUND, spoiled
+from experiments.robustness.faults.recording import Recording
 from experiments.robustness.faults.spoil import spoiled_by
 from tests.cases.conftest import Replay, harmless
 from tests.cases.test_siblings import write
@@ -40,6 +41,42 @@ def test_a_few_keyframes_tell_what_is_plain(
     assert outcome.code == 3, outcome.words
     harmless(outcome.errors(recording.truth), 1.0, keyframes)
     outcome.tells(words)
+
+
+def first_of(recording: Recording, keyframes: int) -> Recording:
+    """Return the first keyframes of a recording."""
+    ids = {keyframe.keyframe_id for keyframe in recording.keyframes[:keyframes]}
+    entries = [entry for entry in recording.timeline if getattr(entry[2], "keyframe_id", min(ids)) in ids]
+    return dataclasses.replace(recording, timeline=tuple(entries))
+
+
+@pytest.mark.parametrize("keyframes", [2, 3])
+@pytest.mark.parametrize(
+    ("fault", "rig", "seed", "words"),
+    [
+        ("baseline_reversed", "stereo", 70, "baseline"),
+        ("baseline_reversed", "stereo", 940, "baseline"),
+        ("depth_in_mm", "rgbd", 70, "millimetres"),
+        ("depth_in_mm", "rgbd", 941, "millimetres"),
+    ],
+)
+def test_two_or_three_keyframes_tell_what_is_gross(
+    fault: str, rig: str, seed: int, words: str, keyframes: int, tmp_path: Path, run: Replay
+) -> None:
+    recording = first_of(spoiled(fault, rig, seed=seed, look_deg=90.0 * (seed > 900)), keyframes)
+    outcome = run(write(tmp_path, recording))
+    assert outcome.code == 3, outcome.words
+    harmless(outcome.errors(recording.truth), 1.0, keyframes)
+    outcome.tells(words)
+
+
+@pytest.mark.parametrize("keyframes", [2, 3])
+@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
+def test_two_or_three_sound_keyframes_are_refined(rig: str, keyframes: int, tmp_path: Path, run: Replay) -> None:
+    recording = first_of(spoiled(SOUND, rig, seed=70), keyframes)
+    outcome = run(write(tmp_path, recording))
+    assert outcome.code == 0 and not outcome.report["attention"], outcome.words
+    harmless(outcome.errors(recording.truth), 1.0, keyframes)
 
 
 @pytest.mark.slow

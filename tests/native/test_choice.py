@@ -22,7 +22,7 @@ from ba_node.scene import ingest, still_images
 from ba_node.scene.scene import Scene
 from ba_node.window import moving, odometry, steps, trial
 from ba_node.window.initial_points import agreed_points
-from ba_node.window.problems import determined, part_of, problem_of, some_observations
+from ba_node.window.problems import Least, determined, part_of, problem_of, some_observations
 from experiments.synthetic import SyntheticOptions, generate
 
 pytestmark = pytest.mark.skipif(native.kernels is None, reason="the C++ kernels are not built")
@@ -87,9 +87,10 @@ def test_what_determines_something_is_what_numpy_finds(depth_share: float, both:
     usable = rng.random(len(problem.observations)) < 0.9
     moves = rng.random(problem.n_points) < 0.1
     problem.start.points[rng.random(problem.n_points) < 0.1] = np.nan
-    least = rng.integers(5, 30, problem.n_keyframes)
+    n_kf = problem.n_keyframes
+    least = Least(rng.integers(5, 30, n_kf), np.full(n_kf, 0.15))
     compiled, plain = both(lambda: determined(problem, usable, moves, 3 * problem.n_points // 4, least))
-    assert 0 < np.count_nonzero(plain[1]) < problem.n_keyframes, "some keyframes are left"
+    assert 0 < np.count_nonzero(plain[1]) < n_kf, "some keyframes are left"
     for a, b in zip(compiled, plain, strict=True):
         np.testing.assert_array_equal(a, b)
 
