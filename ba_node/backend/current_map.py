@@ -24,7 +24,7 @@ from ba_node.core.calibration import Calibration
 from ba_node.estimate import Correction, Estimate, Extras, Poses, Refinement, SolveReport, Status, Transform, World
 from ba_node.measurements import Keyframe
 from ba_node.scene.scene import Scene
-from ba_node.window import culling, full, guard, old_keyframes, precision, quality, view
+from ba_node.window import arrival, culling, full, guard, old_keyframes, precision, quality, view
 from ba_node.window.attempt import Following, attempt
 from ba_node.window.correction import MapCorrection, Move
 from ba_node.window.trust import Trust
@@ -243,6 +243,8 @@ class CurrentMap:
             norms = window.apply(self.scene, selection, state, norms, tracks, kernels)
             rows = selection.keyframes, selection.landmarks, selection.origin
             old_keyframes.note(self.scene, self.config, selection.problem, state, rows)
+            if text := arrival.first_jumped(self.scene, self.config):
+                self.scene.log.warn("stray", text)
             if self._study is None:
                 self._study = self._precision.study(self.scene, self.config, selection, state)
                 self._asks = self._study is not None

@@ -40,6 +40,9 @@ _ASKED = 3
 _TRIED = 3
 # Only these newest keyframes are sought: what was not found then is not found later.
 _SOUGHT = 2
+# Keyframes at which it is asked whether the first one has jumped: it comes before all that could place it. Of its views
+# no more than this share agree, and of those of the one after it at least so many.
+_ASKED_AT, _HARDLY_ANY, _MOST = frozenset({6, 12, 25}), 0.1, 0.6
 
 
 def strays(
@@ -125,11 +128,31 @@ def _placed(scene: Scene, config: Config, row: int, sought: bool) -> Stray:
     return Stray(row, True, off_m, off_rad)
 
 
-def _views(scene: Scene, config: Config, row: int) -> Problem | None:
+def first_jumped(scene: Scene, config: Config) -> str:
+    """Return in words that a map agrees with all keyframes but its first; empty if not, or if it is not asked now."""
+    if len(scene.keyframes) not in _ASKED_AT or not scene.keyframes.refined[scene.order[1]]:
+        return ""
+    agree, gate = [], _WIDE * (config.tracks.outlier_px or np.inf)
+    for row in scene.order[:2].tolist():
+        problem = _views(scene, config, row, outliers=True)
+        if problem is None:
+            return ""
+        agree.append(native_kernels.residual_norms(problem, problem.start, config.solver.kernels) <= gate)
+    first, next_one = agree
+    if first.mean() > _HARDLY_ANY or next_one.mean() < _MOST:
+        return ""
+    return (
+        f"keyframe {scene.keyframes.keyframe_id[scene.order[0]]}, the first, stands apart: {np.count_nonzero(first)} of"
+        f" its {len(first)} observations agree with what those after it see. The front-end has jumped from there, or"
+        " its track ids are wrong; its pose stands as it came"
+    )
+
+
+def _views(scene: Scene, config: Config, row: int, *, outliers: bool = False) -> Problem | None:
     """Return the views of known points by a keyframe, at the points as they are; None if there are too few."""
     table, points = scene.observations, scene.landmarks
     rows = scene.rows_of(row)
-    rows = rows[points.has_position[table.landmark[rows]] & ~table.outlier[rows]]
+    rows = rows[points.has_position[table.landmark[rows]] & (outliers | ~table.outlier[rows])]
     landmarks = np.unique(table.landmark[rows]).astype(np.intp)
     if len(landmarks) < _MIN_POINTS:
         return None

@@ -4,13 +4,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from ba_node.measurements import Keyframe
 from ba_node.offline.recording import record
-from experiments.robustness.faults import FAULTS, Recording, spoiled
+from experiments.robustness.faults import FAULTS, SOUND, Recording, spoiled
 from tests.cases.conftest import Replay, harmless
 
 
@@ -61,3 +64,19 @@ def test_odometry_that_is_better_than_the_tracks_is_kept(name: str, tmp_path: Pa
     assert outcome.code in FAULTS[name].codes
     harmless(outcome.errors(recording.truth), 1.0, 60)
     outcome.tells(*FAULTS[name].named)
+
+
+@pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
+def test_a_first_keyframe_from_which_the_front_end_jumped_is_named(rig: str, tmp_path: Path, run: Replay) -> None:
+    sound = spoiled(SOUND, rig, seed=5)
+    first = sound.keyframes[0].keyframe_id
+
+    def jumped(keyframe: Keyframe) -> Keyframe:
+        if keyframe.keyframe_id != first:
+            return keyframe
+        return dataclasses.replace(keyframe, position=np.add(keyframe.position, (24.0, 32.0, 0.0)))
+
+    outcome = run(write(tmp_path, sound.changed(Keyframe, jumped)))
+    assert outcome.code == 3
+    outcome.tells(r"keyframe 0, the first, stands apart")
+    assert outcome.report["median_sigmas"]["refined"] < 1.5
