@@ -30,9 +30,9 @@ def ratio(backend: Backend, data: SyntheticData) -> float:
     return result.rotation.rmse / given.rotation.rmse
 
 
-@pytest.mark.parametrize(("factor", "seed", "reobserve"), [(0.98, 11, True), (1.02, 12, False)])
-def test_a_focal_length_that_is_a_little_off_turns_no_map(factor: float, seed: int, reobserve: bool) -> None:
-    sound = recording(seed, "", "mono", reobserve=reobserve, **PRECISE)
+@pytest.mark.parametrize(("factor", "seed"), [(0.98, 11), (1.02, 12)])
+def test_a_focal_length_that_is_a_little_off_turns_no_map(factor: float, seed: int) -> None:
+    sound = recording(seed, "", "mono", reobserve=False, **PRECISE)
     data = intrinsics(lambda k: k * [factor, factor, 1.0, 1.0])(sound)
     backend = replayed(data)
     reason = backend.setup.reason(backend.scene)
