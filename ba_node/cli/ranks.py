@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,6 +18,8 @@ T = TypeVar("T")
 _MOST_RANKS = 64
 # For ranks that are told to end; they do within a fraction of it.
 _END_S = 5.0
+# What tells mpiexec to end, and its ranks with it, where this process is killed and says nothing more.
+_WITH_US = ("setpriv", "--pdeathsig", "TERM")
 
 if TYPE_CHECKING:
     import argparse
@@ -40,6 +43,8 @@ def start_ranks(args: argparse.Namespace, codes: tuple[int, ...], hint: Callable
             " mpiexec starts them on several machines"
         )
     command, environ = launch_command(args.ranks, sys.argv[1:])
+    if shutil.which(_WITH_US[0]):
+        command = [*_WITH_US, *command]
     with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as ranks:
         assert ranks.stderr is not None
         interrupts.at_interrupt(lambda: _end(ranks))

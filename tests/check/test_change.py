@@ -169,15 +169,19 @@ def test_what_moves_over_a_few_keyframes_is_no_change() -> None:
     assert not check_change(tracks_of(rest)).findings
 
 
-def test_a_jump_of_the_heading_is_no_change_of_the_images() -> None:
+@pytest.mark.parametrize(("heading_deg", "shift_m"), [(60.0, (0.0, 0.0, 0.0)), (0.0, (-10.0, 5.0, 0.0))])
+def test_a_jump_of_the_front_end_is_no_change_of_the_images(
+    heading_deg: float, shift_m: tuple[float, float, float]
+) -> None:
     """Poses that begin on two sides of a jump end anywhere, and other intrinsics on one side fit that better."""
 
-    def turned(rotation: FloatArray, position: FloatArray, _: SyntheticData) -> tuple[FloatArray, FloatArray]:
-        turn, rotation, position = geometry.so3_exp(np.radians([0.0, 0.0, 60.0])), rotation.copy(), position.copy()
-        position[20:] = (position[20:] - position[20]) @ turn.T + position[20]
+    def jumped(rotation: FloatArray, position: FloatArray, _: SyntheticData) -> tuple[FloatArray, FloatArray]:
+        turn = geometry.so3_exp(np.radians([0.0, 0.0, heading_deg]))
+        rotation, position = rotation.copy(), position.copy()
+        position[20:] = (position[20:] - position[20]) @ turn.T + position[20] + shift_m
         rotation[20:] = turn @ rotation[20:]
         return rotation, position
 
     drift = {"drift_rotation_deg": 0.2, "drift_translation": 0.01}
-    found = check_change(seen(poses(turned)(recording(3, "", "stereo", path="line", keyframes=40, **drift))))
+    found = check_change(seen(poses(jumped)(recording(3, "", "stereo", path="line", keyframes=40, **drift))))
     assert not found.findings, found.summary()
