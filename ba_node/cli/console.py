@@ -66,6 +66,11 @@ def facts(rows: Sequence[tuple[str, str]]) -> str:
 _COLOURS = {"WORSE": 31, "MISSING": 31, "error": 31, "warning": 33, "better": 32, "ok": 32}
 
 
+def counted(number: int, thing: str) -> str:
+    """Return how many there are of a thing: "1 session", "2 sessions"."""
+    return f"{number} {thing}{'s' * (number != 1)}"
+
+
 def coloured(text: str) -> str:
     """Return a word in its colour if somebody looks at a terminal that shows it (NO_COLOR: no), else as it is."""
     code = _COLOURS.get(text)

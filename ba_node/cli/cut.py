@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ba_node.cli.console import progress_bar, require_mcap, write_result
+from ba_node.cli.console import counted, progress_bar, require_mcap, write_result
 
 EXAMPLE = "ba cut bags/stereo_loop.mcap --out middle.mcap --start 5 --end 10"
 
@@ -35,6 +35,6 @@ def run(args: argparse.Namespace) -> int:
     require_mcap(args.out)
     with progress_bar("cut", "messages") as progress:
         count, seconds = cut(args.bag, args.out, Span(args.start, args.end, args.topics), progress)
-    print(f"{args.out}: {count} messages, {seconds:.2f} s")
+    print(f"{args.out}: {counted(count, 'message')}, {seconds:.2f} s")
     write_result(args.json, {"messages": count, "duration_s": seconds})
     return 0

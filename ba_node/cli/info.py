@@ -43,15 +43,16 @@ def run(args: argparse.Namespace) -> int:
 def _print(found: RecordingFacts) -> None:
     duration = (found.end_ns - found.start_ns) * 1e-9
     count, size = (sum(values) for values in zip(*((of.count, of.bytes) for of in found.topics.values()), strict=True))
-    print(f"{found.path}: {duration:.2f} s, {count} messages, {size / 1e6:.1f} MB")
+    print(f"{found.path}: {duration:.2f} s, {console.counted(count, 'message')}, {size / 1e6:.1f} MB")
     if found.refusal:
         print(f"a replay would refuse it: {found.refusal}\n")
     else:
         used = found.inputs
+        sessions, cameras = (console.counted(used[f"{thing}s"], thing) for thing in ("session", "camera"))
         rows = [
             ("a replay uses", ", ".join(found.taken.values())),
             *(("left aside", f"{topic}: {reason}") for topic, reason in found.left.items()),
-            ("keyframes", f"{used['keyframes']} in {used['sessions']} sessions, {used['cameras']} cameras"),
+            ("keyframes", f"{used['keyframes']} in {sessions}, {cameras}"),
             ("tracks", f"{used['tracks']}, {used['tracks_seen_once']} of them seen once"),
             ("median", f"{used['images_per_track']:g} images a track, {used['tracks_per_image']:g} tracks an image"),
             *(("pauses", used["pauses"]) for _ in range(bool(used["pauses"]))),

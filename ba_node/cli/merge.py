@@ -12,7 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from ba_node.cli.console import progress_bar, require_mcap, write_result
+from ba_node.cli.console import counted, progress_bar, require_mcap, write_result
 
 EXAMPLE = "ba merge bags/stereo_loop.mcap out/refined.mcap --out both.mcap"
 ATTENTION = 3
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     require_mcap(args.out)
     with progress_bar("merge", "messages") as progress:
         count, mixed = merge(args.bags, args.out, progress)
-    print(f"{args.out}: {count} messages")
+    print(f"{args.out}: {counted(count, 'message')}")
     for topic in mixed:
         print(f"ba: warning: {topic} is in several of them: two streams are mixed in it", file=sys.stderr)
     write_result(args.json, {"messages": count, "mixed": mixed})

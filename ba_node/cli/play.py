@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from ba_node.cli import interrupts
-from ba_node.cli.console import progress_bar, write_result
+from ba_node.cli.console import counted, progress_bar, write_result
 
 EXAMPLE = (
     "ba play bags/stereo_loop.mcap --rate 2 --remap keyframes:=front/keyframes\n"
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar("play", "messages") as progress:
         summary = play(args.bag, options, Listener(progress, lambda text: print(f"ba: {text}", file=sys.stderr)))
     for topic, count in summary.published.items():
-        print(f"{topic}: {count} messages")
+        print(f"{topic}: {counted(count, 'message')}")
     write_result(args.json, dataclasses.asdict(summary))
     print(f"played in {summary.duration_s:.1f} s")
     return 0 if not summary.unconfirmed else 1

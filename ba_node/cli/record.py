@@ -12,7 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from ba_node.cli.console import TargetError, require_mcap, write_result
+from ba_node.cli.console import TargetError, counted, require_mcap, write_result
 
 EXAMPLE = "ba record --out drive.mcap --namespace /robot1 --topics /robot1/ground_truth/pose"
 
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         for number, handler in before.items():
             signal.signal(number, handler)
     for topic, count in sorted(recorder.counts.items()):
-        print(f"{topic}: {count} messages")
-    print(f"{args.out}: {sum(recorder.counts.values())} messages in {seconds:.1f} s")
+        print(f"{topic}: {counted(count, 'message')}")
+    print(f"{args.out}: {counted(sum(recorder.counts.values()), 'message')} in {seconds:.1f} s")
     write_result(args.json, {"messages": dict(recorder.counts), "duration_s": seconds})
     return 0

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ba_node.cli.console import TargetError, facts, progress_bar, require_mcap, write_result
+from ba_node.cli.console import TargetError, counted, facts, progress_bar, require_mcap, write_result
 
 if TYPE_CHECKING:
     from ba_node.config.front_end import FrontEndOptions
@@ -117,7 +117,7 @@ def tell(report: Mapping[str, Any]) -> None:
     turn = report["stereo_turn_px"]
     rows = [
         ("images", f"{report['images']}, {report['mode']}, {1e3 * report['time_per_image_s']:.1f} ms each"),
-        ("keyframes", f"{report['keyframes']} in {report['sessions']} session{'s' * (report['sessions'] != 1)}"),
+        ("keyframes", f"{report['keyframes']} in {counted(report['sessions'], 'session')}"),
         ("tracks", f"{report['tracks']} with {report['observations']} observations"),
         ("scale of", report["scale_from"]),
     ]

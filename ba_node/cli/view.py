@@ -15,7 +15,7 @@ import subprocess
 import urllib.parse
 from pathlib import Path
 
-from ba_node.cli.console import write_result
+from ba_node.cli.console import counted, write_result
 
 EXAMPLE = "ba view bags/stereo_loop.mcap out --rate 4\n  ba view out --rerun"
 
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         files = [path / REFINED if path.is_dir() else path for path in args.paths]
         return subprocess.run([program, *map(str, files)], check=False).returncode
     count = view(args.paths, ViewOptions(args.host, args.port, args.rate, args.rounds), _tell)
-    print(f"{count} messages sent")
+    print(f"{counted(count, 'message')} sent")
     write_result(args.json, {"messages": count})
     return 0
 

@@ -40,7 +40,7 @@ def test_info_counts_what_is_there(bag: Path, capsys: pytest.CaptureFixture[str]
     assert main(["info", str(bag)]) == 0
     text = capsys.readouterr().out
     assert "a replay uses  /keyframes, /feature_tracks, /camera_rig" in text
-    assert f"keyframes      {KEYFRAMES} in 1 sessions, 2 cameras" in text
+    assert f"keyframes      {KEYFRAMES} in 1 session, 2 cameras" in text
 
 
 def test_info_names_gaps_and_keyframes_without_tracks(
