@@ -198,6 +198,8 @@ class CurrentMap:
         due = self.completion.due(self.scene)
         end = self._end(due)
         taking_part = window.rows_of(self.scene, self.config, end)
+        for text in arrival.parted(self.scene, due):
+            self.scene.log.warn("parted", text)
         refined: Poses | None = None
         extra: dict[str, Any] = {}
         if wrong:

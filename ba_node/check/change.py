@@ -55,9 +55,9 @@ _DOUBTED, _ODD, _SMALL = 15.0, 2.5, 0.25
 # A step that jumps is off by more than this part of the usual step, so many keyframes around. The usual step is longer
 # than this share of all; those much shorter tell nothing. Steps around one that it is as long as.
 _JUMP, _NEAR, _LONG, _TELLING, _AROUND = 0.5, 15, 0.7, 0.3, 4
-# A step of the front-end that is so many times as large as all its others, and a turn so large (rad) or a move (m),
-# is a jump of its own: images that change leave its steps as they are.
-_TIMES, _LEAST_JUMP = 3.0, (0.1, 0.1)
+# A step of the front-end that is so many times as large as all others, and a turn so large (rad) or a move (m), is a
+# jump of its own: images that change leave its steps as they are. A change is told so many keyframes beside it.
+_TIMES, _LEAST_JUMP, _BESIDE = 3.0, (0.1, 0.1), 2
 # Residuals between these, in units of the noise, may be of objects that move, which pull together: their share counts
 # so many times.
 _MOVING, _TOGETHER = (4.0, 15.0), 20.0
@@ -161,12 +161,13 @@ def _off(state: State, tracks: Tracks, keyframes: IntArray) -> FloatArray:
 
 
 def _stands_out(tracks: Tracks, keyframes: IntArray, k: int) -> bool:
-    """Return True if the front-end's step to the k-th keyframe is far longer than its others, or turns far more."""
+    """Return True if a step of the front-end about the k-th keyframe is far longer than others, or turns far more."""
     pairs = keyframes[:-1], keyframes[1:]
     turns, moves = geometry.steps_between(tracks.rotation, tracks.position, *pairs)
     sizes = np.linalg.norm(geometry.so3_log(turns), axis=1), np.linalg.norm(moves, axis=1)
-    return k > 0 and any(
-        bool(of[k - 1] > max(_TIMES * float(np.delete(of, k - 1).max()), least))
+    near = slice(max(0, k - 1 - _BESIDE), k + _BESIDE)
+    return any(
+        bool(of[near].max() > max(_TIMES * float(np.delete(of, near).max(initial=0.0)), least))
         for of, least in zip(sizes, _LEAST_JUMP, strict=True)
     )
 

@@ -65,6 +65,7 @@ WARNINGS: dict[str, str] = {
     "check_failed": "A test of the set-up ended by a fault of its own, and tells nothing.",
     "held": "Solutions that were found and not taken; the front-end's poses stand.",
     "stray": "Keyframes whose front-end's pose contradicts their tracks; they are placed by these, or left out.",
+    "parted": "The front-end jumps to a keyframe and no track leads there: the map is in two parts.",
     "moving": "Tracks that move against the rest, as on objects that move; they are left out.",
     "depths": "Keyframes most of whose depths contradict images and steps, as in another unit; they are left out.",
     "far_from_origin": "Keyframes so far from the origin that the float32 of ~/points loses millimetres.",

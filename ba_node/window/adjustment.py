@@ -53,7 +53,7 @@ _ITERATIONS = 30
 _REFINED = 0.8
 # Warnings that say nothing of the images and poses that are in the map; and those of what is left out of solves.
 _OF_NAMES = frozenset(["bad_stamp", "equal_stamps", "clock_jump", "clock_step", "lower_session", "stray_session"])
-_ALLOWED = _OF_NAMES | {"frame_changed", "frame_name", "far_from_origin", "moving", "outvoted", "stray"}
+_ALLOWED = _OF_NAMES | {"frame_changed", "frame_name", "far_from_origin", "moving", "outvoted", "parted", "stray"}
 # Poses that explain tracks better by less than this share do so by rounding; worse by more than that, worse indeed.
 _ROUNDED, _WORSE = 1e-9, 0.005
 _NOTHING_CAME = "nothing came of a solve of everything"

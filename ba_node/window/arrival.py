@@ -40,6 +40,9 @@ _ASKED = 3
 _TRIED = 3
 # Only these newest keyframes are sought: what was not found then is not found later.
 _SOUGHT = 2
+# A front-end jumps where its step is so many times as quick as any of so many before, of which some are needed, and no
+# less than this (m, rad).
+_QUICKER, _RECENT, _SOME, _LEAST_JUMP = 3.0, 30, 5, (0.5, 1.0)
 # Keyframes at which it is asked whether the first one has jumped: it comes before all that could place it. Of its views
 # no more than this share agree, and of those of the one after it at least so many.
 _ASKED_AT, _HARDLY_ANY, _MOST = frozenset({6, 12, 25}), 0.1, 0.6
@@ -146,6 +149,35 @@ def first_jumped(scene: Scene, config: Config) -> str:
         f" its {len(first)} observations agree with what those after it see. The front-end has jumped from there, or"
         " its track ids are wrong; its pose stands as it came"
     )
+
+
+def parted(scene: Scene, rows: IntArray) -> list[str]:
+    """Return in words to which keyframes (rows, oldest first) the front-end jumps while no track leads there."""
+    table, places, found = scene.keyframes, scene.places(), []
+    for row in rows.tolist():
+        near = scene.order[max(0, places[row] - _RECENT) : places[row] + 1]
+        if len(near) < _SOME + 2:
+            continue
+        turns, moves = geometry.steps_between(table.input_rotation, table.input_position, near[:-1], near[1:])
+        sizes = np.stack([np.linalg.norm(moves, axis=1), np.linalg.norm(geometry.so3_log(turns), axis=1)])
+        rates = sizes / np.maximum(np.diff(table.stamp_ns[near]), 1)
+        times = rates[:, -1] / np.maximum(rates[:, :-1].max(axis=1), 1e-30)
+        jumps = (sizes[:, -1] > _LEAST_JUMP) & (times > _QUICKER)
+        if jumps.any() and _shared(scene, row) < _MIN_POINTS:
+            found.append(
+                f"the front-end jumps at keyframe {table.keyframe_id[row]}, by {sizes[0, -1]:.3g} m and"
+                f" {np.degrees(sizes[1, -1]):.3g} deg, {times[jumps].max():.0f} times as quick as before, and no track"
+                " leads there: the map is in two parts, and where they lie to each other is not known. A front-end that"
+                " begins anew has to raise session_id"
+            )
+    return found
+
+
+def _shared(scene: Scene, row: int) -> int:
+    """Return how many tracks of a keyframe were seen before it."""
+    table, own = scene.observations, scene.rows_of(row)
+    earlier = (scene.places() < scene.places()[row])[table.keyframe]
+    return len(np.intersect1d(table.landmark[own], table.landmark[earlier]))
 
 
 def _views(scene: Scene, config: Config, row: int, *, outliers: bool = False) -> Problem | None:

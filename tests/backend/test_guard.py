@@ -198,6 +198,24 @@ def test_a_jump_that_stays_is_followed(kind: str) -> None:
     assert after < 0.02, f"{before:.4f} -> {after:.4f} m"
 
 
+@pytest.mark.parametrize("spared", [0, 20])
+@pytest.mark.parametrize("shift", [60.0, 0.0])
+def test_a_jump_to_which_no_track_leads_is_said(shift: float, spared: int) -> None:
+    stream, truth = recording(**USUAL)
+    stream, k = jumped(stream, 20, (shift, 0.0, 0.0), 0.0, stays=True), -1
+    for i, one in enumerate(stream):
+        k += isinstance(one, Keyframe)
+        if isinstance(one, FeatureTracks) and k >= 20:
+            new = one.track_id + np.uint64(10**6)
+            new[:spared] -= np.uint64(10**6)
+            stream[i] = dataclasses.replace(one, track_id=new)
+    backend = Backend(ALONE)
+    before, after = errors(stream, truth, replay(backend, stream)[-1])
+    assert after <= 1.1 * before
+    text = backend.scene.log.warnings.get("parted", "")
+    assert ("jumps at keyframe 20, by 6" in text and "raise session_id" in text) == (shift > 0.0 and not spared), text
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_keyframes_with_wrong_ids_harm_no_other(kind: str) -> None:

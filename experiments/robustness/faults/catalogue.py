@@ -315,4 +315,12 @@ FAULTS: dict[str, Fault] = {
         named=("focal length of camera 0 off .* against those of cameras 1 and 2",),
         codes=_LOOK,
     ),
+    "restarts_midway": Fault(
+        "front-end begins anew midway, track ids higher by",
+        midway.restarts,
+        amounts=(1e6, 0.0),
+        rigs=_ALL,
+        named=("jump|off the front-end's",),
+        codes=_LOOK,
+    ),
 }

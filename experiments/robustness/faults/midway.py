@@ -127,6 +127,22 @@ def odometry_freezes(recording: Recording, amount: float, _rng: np.random.Genera
     return recording.changed(Keyframe, change)
 
 
+def restarts(recording: Recording, amount: float, rng: np.random.Generator) -> Recording:
+    """Let a front-end begin anew in the middle under the same session: at its origin, its ids higher by an amount."""
+    half = recording.keyframes[len(recording.keyframes) // 2]
+    origin = geometry.inverse(geometry.matrix_from_quaternion(half.orientation), half.position)
+
+    def change(keyframe: Keyframe) -> Keyframe:
+        pose = geometry.matrix_from_quaternion(keyframe.orientation), keyframe.position
+        rotation, position = geometry.compose(*origin, *pose)
+        return dataclasses.replace(keyframe, position=position, orientation=geometry.quaternion_from_matrix(rotation))
+
+    def anew(whole: Recording, amount: float, rng: np.random.Generator) -> Recording:
+        return ids_shifted(whole.changed(Keyframe, change), amount, rng)
+
+    return from_midway(anew)(recording, amount, rng)
+
+
 def new_ids_twice(recording: Recording, amount: float, _rng: np.random.Generator) -> Recording:
     """Send every seventh keyframe and its tracks once more under a new id, some seconds later by its stamp."""
     timeline: list[Entry] = []
