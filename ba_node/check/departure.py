@@ -71,7 +71,7 @@ _EVERY = 5
 _LEAST_M = 0.02
 # Steps of a stretch, and what its score is at least where objects carried it along: stereo drives of which 30 to 60 %
 # moves show 25 where the result is better than what came in, 32 to 200 where it is worse. One camera's scale errs so.
-_STRETCH, _CARRIED = 12, 60.0
+_STRETCH, _CARRIED, _CARRIED_WHERE_MOST_MOVES = 12, 60.0, 35.0
 # Cosines between where a camera looks and where it moves, from which on a focal length turns steps, and scales them.
 _ASIDE, _AHEAD = 0.95, 0.2
 # Part of a turn that may be out of the plane of these two, for a focal length to explain it.
@@ -106,7 +106,7 @@ def departed(scene: Scene, *, final: bool = False, doubted: bool = False) -> Che
     if final:
         finding = finding or _aside(scene, refined, given, aside)
     if final and not doubted:
-        finding = finding or _of_the_newest(scene, _FACTORS) or _carried(scene)
+        finding = finding or _of_the_newest(scene, _FACTORS) or carried(scene)
     if finding is None:
         return None
     found = Diagnosis([dataclasses.replace(finding, harmful=not doubted)])
@@ -248,9 +248,9 @@ def _focal(factor: float) -> str:
     return f"focal length off by a factor of about {factor:.2f}"
 
 
-def _carried(scene: Scene) -> Finding | None:
-    """Return where what moves has carried refined steps along, if it was said that much does."""
-    if "moving" not in scene.log.warnings or not has_scale(scene):
+def carried(scene: Scene, *, mostly: bool = False) -> Finding | None:
+    """Return where what moves has carried refined steps along, if it was said that much does, or ``mostly`` all."""
+    if not mostly and ("moving" not in scene.log.warnings or not has_scale(scene)):
         return None
     pairs = _telling(scene)
     if len(pairs[0]) < 2 * _STRETCH:
@@ -264,7 +264,7 @@ def _carried(scene: Scene) -> Finding | None:
     means = (sums[_STRETCH:] - sums[:-_STRETCH]) / _STRETCH
     scores = _STRETCH * np.sum((means / sigma) ** 2, axis=1)
     k = int(np.argmax(scores))
-    if scores[k] < _CARRIED:
+    if scores[k] < (_CARRIED_WHERE_MOST_MOVES if mostly else _CARRIED):
         return None
     first, last = (int(table.keyframe_id[row]) for row in (pairs[0][k], pairs[1][k + _STRETCH - 1]))
     aside, angle_deg = np.linalg.norm(means[k, :3]), np.degrees(np.linalg.norm(means[k, 3:]))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ba_node.backend import Backend
-from ba_node.backend.worse import explains_worse, keep_lengths
+from ba_node.backend.worse import explains_worse, keep_lengths, most_moves, torn
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.evaluation.metrics import absolute_error
@@ -35,6 +35,27 @@ def test_a_good_map_that_is_moved_aside_is_worse(rig: str) -> None:
     scene.keyframes.position[scene.order[::2], 2] += 0.3
     check = explains_worse(scene, backend.config)
     assert check is not None and check.found is not None and check.found.harmful
+
+
+@pytest.mark.parametrize("rig", ["stereo", "mono"])
+def test_a_step_that_few_tracks_bear_out_tears_the_map(rig: str) -> None:
+    """As where one camera follows a vehicle that drives ahead: 0.01 m became 1.3 m, by one step of 4 m."""
+    recording = spoiled(SOUND, rig, seed=12, keyframes=14, length_m=10.0)
+    backend = Backend(Config())
+    for _ in backend.replay(iter(recording.measurements)):
+        pass
+    scene = backend.scene
+    late = scene.places()[scene.observations.keyframe] >= 7
+    scene.keyframes.position[scene.order[7:]] += [0.0, 4.0, 0.0]
+    assert torn(scene, backend.config) is None, "nothing gave a reason to ask"
+    scene.log.warn("stray", "one was placed by its tracks")
+    assert torn(scene, backend.config) is None, "all tracks across the step agree, as where a front-end jumps"
+    early = np.unique(scene.observations.landmark[~late])
+    scene.observations.outlier[late & np.isin(scene.observations.landmark, early)] = True
+    check = torn(scene, backend.config)
+    assert check is not None and check.found is not None and check.found.harmful
+    assert f"the step to keyframe {scene.keyframes.keyframe_id[scene.order[7]]}" in check.found.causes()
+    assert most_moves(scene, backend.config) is None, "nothing moves"
 
 
 @pytest.mark.parametrize(
