@@ -53,7 +53,9 @@ _FREEDOM = 5.0
 _TELLING, _ENOUGH, _FADES = 6.0, 3, 0.8
 # How many windows tell it at least; bounds of z^2; what C is of a stated sigma, at least; larger shares are 1.
 _WINDOWS, _LOW, _HIGH, _COARSE, _LARGEST = 2, 0.4, 1.5, 0.2, 0.75
-_LEAST_STEPS = 5
+# Steps of a window, and of all of them, that tell it; and of a map that is asked as a whole: of a dozen the likelihood
+# was so flat that what came in counted ten times too much (0.006 -> 0.011 m).
+_LEAST_STEPS, _STEPS, _STEPS_OF_ALL = 5, 20, 8
 # Keyframes up to which a map is asked as a whole; there: what C is at least, observations that keyframes have at least,
 # and how many times as large the standard deviations of steps are that hold the scale of one camera.
 _YOUNG, _COARSE_OF_ALL, _SEEN, _NOTHING = 120, 0.08, 20, 30.0
@@ -73,12 +75,13 @@ class Precision:
     # (2,) likewise of the standard deviation by images, in stated ones
     coarse: FloatArray = field(default_factory=lambda: np.zeros(2))
     windows: int = 0
+    steps: int = 0  # steps of all of them
     seen: int = 0  # keyframes of the map at the last of them
     whole: bool = False  # the last of them, which alone counts, was of all of the map
 
     def shares(self) -> tuple[float, float]:
         """Return what the standard deviations of rotation and translation are to be multiplied by."""
-        if self.windows < (1 if self.whole else _WINDOWS):
+        if self.steps < (_STEPS_OF_ALL if self.whole else _STEPS) or self.windows < (1 if self.whole else _WINDOWS):
             return 1.0, 1.0
         each, coarse = np.arange(2), self.coarse / self.windows
         odds = self.likelihood.copy()
@@ -157,7 +160,7 @@ class Precision:
         likelihood, fit = (np.stack(values) for values in zip(*(_told(*part) for part in done.found), strict=True))
         self.likelihood, self.fit = _FADES * self.likelihood + likelihood, self.fit + fit
         self.coarse = self.coarse + done.coarse
-        self.windows += 1
+        self.windows, self.steps = self.windows + 1, self.steps + len(done.kept)
         before, scene.step_shares = scene.step_shares, self.shares()
         newly = any(then == 1.0 and now < 1.0 for then, now in zip(before, scene.step_shares, strict=True))
         scene.constraints.steps_precise |= newly and done.seen > config.window.max_keyframes

@@ -133,13 +133,13 @@ def test_errors_that_images_share_tell_nothing() -> None:
     sure = np.tile(10.0 * np.arange(7), (2, 1))
     for fit, coarse, taken in ((1.0, 1.0, True), (0.2, 1.0, False), (2.0, 1.0, False), (1.0, 0.05, False)):
         fits = np.array([np.full(7, 2.0), np.full(7, 2.0 * fit)])
-        known = precision.Precision(sure, fits, np.array([2.0, 2.0 * coarse]), 2)
+        known = precision.Precision(sure, fits, np.array([2.0, 2.0 * coarse]), 2, 30)
         assert (known.shares()[1] != 1.0) == taken, (fit, coarse)
 
 
 def test_the_less_images_tell_the_less_has_to_be_known() -> None:
     """Of lengths that images tell badly nothing is lost by a share that is too small."""
     little = np.tile(np.minimum(1.0, np.arange(7)), (2, 1))
-    known = precision.Precision(little, np.full((2, 7), 2.0), np.array([2.0, 6.0]), 2)
+    known = precision.Precision(little, np.full((2, 7), 2.0), np.array([2.0, 6.0]), 2, 30)
     rotation, translation = known.shares()
     assert rotation == 1.0 and translation < 0.2, (rotation, translation)
