@@ -118,6 +118,16 @@ def test_doubt_grows_and_fades() -> None:
     assert trust.bounds(CONFIG) is CONFIG
 
 
+def test_what_was_given_up_before_is_given_up_sooner() -> None:
+    """Solves that pass for a while between many that are held are no better than these."""
+    trust = Trust()
+    for given_up in (False, True):
+        trust.given_up = given_up
+        trust.doubt = 1
+        assert trust.hear("wrong", None, (), CONFIG) == "wrong"
+        assert trust.lost is given_up
+
+
 def test_always_other_keyframes_to_blame_is_doubtful() -> None:
     trust = Trust()
     assert trust.hear("", None, (4,), CONFIG) != ""
