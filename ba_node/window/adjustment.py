@@ -207,7 +207,7 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
     found = found or (loops.measured(scene, config) if known.unchecked else None)
     if known.steps_precise and not found:
         known.steps_precise = False
-        found = loops.Due("the front-end's steps are more precise than was stated", quiet=final)
+        found = loops.Due("the front-end's steps are more precise than was stated", quiet=True)
     return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final) or _grown(scene, config))
 
 

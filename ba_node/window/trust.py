@@ -14,7 +14,7 @@ from ba_node.window import steps
 
 # Doubt that a held solve adds; the most there may be; up to which one that passes is taken; from which on what was
 # taken of a young map is given up, and that is once it was given up before.
-_HELD, _MAX_DOUBT, _ENOUGH, _LOST, _LOST_AGAIN = 2, 12, 1, 6, 3
+_HELD, _MAX_DOUBT, _ENOUGH, _LOST, _LOST_AGAIN = 2, 12, 1, 6, 2
 # By how much bounds narrow while there is doubt.
 _NARROW = 0.8
 
@@ -59,6 +59,10 @@ class Trust:
     def lost(self) -> bool:
         """Return True if what was taken of a young map is to be given up."""
         return self.doubt >= (_LOST_AGAIN if self.given_up else _LOST)
+
+    def give_up(self) -> None:
+        """Take note that what was taken of the map is given up: many solves have to pass until one is taken again."""
+        self.given_up, self.doubt = True, _MAX_DOUBT
 
     def bounds(self, config: Config) -> Config:
         """Return parameters with narrower bounds as long as there is doubt: who was just out does not slip back in."""
