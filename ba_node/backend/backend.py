@@ -200,8 +200,7 @@ class Backend:
     def adjust(self, *, final: bool = False) -> Estimate | None:
         """Bend the map and refine all of it, if a loop or what is absolute asks for it, see ``window/adjustment.py``.
 
-        ``final``: nothing more will come. Returns what is known then, None if nothing changed, or not yet, as it is
-        being worked on elsewhere.
+        ``final``: nothing more will come. Returns what is known then, None if nothing changed, or not yet.
         """
         if self._adjusting is not None and self._adjusting.scene is self.scene:
             return None
@@ -231,7 +230,7 @@ class Backend:
         self._adjusting = None
         why, merged = done.why, None
         if not why and done.taken is not None:
-            merged = self.merge(done.taken, done.put, grown=done.due.grown)
+            merged = self.merge(done.taken, done.put, grown=done.due.grown or done.due.quiet)
             why = self.refusal or ("" if merged else "nothing came of a solve of everything")
         elif not why:
             done.put()
@@ -274,11 +273,13 @@ class Backend:
 
     def _ended(self) -> Estimate | None:
         """Ask what is wrong with a map to which no more comes; return what is known now if that changes it."""
-        undone = self.take_check(wrong_at_the_end(self.scene, self.config))
-        if undone is None and keep_lengths(self.scene, self.config):
+        if (undone := self.take_check(wrong_at_the_end(self.scene, self.config))) is not None:
+            return undone
+        followed = self.adjust(final=True) if self.map.precision.ask_all(self.scene, self.config) else None
+        if keep_lengths(self.scene, self.config):
             self.map.correct(int(self.scene.order[-1]))
             return self.estimate()
-        return undone
+        return followed
 
     def take_check(self, check: Check | None) -> Estimate | None:
         """Take in a check of the set-up that was run elsewhere; return what is known now if it undoes all solves."""
@@ -317,9 +318,8 @@ class Backend:
     ) -> tuple[Estimate, int] | None:
         """Put the result of a solve of everything into the map, see ``window/full.py``.
 
-        ``first`` is done to the map before, once it is known that the result is taken. ``grown``: the map has grown, no
-        more: nothing is said if it is not taken, and what shows at a map's end is not asked. Returns what is known now,
-        and how many later keyframes followed; None if the result is of no use or of another map.
+        ``first`` is done to the map before, once the result is taken. ``grown``: nothing is said if it is not, and what
+        shows at a map's end is not asked. Returns what is known now, and how many later keyframes followed, or None.
         """
         taken, result, self.refusal = optimization, optimization.result, ""
         if not result.status.usable or not result.state.is_finite():

@@ -91,6 +91,7 @@ class CurrentMap:
         correction: map from odom.
         calibration: what solves of everything found of the cameras, against those that came; None if not asked for.
         adjustments: how often a solve of everything went into it.
+        precision: what is known of the front-end's steps.
     """
 
     def __init__(self, config: Config, scene: Scene, index: int) -> None:
@@ -101,7 +102,7 @@ class CurrentMap:
         self.calibration: Calibration | None = None
         self.adjustments = 0
         self._trust = Trust()
-        self._precision = precision.Precision()
+        self.precision = precision.Precision()
         # What is being asked of the front-end's steps, and whether the last solve has asked it.
         self._study: precision.Study | None = None
         self._asks = False
@@ -248,7 +249,7 @@ class CurrentMap:
             if text := arrival.first_jumped(self.scene, self.config):
                 self.scene.log.warn("stray", text)
             if self._study is None:
-                self._study = self._precision.study(self.scene, self.config, selection, state)
+                self._study = self.precision.study(self.scene, self.config, selection, state)
                 self._asks = self._study is not None
             extra = view.work_out(wanted, self.scene, self.config, selection, state, taking_part)
         statistics = quality.statistics(selection, tried.result, norms) | tried.health | agree
@@ -266,12 +267,13 @@ class CurrentMap:
         """Take in what was asked of the front-end's steps, if it was of this map."""
         if study is self._study:
             self._study = None
-            self._precision.learn(study, self.config)
+            self.precision.learn(study, self.config)
 
     def hold(self, reason: str) -> None:
         """Say that a solution is held; give up what was taken of a young map if many are."""
         text = f"a solution was held, the front-end's poses stand: {reason}"
         if self._trust.lost and self._young():
+            self._trust.give_up()
             self.scene.forget_solutions()
             self.correction = MapCorrection()
             self.correct(int(self.scene.order[-1]))

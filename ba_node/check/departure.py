@@ -79,6 +79,9 @@ _IN_PLANE = 0.5
 _K = "k of camera_info in camera_rig"
 # Steps that are more standard deviations off the others are drawn in to so many.
 _USUAL = 3.0
+# Neighbours err alike where they correlate by more than so many standard errors; the largest correlation that counts,
+# and the share of the variance that their own mean leaves at least.
+_ALIKE, _MOST_ALIKE, _LEFT = 2.0, 0.95, 0.1
 # Share of a way by which its ends are apart where it does not come back.
 _STRAIGHT = 0.7
 # Share of the usual step below which one tells nothing; share that is left out at either end of their ratios.
@@ -314,10 +317,29 @@ def _telling(scene: Scene, newest: int = 0) -> IntArray:
 
 
 def trimmed_mean(values: FloatArray) -> tuple[float, float]:
-    """Return the mean without the extremes and its standard error, by the spread of the values drawn in to these."""
-    values = np.sort(values)
-    cut = int(_TRIMMED * len(values))
-    kept = values[cut : len(values) - cut]
+    """Return the mean without the extremes and its standard error, by the spread of the values drawn in to these.
+
+    Values are in the order of time: where neighbours err alike, as where odometry's errors wander, few are independent.
+    """
+    low = int(_TRIMMED * len(values))
+    in_order = np.sort(values)
+    kept = in_order[low : len(values) - low]
     drawn_in = np.clip(values, kept[0], kept[-1])
     error = float(np.std(drawn_in, ddof=1)) / ((1.0 - 2.0 * _TRIMMED) * float(np.sqrt(len(values))))
-    return float(np.mean(kept)), error
+    return float(np.mean(kept)), error * _wanders(drawn_in)
+
+
+def _wanders(values: FloatArray) -> float:
+    """Return how many times as large the standard error of a mean is as if n values were independent.
+
+    With the correlation r of neighbours, ``g = (1 + r) / (1 - r)`` of them tell as much as one (autoregression of first
+    order), and their spread about their own mean is that of 1 - g / n of the variance. The r that is found is raised by
+    ``(1 + 3 r) / n``, as much as it is too low (Kendall, *Note on bias in the estimation of autocorrelation*, 1954).
+    """
+    off, n = values - np.mean(values), len(values)
+    r = float(off[1:] @ off[:-1]) / max(float(off @ off), 1e-300)
+    if r <= _ALIKE / np.sqrt(n):
+        return 1.0
+    r = min(r + (1.0 + 3.0 * r) / n, _MOST_ALIKE)
+    g = (1.0 + r) / (1.0 - r)
+    return float(np.sqrt(g / max(1.0 - g / n, _LEFT)))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ba_node.arrays import FloatArray
 from ba_node.check import (
     change,
     exposure,
@@ -63,7 +64,7 @@ def examine(tracks: Tracks, told: frozenset[str] = frozenset(), more: Tracks | N
         "ids": lambda: ids.check_ids(tracks),
         "onset": lambda: onset.check_onset(tracks),
         "silent": lambda: placement.check_silent(tracks),
-        "cameras": lambda: placement.check_cameras(tracks, related),
+        "cameras": lambda: _cameras(tracks, related),
         "poses": lambda: _poses(tracks, related()),
         "depth": lambda: lengths.check_depth(tracks, related()),
         "intrinsics": lambda: intrinsics.check_intrinsics(tracks, related()),
@@ -105,6 +106,37 @@ def run(test: Callable[[], Diagnosis], name: str) -> Diagnosis:
     except Exception as error:
         text = f"{name}: internal error, {type(error).__name__}: {error}"
         return Diagnosis(untold=[text], failed=[text])
+
+
+def _cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diagnosis:
+    """Compare the cameras with each other, and where they misfit with what they would be in images of another size.
+
+    A region of interest of all cameras alike shows as cameras that are off their places, where their lenses bend rays
+    or they look elsewhere: with it undone all of them fit, and the poses too.
+    """
+    outcome = placement.check_cameras(tracks, related)
+    if not outcome.harmful or outcome.usual:
+        return outcome
+    pairs, sizes = related(), intrinsics.other_sizes(tracks)
+    models = [intrinsics.freed_from(tracks, pairs, params) for params in (tracks.cameras.params, *map(_params, sizes))]
+    for model in (*(one for one in models if one is not None), *sizes):
+        other = model.of(tracks)
+        moved = relations.in_motion(other)
+        again = placement.check_cameras(other, functools.partial(list, moved))
+        if again.sound and not again.harmful and motion.check_motion(other, moved).sound:
+            outcome.findings = [Finding((model.cause,), f"with that {' and '.join(again.sound)}", (model.change,))]
+            return outcome
+    # Few keyframes do not confirm it; but tracks that lie far off the centre are seldom a camera's.
+    causes, changes = tuple(one.cause for one in sizes), tuple(one.change for one in sizes)
+    outcome.findings = [
+        dataclasses.replace(one, causes=(*causes, *one.causes), changes=(*changes, *one.changes))
+        for one in outcome.findings
+    ]
+    return outcome
+
+
+def _params(model: intrinsics.Model) -> FloatArray:
+    return model.params
 
 
 def _poses(tracks: Tracks, pairs: list[Relation]) -> Diagnosis:

@@ -94,9 +94,13 @@ class _Both:
             best_s, reach_s = float(tried[int(np.argmin(losses))]), 2.0 * reach_s / (len(tried) - 1)
             tried = np.linspace(best_s - reach_s, best_s + reach_s, _CLOSER)
         given, delayed = (self._residuals(by_s) for by_s in (0.0, best_s))
-        noise = max(float(robust_spread(delayed)), 1e-9)
+        elsewhere = self._elsewhere()
+        # Whichever explains them, among outliers, tells how noisy they are.
+        noise = max(min(float(robust_spread(delayed)), float(robust_spread(elsewhere))), 1e-9)
+        if noise > self._gate:
+            return None  # of mostly outliers, which lie nearer to some lines than to others
         loss = _loss(given, noise)
-        gain, otherwise = loss - _loss(delayed, noise), loss - _loss(self._elsewhere(), noise)
+        gain, otherwise = loss - _loss(delayed, noise), loss - _loss(elsewhere, noise)
         if abs(best_s) < _LEAST_S or gain < max(_SURE, _AS_GOOD * otherwise):
             return None
         meet, undone = (float(np.mean(np.abs(one) < 3.0 * noise)) for one in (given, delayed))

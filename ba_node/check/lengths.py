@@ -65,7 +65,8 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     by = "the front-end's steps"
     pairs = _depth_pairs(tracks, relations, tracks.depth_m)
     if len(pairs) < _PAIRS and not (pairs and _make_no_sense(tracks, pairs)):
-        return Diagnosis(untold=["too little parallax to compare depths with steps"])
+        few = _of_few_points(tracks, relations)
+        return few or Diagnosis(untold=["too little parallax to compare depths with steps"])
     ratio = [float(np.median(np.log(given / found))) for given, found in pairs]
     factor, scatter = float(np.exp(np.median(ratio))), _deviation(ratio)
     rows = [Row("depth", f"measured over triangulated: {factor:.4g}", 1.0)]
@@ -92,6 +93,19 @@ def check_depth(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     if moderate and not small and inner > _ALIKE * abs(np.log(factor)):
         return Diagnosis(untold=[f"depths contradict {by}, each by another factor: much may move"], rows=rows)
     return Diagnosis([_depth_or_steps(tracks, factor, f"over {len(pairs)} pairs of keyframes")], rows=rows)
+
+
+def _of_few_points(tracks: Tracks, relations: list[Relation]) -> Diagnosis | None:
+    """Return what is wrong where few points have a depth, as most are out of reach, and all are off by far alike."""
+    pairs = _depth_pairs(tracks, relations, tracks.depth_m, least=1)
+    if len(pairs) < _PAIRS:
+        return None
+    off = np.concatenate([np.log(given / found) for given, found in pairs])
+    factor = float(np.exp(np.median(off)))
+    if len(off) < _POINTS or 1.0 / _GROSS < factor < _GROSS or _deviation(off) > _AGREE:
+        return None
+    rows = [Row("depth", f"measured over triangulated: {factor:.4g}", 1.0)]
+    return Diagnosis([_depth_or_steps(tracks, factor, f"over {len(off)} points")], rows=rows)
 
 
 def _make_no_sense(tracks: Tracks, pairs: list[tuple[FloatArray, FloatArray]]) -> bool:
@@ -327,9 +341,13 @@ def _scale_of_steps(factor: float) -> str:
 
 
 def _depth_pairs(
-    tracks: Tracks, relations: list[Relation], depth: FloatArray, most: FloatArray | None = None
+    tracks: Tracks,
+    relations: list[Relation],
+    depth: FloatArray,
+    most: FloatArray | None = None,
+    least: int = _POINTS,
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return given depths and those of the front-end's steps, m, for each pair of images with enough of them.
+    """Return given depths and those of the front-end's steps, m, for each pair of images with ``least`` of them.
 
     ``most`` (n_obs,) is how far a point may be by the steps, m.
     """
@@ -343,7 +361,7 @@ def _depth_pairs(
         good &= (depth[one.rows_b] > 0.0) & (in_b > 0.0)
         if most is not None:
             good &= in_b < most[one.rows_b]
-        if np.count_nonzero(good) >= _POINTS:
+        if np.count_nonzero(good) >= least:
             found.append((depth[one.rows_b][good], in_b[good]))
     return found
 

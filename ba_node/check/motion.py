@@ -109,7 +109,9 @@ def _by_known(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
         if turned is not None and np.median(compare(tracks, usable, _turn(tracks, usable)).off) < best:
             return turned
     evidence = f"as given the front-end's steps are {np.median(now.off):.0f} degrees off, {best:.0f} with that undone"
-    return Diagnosis([finding(named, evidence)], rows=rows)
+    # What leaves steps that point anywhere is a guess: images of another size may be behind it.
+    found = finding(named, evidence)
+    return Diagnosis([dataclasses.replace(found, usual=found.usual and best < _ABSURD_DEG)], rows=rows)
 
 
 def _flips(tracks: Tracks) -> list[Flip]:

@@ -57,7 +57,7 @@ _NEXT = 3
 # Two cameras that see so much of the same have tracks in common.
 _SEE_THE_SAME = 0.5
 # Outliers keep it from being measured unless the given relation explains less than this share of what the best does.
-_CLEAR = 0.5
+_CLEAR = 0.85
 
 
 def check_cameras(tracks: Tracks, related: Callable[[], list[Relation]]) -> Diagnosis:

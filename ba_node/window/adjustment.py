@@ -148,7 +148,7 @@ class Adjustment:
     def end(self, why: str) -> None:
         """Take note that it is over, and why the map stays as it was, in words; empty if it does not."""
         known = self.scene.constraints
-        if self.due.grown:
+        if self.due.grown or (self.due.quiet and why):
             if why:
                 self.scene.log.notice("not_refined")
             return
@@ -207,7 +207,7 @@ def due(scene: Scene, config: Config, *, final: bool = False) -> loops.Due | Non
     found = found or (loops.measured(scene, config) if known.unchecked else None)
     if known.steps_precise and not found:
         known.steps_precise = False
-        found = loops.Due("the front-end's steps are more precise than was stated")
+        found = loops.Due("the front-end's steps are more precise than was stated", quiet=True)
     return found or (loops.Due(jumped) if jumped else _left_the_world(scene, config, final) or _grown(scene, config))
 
 

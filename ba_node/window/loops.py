@@ -36,6 +36,7 @@ class Due:
     joined: tuple[tuple[int, int], ...] = ()  # tracks that go on under the id of another
     key: tuple[int, int] | None = None  # keyframes of the relative pose that the map does not meet
     grown: bool = False  # nothing but that the map has grown
+    quiet: bool = False  # nothing is said if nothing comes of it
 
 
 def measured(scene: Scene, config: Config) -> Due | None:

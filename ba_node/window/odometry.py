@@ -257,7 +257,7 @@ def _as_learned(
     steps_of = (((sure[steps.first] & sure[steps.first + 1]).nonzero()[0], factor) for sure, factor in told)
     rows, factor = next((one for one in steps_of if len(one[0]) >= _LEAST_STEPS), (steps.first[:0], 0.0))
     if not len(rows):
-        return None
+        return None if shares == (1.0, 1.0) else steps
     first, last = keyframes[steps.first[rows]], keyframes[steps.first[rows] + 1]
     refined = geometry.steps_between(table.rotation, table.position, first, last)
     stated = steps.rotation[rows], steps.translation[rows]

@@ -24,6 +24,9 @@ have no weight that could do harm, and none is to be had by mistake. Where the f
 is not asked any more; larger shares are odometry.py's.
 
 Only where images have a scale of their own (several cameras, or depths), or two older keyframes hold one.
+
+A young map that ends, and whose windows did not tell, is asked as a whole: there all steps tell at once, also of a map
+of no more than two windows. One camera has its scale there of steps that count next to nothing.
 """
 
 from __future__ import annotations
@@ -34,13 +37,13 @@ from typing import Any
 
 import numpy as np
 
-from ba_node.arrays import FloatArray, IntArray
+from ba_node.arrays import FloatArray, IntArray, changed
 from ba_node.config import Config, SolverOptions
 from ba_node.core import covariance, methods, solver
 from ba_node.core.factors import RelativePoses
 from ba_node.core.problem import Problem, State
 from ba_node.scene.scene import Scene
-from ba_node.window import odometry
+from ba_node.window import full, odometry
 from ba_node.window.selection import Selection
 
 _SHARES = 0.5 ** np.arange(7)
@@ -50,7 +53,14 @@ _FREEDOM = 5.0
 _TELLING, _ENOUGH, _FADES = 6.0, 3, 0.8
 # How many windows tell it at least; bounds of z^2; what C is of a stated sigma, at least; larger shares are 1.
 _WINDOWS, _LOW, _HIGH, _COARSE, _LARGEST = 2, 0.4, 1.5, 0.2, 0.75
-_LEAST_STEPS = 5
+# Steps of a window, and of all of them, that tell it; and of a map that is asked as a whole: of a dozen the likelihood
+# was so flat that what came in counted ten times too much (0.006 -> 0.011 m).
+_LEAST_STEPS, _STEPS, _STEPS_OF_ALL = 5, 20, 8
+# Keyframes up to which a map is asked as a whole; there: what C is at least, observations that keyframes have at least,
+# and how many times as large the standard deviations of steps are that hold the scale of one camera.
+_YOUNG, _COARSE_OF_ALL, _SEEN, _NOTHING = 120, 0.08, 20, 30.0
+# Errors along an axis that are larger, in standard deviations, count as so many.
+_BOUND = 3.0
 _TO_THE_END: dict[str, Any] = {"function_tolerance": 1e-12, "max_iterations": 60}
 
 
@@ -65,22 +75,28 @@ class Precision:
     # (2,) likewise of the standard deviation by images, in stated ones
     coarse: FloatArray = field(default_factory=lambda: np.zeros(2))
     windows: int = 0
+    steps: int = 0  # steps of all of them
     seen: int = 0  # keyframes of the map at the last of them
+    whole: bool = False  # the last of them, which alone counts, was of all of the map
 
     def shares(self) -> tuple[float, float]:
         """Return what the standard deviations of rotation and translation are to be multiplied by."""
-        if self.windows < _WINDOWS:
+        if self.steps < (_STEPS_OF_ALL if self.whole else _STEPS) or self.windows < (1 if self.whole else _WINDOWS):
             return 1.0, 1.0
         each, coarse = np.arange(2), self.coarse / self.windows
         odds = self.likelihood.copy()
         odds[:, 0] += _TELLING / np.maximum(coarse, 1.0) ** 2
+        if self.whole:
+            # What is more than a share says may be the images': a larger share says it too.
+            odds[:, 1:][self.fit[:, 1:] > _HIGH * self.windows] = -np.inf
         fit = self.fit[each, np.argmax(odds, axis=1)] / self.windows
         odds = np.exp(odds - odds.max(axis=1, keepdims=True))
         odds /= odds.sum(axis=1, keepdims=True)
         logs = np.log(_SHARES)
         mean = odds @ logs
         spread = np.sqrt(np.maximum(odds @ logs**2 - mean**2, 0.0))
-        precise = (np.exp(mean) < _LARGEST) & (fit.min() > _LOW) & (fit < _HIGH) & (coarse > _COARSE)
+        precise = (np.exp(mean) < _LARGEST) & (fit.min() > _LOW) & (fit < _HIGH)
+        precise &= coarse > (_COARSE_OF_ALL if self.whole else _COARSE)
         rotation, translation = np.where(precise, np.exp(mean - spread), 1.0).tolist()
         return rotation, translation
 
@@ -101,16 +117,50 @@ class Precision:
         problem = Problem(state, whole.fixed, whole.cameras, whole.observations, selection.beside)
         return Study(scene, n, problem, methods.from_config(config.solver), steps, kept)
 
+    def ask_all(self, scene: Scene, config: Config) -> bool:
+        """Ask a young map that ends, at once; return True if it is to follow steps, more precise than stated."""
+        study = self._study_all(scene, config) if scene.step_shares == (1.0, 1.0) else None
+        if study is not None:
+            study.run()
+            self.learn(study, config)
+        scene.constraints.steps_precise = scene.step_shares != (1.0, 1.0)
+        return scene.constraints.steps_precise
+
+    def _study_all(self, scene: Scene, config: Config) -> Study | None:
+        """Return what is to be asked of a whole map that ends; None if nothing is."""
+        known, n = scene.constraints, len(scene.keyframes)
+        placed = known.absolute or known.landmarks or known.relative
+        if placed or n > _YOUNG or not config.odometry.enabled or not scene.keyframes.refined.any():
+            return None
+        begun = full.take_snapshot(scene, config)
+        if isinstance(begun, str) or begun.selection.much_moves:
+            return None
+        selection, whole = begun.selection, begun.selection.problem
+        steps = odometry.stated(scene, config.odometry, selection.keyframes)
+        sure = np.bincount(whole.observations.keyframe, minlength=whole.n_keyframes) >= _SEEN
+        kept = np.flatnonzero(sure[steps.first] & sure[steps.first + 1])
+        if len(kept) < _LEAST_STEPS:
+            return None
+        beside = selection.beside
+        if not whole.has_scale:
+            loose = changed(steps, sigma_rad=_NOTHING * steps.sigma_rad, sigma_m=_NOTHING * steps.sigma_m)
+            beside = (*beside, *loose.factors(np.ones(len(steps.first), bool), _NOTHING))
+        problem = Problem(whole.start, whole.fixed, whole.cameras, whole.observations, beside)
+        return Study(scene, n, problem, methods.from_config(config.solver), steps, kept, whole=True)
+
     def learn(self, done: Study, config: Config) -> None:
-        """Take in what a window has told; the steps of its scene count accordingly from now on."""
+        """Take in what a window, or a map, has told; the steps of its scene count accordingly from now on."""
         self.seen = done.seen
         if done.found is None:
             return
         scene = done.scene
+        if done.whole:
+            vars(self).update(vars(Precision(seen=done.seen)))
+        self.whole = done.whole
         likelihood, fit = (np.stack(values) for values in zip(*(_told(*part) for part in done.found), strict=True))
         self.likelihood, self.fit = _FADES * self.likelihood + likelihood, self.fit + fit
-        self.coarse = self.coarse + [float(np.median(_spread(part[1]) / part[2])) for part in done.found]
-        self.windows += 1
+        self.coarse = self.coarse + done.coarse
+        self.windows, self.steps = self.windows + 1, self.steps + len(done.kept)
         before, scene.step_shares = scene.step_shares, self.shares()
         newly = any(then == 1.0 and now < 1.0 for then, now in zip(before, scene.step_shares, strict=True))
         scene.constraints.steps_precise |= newly and done.seen > config.window.max_keyframes
@@ -126,9 +176,11 @@ class Study:
     options: SolverOptions
     steps: odometry.Steps  # as stated
     kept: IntArray  # those between keyframes that see much
+    whole: bool = False  # of all of the map, to which no more comes
     # errors (n, 3), their covariance by images (n, 3, n, 3), stated sigmas (n,), of rotation and translation; None
     # before :meth:`run`, and where images do not tell
     found: list[tuple[FloatArray, FloatArray, FloatArray]] | None = None
+    coarse: list[float] = field(default_factory=list)  # standard deviation by images, in stated ones, of both
 
     def run(self) -> None:
         """Solve, and compare."""
@@ -151,9 +203,15 @@ class Study:
             by_free[at, :, column[pairs[:, end]]] = by_pose[:, end]
         J = by_free.reshape(6 * len(kept), -1)
         covariances = (J @ uncertainty.of(np.arange(6 * len(free))) @ J.T).reshape(2 * (len(kept), 6))
-        if np.isfinite(covariances).all():
-            parts = ((slice(0, 3), steps.sigma_rad), (slice(3, 6), steps.sigma_m))
-            self.found = [(error[:, of], covariances[:, of, :, of], sigma[kept]) for of, sigma in parts]
+        if not np.isfinite(covariances).all():
+            return
+        parts = ((slice(0, 3), steps.sigma_rad), (slice(3, 6), steps.sigma_m))
+        self.found = [(error[:, of], covariances[:, of, :, of], sigma[kept]) for of, sigma in parts]
+        self.coarse = [float(np.median(_spread(part[1]) / part[2])) for part in self.found]
+        if self.whole and not problem.has_scale:
+            # No image tells it.
+            moves = steps.translation[kept]
+            self.found[1][1][:] += np.multiply.outer(moves, moves)
 
 
 def _own(covariances: FloatArray) -> FloatArray:
@@ -175,4 +233,6 @@ def _told(error: FloatArray, covariances: FloatArray, sigma: FloatArray) -> tupl
     along = axes.T @ (error.ravel() / scale)
     total = np.maximum(variance, 0.0) + _SHARES[:, None] ** 2
     odd = (_FREEDOM + 1.0) * np.log1p(along**2 / (_FREEDOM * total))
-    return -0.5 * np.sum(np.log(total) + odd, axis=1), np.mean(along**2 / total, axis=1)
+    # One axis whose variance by images came out as next to nothing is not to decide alone.
+    fit = np.mean(np.minimum(along**2 / total, _BOUND**2), axis=1)
+    return -0.5 * np.sum(np.log(total) + odd, axis=1), fit

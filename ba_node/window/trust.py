@@ -13,8 +13,8 @@ from ba_node.config import Config
 from ba_node.window import steps
 
 # Doubt that a held solve adds; the most there may be; up to which one that passes is taken; from which on what was
-# taken of a young map is given up.
-_HELD, _MAX_DOUBT, _ENOUGH, _LOST = 2, 12, 1, 6
+# taken of a young map is given up, and that is once it was given up before.
+_HELD, _MAX_DOUBT, _ENOUGH, _LOST, _LOST_AGAIN = 2, 12, 1, 6, 2
 # By how much bounds narrow while there is doubt.
 _NARROW = 0.8
 
@@ -53,11 +53,16 @@ class Trust:
         self.agreeing = 0  # solves in a row that found them
         self.blamed: set[int] = set()  # rows of keyframes that the last solve was made without
         self.cause = ""  # why the last one was held, or made without them
+        self.given_up = False  # what was taken of the map was given up before
 
     @property
     def lost(self) -> bool:
         """Return True if what was taken of a young map is to be given up."""
-        return self.doubt >= _LOST
+        return self.doubt >= (_LOST_AGAIN if self.given_up else _LOST)
+
+    def give_up(self) -> None:
+        """Take note that what was taken of the map is given up: many solves have to pass until one is taken again."""
+        self.given_up, self.doubt = True, _MAX_DOUBT
 
     def bounds(self, config: Config) -> Config:
         """Return parameters with narrower bounds as long as there is doubt: who was just out does not slip back in."""

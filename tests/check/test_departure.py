@@ -205,6 +205,20 @@ def test_noise_is_no_side(mode: str) -> None:
             )
 
 
+@pytest.mark.parametrize("mode", ["mono", "stereo"])
+def test_odometry_whose_errors_wander_is_no_fault(mode: str) -> None:
+    """Steps err alike for some time, as by a bias that changes: few of them are independent."""
+    data, said = recording(mode=mode, path="line"), 0
+    for seed in range(20):
+        scene, rng = refined(data, 1.0, noise_m=0.001), np.random.default_rng(seed)
+        off = 0.02 * rng.normal(size=(30, 3))
+        for k in range(1, 30):
+            off[k] = 0.9 * off[k - 1] + np.sqrt(1.0 - 0.9**2) * off[k]
+        scene.keyframes.position[scene.order] += np.cumsum(off, axis=0)
+        said += departed(scene, final=True) is not None
+    assert said <= 6, f"{said} of 20 are taken for a fault"
+
+
 def test_where_it_cannot_be_asked() -> None:
     assert departed(refined(recording(mode="mono", path="line"), 1.1)) is None, "one camera has no scale"
     data = recording(path="line")

@@ -17,14 +17,14 @@ from ba_node.check.examine import examine
 from ba_node.check.ids import check_ids
 from ba_node.check.tracks import Tracks, tracks_of
 from ba_node.config import Config
-from ba_node.measurements import CameraRig
+from ba_node.measurements import CameraRig, FeatureTracks
 from ba_node.scene.scene import Scene
 from experiments.robustness.faults import spoiled
 from experiments.robustness.faults.surround import third
 from experiments.synthetic import SyntheticOptions, generate
 from experiments.synthetic.world import Path, World
 from tests.check.named import CASES, NAMED
-from tests.check.set_ups import intrinsics, poses, recording, seen, tracks_in
+from tests.check.set_ups import images, intrinsics, poses, recording, seen, tracks_in
 from tests.window.street import round_trip
 
 
@@ -48,6 +48,30 @@ def test_two_cameras_tell_whether_depths_or_poses_are_off(wrong: str, named: str
     found = examine(seen(recording(wrong=wrong, depth_share=0.8, look_deg=90.0)))
     assert found.causes().startswith(named), found.summary()
     assert ("poses" in found.causes()) == (named[:5] == "poses"), found.summary()
+
+
+@pytest.mark.parametrize(("path", "x", "y"), [("loop", 160.0, 100.0), ("loop", 80.0, 120.0), ("line", 160.0, 100.0)])
+def test_a_region_of_all_cameras_is_no_camera_off_its_place(path: str, x: float, y: float) -> None:
+    """Where a lens bends rays, those of two cameras do not meet with another principal point."""
+    data = recording(path=path, distortion="equidistant", fov_deg=120.0)
+    found = examine(seen(intrinsics(lambda k: np.add(k, [0.0, 0.0, x, y]))(data), 25))
+    assert re.match("region of interest not applied", found.causes()), found.summary()
+    assert "camera 1" not in found.causes(), found.summary()
+    assert not examine(seen(data, 25)).findings
+
+
+@pytest.mark.parametrize("share", [0.03, 0.02])
+def test_few_points_with_a_depth_tell_another_unit(share: float) -> None:
+    """Most are out of reach of a sensor, and no two images share enough of the others."""
+    rng = np.random.default_rng(1)
+
+    def change(one: FeatureTracks) -> FeatureTracks:
+        return dataclasses.replace(
+            one, depth_m=np.where(rng.random(len(one.depth_m)) < share, 1000.0 * one.depth_m, np.nan)
+        )
+
+    found = examine(seen(images(change)(recording(mode="rgbd"))))
+    assert found.causes().startswith("depth_m in millimetres"), found.summary()
 
 
 def test_a_speed_that_nothing_has_is_said_where_images_have_no_scale() -> None:

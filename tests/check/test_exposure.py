@@ -13,6 +13,7 @@ from ba_node.check.examine import examine
 from ba_node.check.exposure import find_late
 from ba_node.check.tracks import Tracks
 from experiments.robustness.faults import SOUND, spoiled
+from experiments.robustness.faults.spoil import spoiled_by
 from tests.check.set_ups import tracks_in
 
 LOOP: dict[str, Any] = {"path": "loop", "length_m": 30.0, "keyframes": 60}
@@ -32,6 +33,19 @@ def test_a_camera_that_is_exposed_later_is_named_alone(delay_s: float, changes: 
     assert "after those of camera 0" in cause, cause
     told_ms = float(cause.split(" about ")[1].split(" ms")[0])
     assert abs(told_ms - 1e3 * delay_s) < 0.2 * 1e3 * delay_s, cause
+
+
+@pytest.mark.parametrize(("degrees", "share"), [(0.5, 0.25), (1.0, 0.2), (2.0, 0.25)])
+def test_a_camera_that_is_turned_is_told_from_a_late_one_among_outliers(degrees: float, share: float) -> None:
+    """It explains so few tracks that a delay, which explains hardly more, passed for as good."""
+    good = {"keyframes": 25, "drift_rotation_deg": 0.02, "drift_translation": 0.002}
+    faults = (("camera_turned", degrees), ("outliers_uniform", share))
+    for seed in (701, 704):
+        found = examine(tracks_in(spoiled_by(faults, "stereo", seed, **good).measurements))
+        assert found.harmful and found.causes().startswith("camera 1 does not fit its place on the body"), (
+            f"seed {seed}: {found.summary()}"
+        )
+        assert "synchronised" not in found.causes(), f"seed {seed}: {found.summary()}"
 
 
 @pytest.mark.parametrize("changes", [{}, LOOP, {"look_deg": 90.0}])

@@ -118,6 +118,16 @@ def test_doubt_grows_and_fades() -> None:
     assert trust.bounds(CONFIG) is CONFIG
 
 
+def test_what_was_given_up_before_is_given_up_sooner() -> None:
+    """Solves that pass for a while between many that are held are no better than these."""
+    trust = Trust()
+    assert trust.hear("wrong", None, (), CONFIG) == "wrong" and not trust.lost
+    trust.give_up()
+    waits = [trust.hear("", None, (), CONFIG) for _ in range(12)]
+    assert sum(map(bool, waits)) == 10 and not trust.lost
+    assert trust.hear("wrong", None, (), CONFIG) == "wrong" and trust.lost
+
+
 def test_always_other_keyframes_to_blame_is_doubtful() -> None:
     trust = Trust()
     assert trust.hear("", None, (4,), CONFIG) != ""
