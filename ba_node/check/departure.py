@@ -58,7 +58,7 @@ _WORTH_A_LOOK: Limits = ((1.012, 2.4),)
 _HARDLY_CHANCE: Limits = ((1.004, 2.4),)
 # Fewer steps than so many hardly tell what is chance: there lengths by images stand only if they are off by less, or by
 # fewer standard errors, as where the front-end's steps scatter widely.
-_MANY, _LITTLE, _FEW_ERRORS = 10, 1.015, 1.5
+_MANY, _LITTLE, _FEW_ERRORS = 25, 1.012, 1.8
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
 # Student's distribution asks for.
 _FEW = 8.0
@@ -82,6 +82,8 @@ _IN_PLANE = 0.5
 _K = "k of camera_info in camera_rig"
 # Steps that are more standard deviations off the others are drawn in to so many.
 _USUAL = 3.0
+# Standard errors by which the lengths that windows told of one camera may be off those that all steps tell.
+_LIKELY = 4.2
 # Share of a way by which its ends are apart where it does not come back.
 _STRAIGHT = 0.7
 # Share of the usual step below which one tells nothing; share that is left out at either end of their ratios.
@@ -209,7 +211,7 @@ def _of_one_camera(scene: Scene, refined: FloatArray, given: FloatArray) -> floa
     within = np.clip(ratio, middle - _USUAL * sigma, middle + _USUAL * sigma)
     # Noise aside makes steps longer, by twice as much as that along them lowers the mean of the logarithm.
     mean = float(np.average(within, weights=np.linalg.norm(refined, axis=1))) + 0.5 * sigma**2
-    return float(np.exp(mean)) if abs(mean) < _USUAL * sigma / np.sqrt(len(ratio)) else 1.0
+    return float(np.exp(mean)) if abs(mean) < _LIKELY * sigma / np.sqrt(len(ratio)) else 1.0
 
 
 def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:

@@ -100,6 +100,20 @@ def test_a_few_keyframes_with_wrong_cameras(
     outcome.tells(words)
 
 
+@pytest.mark.parametrize(("rig", "look_deg"), [("stereo", 0.0), ("rgbd", 90.0)])
+def test_a_focal_length_slightly_off_on_a_short_way(rig: str, look_deg: float, tmp_path: Path, run: Replay) -> None:
+    seed = 70 if rig == "stereo" else 74
+    recording = spoiled("focal_off", rig, 0.98, seed, keyframes=20, length_m=10.0, look_deg=look_deg)
+    outcome = run(write(tmp_path, recording))
+    harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
+
+
+def test_steps_alone_tell_how_long_a_way_of_one_camera_is(tmp_path: Path, run: Replay) -> None:
+    recording = spoiled("new_ids_twice", "mono", seed=11)
+    (found,) = run(write(tmp_path, recording)).errors(recording.truth)
+    assert found.published_m < 0.6 * found.input_m
+
+
 @pytest.mark.slow
 def test_each_of_two_sessions_is_compared_at_its_end(tmp_path: Path, run: Replay) -> None:
     recording = spoiled_by([("session_lowered", 3.0), ("baseline_off", 1.3)], "stereo", 88)
