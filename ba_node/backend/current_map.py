@@ -287,8 +287,7 @@ class CurrentMap:
     def hold_all(self, solve_count: int, reason: str) -> None:
         """Report that the set-up is wrong; the front-end's poses stand, and its frame is the map's."""
         newest = int(self.scene.order[-1])
-        report = self.base_report(solve_count, newest)
-        self.report = dataclasses.replace(report, status=Status.HELD, reason=reason)
+        self.report = dataclasses.replace(self.base_report(solve_count, newest), status=Status.HELD, reason=reason)
         self.correction = MapCorrection()
         self.correct(newest)
 

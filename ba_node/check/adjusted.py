@@ -71,12 +71,14 @@ def problem_of(tracks: Tracks, relations: list[Relation], part: int) -> Problem 
     return _problem(tracks, keyframes, (part, 2), _OBSERVATIONS)
 
 
-def problem_of_all(tracks: Tracks, keyframes: IntArray, most: int) -> Problem | None:
+def problem_of_all(tracks: Tracks, keyframes: IntArray, most: int, least_views: int = _MIN_VIEWS) -> Problem | None:
     """Return the adjustment of some keyframes, of tracks with about so many observations, the first fixed."""
-    return _problem(tracks, keyframes, (0, 1), most)
+    return _problem(tracks, keyframes, (0, 1), most, least_views)
 
 
-def _problem(tracks: Tracks, keyframes: IntArray, part: tuple[int, int], most: int) -> Problem | None:
+def _problem(
+    tracks: Tracks, keyframes: IntArray, part: tuple[int, int], most: int, least_views: int = _MIN_VIEWS
+) -> Problem | None:
     """Return the adjustment of some keyframes; every so many of the tracks, from one on; None where they are few."""
     first, (begin, stride) = keyframes[0], part
     place = np.full(len(tracks), -1)
@@ -85,7 +87,7 @@ def _problem(tracks: Tracks, keyframes: IntArray, part: tuple[int, int], most: i
     image = np.unique(tracks.track[rows] * len(tracks) + tracks.keyframe[rows])
     views = np.bincount(image // len(tracks))
     # Tracks are numbered as they begin: so some of each keyframe.
-    longest = np.flatnonzero(views >= _MIN_VIEWS)[begin::stride]
+    longest = np.flatnonzero(views >= least_views)[begin::stride]
     count = np.bincount(tracks.track[rows])[longest].sum()
     longest = longest[spread(len(longest), int(len(longest) * most / max(count, 1)))]
     if len(longest) < _MIN_POINTS:

@@ -56,6 +56,9 @@ _PLAIN: Limits = ((1.007, 10.0),)
 _WORTH_A_LOOK: Limits = ((1.012, 2.4),)
 # Too little to say so, too much to trust lengths: one in 60 sound drives shows as much by chance.
 _HARDLY_CHANCE: Limits = ((1.004, 2.4),)
+# Fewer steps than so many hardly tell what is chance: there lengths by images stand only if they are off by less, or by
+# fewer standard errors, as where the front-end's steps scatter widely.
+_MANY, _LITTLE, _FEW_ERRORS = 25, 1.012, 1.8
 # Few steps tell their own spread badly: n of them need 1 + (this / n)^1.5 times as many standard errors, about what
 # Student's distribution asks for.
 _FEW = 8.0
@@ -82,6 +85,8 @@ _USUAL = 3.0
 # Neighbours err alike where they correlate by more than so many standard errors; the largest correlation that counts,
 # and the share of the variance that their own mean leaves at least.
 _ALIKE, _MOST_ALIKE, _LEFT = 2.0, 0.95, 0.1
+# Standard errors by which the lengths that windows told of one camera may be off those that all steps tell.
+_LIKELY = 4.2
 # Share of a way by which its ends are apart where it does not come back.
 _STRAIGHT = 0.7
 # Share of the usual step below which one tells nothing; share that is left out at either end of their ratios.
@@ -183,11 +188,13 @@ def length_factor(scene: Scene) -> float:
     """
     known = scene.constraints
     alone = not (known.absolute or known.landmarks or known.relative)
-    if not (alone and _STEPS < len(scene.keyframes) <= _YOUNG) or scene.cameras is None:
+    if not (alone and len(scene.keyframes) <= _YOUNG) or scene.cameras is None:
         return 1.0
     refined, given = _steps(scene)
     if has_scale(scene):
-        return _factor(scene, refined, given, _HARDLY_CHANCE) if len(refined) >= _STEPS else 1.0
+        n = len(refined)
+        limits = _HARDLY_CHANCE if n >= _MANY else ((_LITTLE, _FEW_ERRORS / _more(n)),)
+        return _factor(scene, refined, given, limits) if n else 1.0
     return _of_one_camera(scene, refined, given) if len(refined) >= _STEPS_BEFORE else 1.0
 
 
@@ -207,7 +214,7 @@ def _of_one_camera(scene: Scene, refined: FloatArray, given: FloatArray) -> floa
     within = np.clip(ratio, middle - _USUAL * sigma, middle + _USUAL * sigma)
     # Noise aside makes steps longer, by twice as much as that along them lowers the mean of the logarithm.
     mean = float(np.average(within, weights=np.linalg.norm(refined, axis=1))) + 0.5 * sigma**2
-    return float(np.exp(mean)) if abs(mean) < _USUAL * sigma / np.sqrt(len(ratio)) else 1.0
+    return float(np.exp(mean)) if abs(mean) < _LIKELY * sigma / np.sqrt(len(ratio)) else 1.0
 
 
 def _aside(scene: Scene, refined: FloatArray, given: FloatArray, limits: Limits) -> Finding | None:
@@ -280,8 +287,12 @@ def carried(scene: Scene, *, mostly: bool = False) -> Finding | None:
 
 
 def _differs(mean: float, error: float, count: int, limits: Limits, times: float = 1.0) -> bool:
-    more = 1.0 + (_FEW / count) ** 1.5
-    return any(abs(mean) >= max(times * np.log(factor), more * errors * error) for factor, errors in limits)
+    return any(abs(mean) >= max(times * np.log(factor), _more(count) * errors * error) for factor, errors in limits)
+
+
+def _more(count: int) -> float:
+    """Return by how much more standard errors so few steps need, at least one."""
+    return float(1.0 + (_FEW / max(count, 1)) ** 1.5)
 
 
 def has_scale(scene: Scene) -> bool:
@@ -325,7 +336,8 @@ def trimmed_mean(values: FloatArray) -> tuple[float, float]:
     in_order = np.sort(values)
     kept = in_order[low : len(values) - low]
     drawn_in = np.clip(values, kept[0], kept[-1])
-    error = float(np.std(drawn_in, ddof=1)) / ((1.0 - 2.0 * _TRIMMED) * float(np.sqrt(len(values))))
+    spread = float(np.std(drawn_in, ddof=min(len(values) - 1, 1)))
+    error = spread / ((1.0 - 2.0 * _TRIMMED) * float(np.sqrt(len(values))))
     return float(np.mean(kept)), error * _wanders(drawn_in)
 
 

@@ -46,7 +46,7 @@ _LOWER = 0.05
 # A lens is named rather than a focal length and a principal point that leave no less than this part of its sum.
 _RATHER = 0.9
 # Where fewer tracks than this agree with free relations, the sum has to fall to this share: moving objects pull too.
-_MOST_AGREE, _LEFT = 0.85, 0.75
+MOST_AGREE, LEFT = 0.85, 0.75
 _TEST = "intrinsics"
 _INFO = "camera_info in camera_rig"
 
@@ -131,7 +131,7 @@ def _left(relations: list[Relation]) -> float:
     share = median_share([one for one in relations if one.has_direction])
     if share < AGREED:
         return 0.0
-    return _LEFT if share < _MOST_AGREE else 1.0
+    return LEFT if share < MOST_AGREE else 1.0
 
 
 def freed_from(tracks: Tracks, relations: list[Relation], params: FloatArray) -> Model | None:

@@ -46,8 +46,8 @@ _ROUNDS, _STAY = 8, 0.03
 _BETTER = 0.5
 
 
-def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
-    """Compare the front-end's steps with those of a camera."""
+def check_motion(tracks: Tracks, relations: list[Relation], *, doubted: bool = False) -> Diagnosis:
+    """Compare the front-end's steps with those of a camera; one pair will do if they are ``doubted`` already."""
     usable = [one for one in relations if one.has_direction]
     same = _all_the_same(tracks, usable)
     if same is not None:
@@ -57,11 +57,11 @@ def check_motion(tracks: Tracks, relations: list[Relation]) -> Diagnosis:
     usable = [one for one, moves in zip(usable, moving, strict=True) if moves]
     test = "poses against tracks"
     now = compare(tracks, usable)
-    few = len(usable) < _PAIRS_NEEDED
-    if few and not (len(usable) >= _FEW_PAIRS and now.off.min() > _ABSURD_DEG):
+    few, least = len(usable) < _PAIRS_NEEDED, np.median if doubted else np.min
+    if few and not (len(usable) >= (1 if doubted else _FEW_PAIRS) and least(now.off) > _ABSURD_DEG):
         return _too_few(usable)
     rows = [now.row(test, "as given"), Row(test, "free", float(np.mean([one.share for one in usable])))]
-    known = _by_known(tracks, usable, now, rows) if np.median(now.off) > DOUBTFUL_DEG else None
+    known = _by_known(tracks, usable, now, rows, doubted) if np.median(now.off) > DOUBTFUL_DEG else None
     if known is not None:
         return known
     if few:
@@ -91,7 +91,7 @@ def _all_the_same(tracks: Tracks, usable: list[Relation]) -> Diagnosis | None:
     return Diagnosis([Finding((cause,), f"by the tracks {evidence}", (f"the {names} in the keyframes",), usual=True)])
 
 
-def _by_known(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row]) -> Diagnosis | None:
+def _by_known(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row], doubted: bool) -> Diagnosis | None:
     """Tell of mistakes that are made often, which bring steps nearer to the tracks; None if none does."""
     test, few = rows[0].test, len(usable) < _PAIRS_NEEDED
     tried: dict[Mistake | Flip, Steps] = {one: compare(one.undo(tracks, 0), usable) for one in in_motion(tracks)}
@@ -99,7 +99,8 @@ def _by_known(tracks: Tracks, usable: list[Relation], now: Steps, rows: list[Row
     rows += [other.row(test, one.name) for one, other in tried.items()]
     best = min(float(np.median(other.off)) for other in tried.values())
     named = [one for one, it in tried.items() if np.median(it.off) <= 1.15 * best + 1.0 and now.loses_to(it)]
-    if not named or (few and max(float(tried[one].off.max()) for one in named) >= DOUBTFUL_DEG):
+    most = np.median if doubted else np.max
+    if not named or (few and max(float(most(tried[one].off)) for one in named) >= DOUBTFUL_DEG):
         return None
     if all(isinstance(one, Flip) for one in named):
         if len(usable) < 2 * _PAIRS_NEEDED:

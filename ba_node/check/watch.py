@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ba_node.check import two_view
+from ba_node.check import few, two_view
 from ba_node.check.change import check_change
 from ba_node.check.diagnosis import Diagnosis
 from ba_node.check.examine import examine, run
@@ -83,6 +83,9 @@ def of_few_keyframes(scene: Scene) -> Check | None:
     if tracks is None or not two_view.available():
         return None
     found = examine(tracks)
+    if not found.harmful and scene.keyframes.refined.any():
+        table, order = scene.keyframes, scene.order
+        found = run(lambda: few.check_few(tracks, table.rotation[order], table.position[order]), "few keyframes")
     return _done(scene, found) if found.harmful else None
 
 

@@ -79,6 +79,41 @@ def test_two_or_three_sound_keyframes_are_refined(rig: str, keyframes: int, tmp_
     harmless(outcome.errors(recording.truth), 1.0, keyframes)
 
 
+@pytest.mark.parametrize(
+    ("fault", "rig", "amount", "seen", "words"),
+    [
+        ("roi_ignored", "mono", 120.0, (5, 0.0), "region of interest"),
+        ("camera_turned", "stereo", 1.0, (3, 0.0), "sit on the body"),
+        ("rectified_with_distortion", "stereo", 1.0, (4, 0.0), "rectified"),
+        ("axes_confused", "rgbd", 1.0, (2, 0.0), "axes confused"),
+        ("focal_off", "rgbd", 1.2, (6, 90.0), "focal length"),
+        ("focal_off", "stereo", 1.2, (4, 0.0), "^$"),
+    ],
+)
+def test_a_few_keyframes_with_wrong_cameras(
+    fault: str, rig: str, amount: float, seen: tuple[int, float], words: str, tmp_path: Path, run: Replay
+) -> None:
+    keyframes, look_deg = seen
+    recording = first_of(spoiled(fault, rig, amount, 70, look_deg=look_deg), keyframes)
+    outcome = run(write(tmp_path, recording))
+    harmless(outcome.errors(recording.truth), 1.0, keyframes)
+    outcome.tells(words)
+
+
+@pytest.mark.parametrize(("rig", "look_deg"), [("stereo", 0.0), ("rgbd", 90.0)])
+def test_a_focal_length_slightly_off_on_a_short_way(rig: str, look_deg: float, tmp_path: Path, run: Replay) -> None:
+    seed = 70 if rig == "stereo" else 74
+    recording = spoiled("focal_off", rig, 0.98, seed, keyframes=20, length_m=10.0, look_deg=look_deg)
+    outcome = run(write(tmp_path, recording))
+    harmless(outcome.errors(recording.truth), 1.0, len(recording.keyframes))
+
+
+def test_steps_alone_tell_how_long_a_way_of_one_camera_is(tmp_path: Path, run: Replay) -> None:
+    recording = spoiled("new_ids_twice", "mono", seed=11)
+    (found,) = run(write(tmp_path, recording)).errors(recording.truth)
+    assert found.published_m < 0.6 * found.input_m
+
+
 @pytest.mark.slow
 def test_each_of_two_sessions_is_compared_at_its_end(tmp_path: Path, run: Replay) -> None:
     recording = spoiled_by([("session_lowered", 3.0), ("baseline_off", 1.3)], "stereo", 88)
