@@ -193,7 +193,7 @@ def length_factor(scene: Scene) -> float:
     refined, given = _steps(scene)
     if has_scale(scene):
         n = len(refined)
-        limits = _HARDLY_CHANCE if n >= _MANY else ((_LITTLE, _FEW_ERRORS / _more(n)),)
+        limits = _HARDLY_CHANCE if n >= _MANY else ((_LITTLE, _FEW_ERRORS / more_errors(n)),)
         return _factor(scene, refined, given, limits) if n else 1.0
     return _of_one_camera(scene, refined, given) if len(refined) >= _STEPS_BEFORE else 1.0
 
@@ -287,11 +287,12 @@ def carried(scene: Scene, *, mostly: bool = False) -> Finding | None:
 
 
 def _differs(mean: float, error: float, count: int, limits: Limits, times: float = 1.0) -> bool:
-    return any(abs(mean) >= max(times * np.log(factor), _more(count) * errors * error) for factor, errors in limits)
+    error *= more_errors(count)
+    return any(abs(mean) >= max(times * np.log(factor), errors * error) for factor, errors in limits)
 
 
-def _more(count: int) -> float:
-    """Return by how much more standard errors so few steps need, at least one."""
+def more_errors(count: int) -> float:
+    """Return how many times as many standard errors so few steps need."""
     return float(1.0 + (_FEW / max(count, 1)) ** 1.5)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ba_node.check import two_view
 from ba_node.check.adjusted import Adjusted, Freed, problem_of_all
-from ba_node.check.departure import trimmed_mean
+from ba_node.check.departure import more_errors, trimmed_mean
 from ba_node.check.diagnosis import Diagnosis, Finding
 from ba_node.check.relations import spread
 from ba_node.check.tracks import tracks_of
@@ -45,7 +45,7 @@ def turns_differ(scene: Scene, *, final: bool = False) -> Check | None:
     if (count not in _AT and not final) or count > _YOUNG or known.absolute or known.landmarks:
         return None
     by_turns, error, n = _turns(scene)
-    if abs(by_turns) < max(_FACTOR, _ERRORS * error) or not two_view.available():
+    if abs(by_turns) < max(_FACTOR, more_errors(n) * _ERRORS * error) or not two_view.available():
         return None
     tracks = tracks_of(scene, NEWEST)
     problem = tracks and problem_of_all(tracks, spread(len(tracks), _KEYFRAMES), _OBSERVATIONS)
