@@ -273,7 +273,7 @@ class CurrentMap:
         """Say that a solution is held; give up what was taken of a young map if many are."""
         text = f"a solution was held, the front-end's poses stand: {reason}"
         if self._trust.lost and self._young():
-            self._trust.give_up()
+            self._trust.given_up = True
             self.scene.forget_solutions()
             self.correction = MapCorrection()
             self.correct(int(self.scene.order[-1]))

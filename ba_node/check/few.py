@@ -67,8 +67,7 @@ def check_few(tracks: Tracks, rotation: FloatArray, position: FloatArray) -> Dia
 
 def _of_cameras(tracks: Tracks, given: Adjusted, share: float) -> Diagnosis:
     """Return what is wrong if other cameras explain the tracks better; fewer agree where objects move: then by far."""
-    measure = Measure(given.norms)
-    measure = Measure(given.norms, max(1.0, measure.noise))
+    measure = Measure(given.norms, max(1.0, Measure(given.norms).noise))
     free, now, before = Freed(given), measure(given), given.state
     tried = [(model, measure(Adjusted(given.problem, model.params, model.lens))) for model in _lenses(tracks)]
     best = min([measure(free), *(left for _, left in tried)])

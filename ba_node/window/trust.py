@@ -60,10 +60,6 @@ class Trust:
         """Return True if what was taken of a young map is to be given up."""
         return self.doubt >= (_LOST_AGAIN if self.given_up else _LOST)
 
-    def give_up(self) -> None:
-        """Take note that what was taken of the map is given up: many solves have to pass until one is taken again."""
-        self.given_up, self.doubt = True, _MAX_DOUBT
-
     def bounds(self, config: Config) -> Config:
         """Return parameters with narrower bounds as long as there is doubt: who was just out does not slip back in."""
         if self.doubt <= _ENOUGH:

@@ -269,7 +269,9 @@ def test_nothing_is_held_of_sound_data(kind: str, drift: dict[str, Any]) -> None
     backend = Backend(ALONE)
     found = replay(backend, stream)
     before, after = errors(stream, truth, found[-1])
-    assert [one.report.status.usable for one in found] == [False] + [True] * 39
+    # Of the end there is another where the front-end turns out to be precise.
+    assert [one.report.status.usable for one in found[:40]] == [False] + [True] * 39
+    assert all(one.report.status.usable for one in found[40:])
     assert not backend.scene.log.warnings
     assert after <= max(before, 0.008)
     report = found[-1].report

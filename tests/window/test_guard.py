@@ -122,9 +122,8 @@ def test_what_was_given_up_before_is_given_up_sooner() -> None:
     """Solves that pass for a while between many that are held are no better than these."""
     trust = Trust()
     assert trust.hear("wrong", None, (), CONFIG) == "wrong" and not trust.lost
-    trust.give_up()
-    waits = [trust.hear("", None, (), CONFIG) for _ in range(12)]
-    assert sum(map(bool, waits)) == 10 and not trust.lost
+    trust.given_up = True
+    assert not trust.hear("", None, (), CONFIG) and not trust.lost
     assert trust.hear("wrong", None, (), CONFIG) == "wrong" and trust.lost
 
 
