@@ -53,9 +53,9 @@ _FREEDOM = 5.0
 _TELLING, _ENOUGH, _FADES = 6.0, 3, 0.8
 # How many windows tell it at least; bounds of z^2; what C is of a stated sigma, at least; larger shares are 1.
 _WINDOWS, _LOW, _HIGH, _COARSE, _LARGEST = 2, 0.4, 1.5, 0.2, 0.75
-# Steps of a window, and of all of them, that tell it; and of a map that is asked as a whole: of a dozen the likelihood
-# was so flat that what came in counted ten times too much (0.006 -> 0.011 m).
-_LEAST_STEPS, _STEPS, _STEPS_OF_ALL = 5, 20, 8
+# Steps of a window, and of all of them, that tell it: of a dozen the likelihood is so flat that what came in counted ten
+# times too much (0.006 -> 0.011 m).
+_LEAST_STEPS, _STEPS = 5, 20
 # Keyframes up to which a map is asked as a whole; there: what C is at least, observations that keyframes have at least,
 # and how many times as large the standard deviations of steps are that hold the scale of one camera.
 _YOUNG, _COARSE_OF_ALL, _SEEN, _NOTHING = 120, 0.08, 20, 30.0
@@ -81,7 +81,7 @@ class Precision:
 
     def shares(self) -> tuple[float, float]:
         """Return what the standard deviations of rotation and translation are to be multiplied by."""
-        if self.steps < (_STEPS_OF_ALL if self.whole else _STEPS) or self.windows < (1 if self.whole else _WINDOWS):
+        if self.steps < _STEPS or self.windows < (1 if self.whole else _WINDOWS):
             return 1.0, 1.0
         each, coarse = np.arange(2), self.coarse / self.windows
         odds = self.likelihood.copy()
@@ -97,7 +97,8 @@ class Precision:
         spread = np.sqrt(np.maximum(odds @ logs**2 - mean**2, 0.0))
         precise = (np.exp(mean) < _LARGEST) & (fit.min() > _LOW) & (fit < _HIGH)
         precise &= coarse > (_COARSE_OF_ALL if self.whole else _COARSE)
-        rotation, translation = np.where(precise, np.exp(mean - spread), 1.0).tolist()
+        # Of a whole map no later window mends what was taken too small.
+        rotation, translation = np.where(precise, np.exp(mean if self.whole else mean - spread), 1.0).tolist()
         return rotation, translation
 
     def study(self, scene: Scene, config: Config, selection: Selection, state: State) -> Study | None:
