@@ -53,8 +53,8 @@ _FREEDOM = 5.0
 _TELLING, _ENOUGH, _FADES = 6.0, 3, 0.8
 # How many windows tell it at least; bounds of z^2; what C is of a stated sigma, at least; larger shares are 1.
 _WINDOWS, _LOW, _HIGH, _COARSE, _LARGEST = 2, 0.4, 1.5, 0.2, 0.75
-# Steps of a window, and of all of them, that tell it: of a dozen the likelihood is so flat that what came in counted ten
-# times too much (0.006 -> 0.011 m).
+# Steps of a window, and of all of them, that tell it: of a dozen the likelihood is so flat that what came in counted
+# ten times too much (0.006 -> 0.011 m).
 _LEAST_STEPS, _STEPS = 5, 20
 # Keyframes up to which a map is asked as a whole; there: what C is at least, observations that keyframes have at least,
 # and how many times as large the standard deviations of steps are that hold the scale of one camera.
