@@ -26,7 +26,8 @@ is not asked any more; larger shares are odometry.py's.
 Only where images have a scale of their own (several cameras, or depths), or two older keyframes hold one.
 
 A young map that ends, and whose windows did not tell, is asked as a whole: there all steps tell at once, also of a map
-of no more than two windows. One camera has its scale there of steps that count next to nothing.
+of no more than two windows. One camera has its scale there of steps that count next to nothing. Taken is the mean of
+log s as it is: no later window would mend what was taken too small, and covariances would come out too small with it.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from ba_node.backend.worse import explains_worse, keep_lengths, most_moves, torn
 from ba_node.config import Config
 from ba_node.estimate import Estimate
 from ba_node.evaluation.metrics import absolute_error
-from experiments.robustness.faults import SOUND, spoiled
+from experiments.robustness.faults import SOUND, Recording, spoiled
 
 
 def test_few_keyframes_at_their_optimum_that_windows_make_worse_are_kept() -> None:
@@ -24,12 +24,18 @@ def test_few_keyframes_at_their_optimum_that_windows_make_worse_are_kept() -> No
     assert "rms with none above 10 sigmas 0.995 -> 1.22 px" in line
 
 
+def replayed(recording: Recording, **settings: object) -> Backend:
+    """Return a back-end that has seen a recording."""
+    backend = Backend(Config().with_values(settings))
+    for _ in backend.replay(iter(recording.measurements)):
+        pass
+    return backend
+
+
 @pytest.mark.parametrize("rig", ["stereo", "mono", "rgbd"])
 def test_a_good_map_that_is_moved_aside_is_worse(rig: str) -> None:
     recording = spoiled(SOUND, rig, seed=12, keyframes=12, length_m=10.0)
-    backend = Backend(Config())
-    for _ in backend.replay(iter(recording.measurements)):
-        pass
+    backend = replayed(recording)
     scene = backend.scene
     assert explains_worse(scene, backend.config) is None and scene.keyframes.refined.all()
     scene.keyframes.position[scene.order[::2], 2] += 0.3
@@ -41,9 +47,7 @@ def test_a_good_map_that_is_moved_aside_is_worse(rig: str) -> None:
 def test_a_step_that_few_tracks_bear_out_tears_the_map(rig: str) -> None:
     """As where one camera follows a vehicle that drives ahead: 0.01 m became 1.3 m, by one step of 4 m."""
     recording = spoiled(SOUND, rig, seed=12, keyframes=14, length_m=10.0)
-    backend = Backend(Config())
-    for _ in backend.replay(iter(recording.measurements)):
-        pass
+    backend = replayed(recording)
     scene = backend.scene
     late = scene.places()[scene.observations.keyframe] >= 7
     scene.keyframes.position[scene.order[7:]] += [0.0, 4.0, 0.0]
@@ -70,9 +74,7 @@ def test_a_step_that_few_tracks_bear_out_tears_the_map(rig: str) -> None:
 )
 def test_mismatches_that_nothing_bounds_are_said(share: float, settings: dict[str, object], said: bool) -> None:
     recording = spoiled(SOUND, "mono", seed=7, keyframes=15, outlier_share=share)
-    backend = Backend(Config().with_values(settings))
-    for _ in backend.replay(iter(recording.measurements)):
-        pass
+    backend = replayed(recording, **settings)
     assert backend.solve_count
     assert any("nothing bounds how far each draws the map" in line for line in backend.report.warnings) == said
 
@@ -81,9 +83,7 @@ def test_mismatches_that_nothing_bounds_are_said(share: float, settings: dict[st
 def test_lengths_that_are_doubted_are_those_of_the_front_end(rig: str) -> None:
     """The map keeps its shape; what follows from its last pose follows."""
     recording = spoiled(SOUND, rig, seed=12, keyframes=30, length_m=15.0)
-    backend = Backend(Config())
-    for _ in backend.replay(iter(recording.measurements)):
-        pass
+    backend = replayed(recording)
     scene, config = backend.scene, backend.config
     assert not keep_lengths(scene, config), "the map is sound"
     table = scene.keyframes
@@ -109,9 +109,7 @@ def test_lengths_that_are_doubted_are_those_of_the_front_end(rig: str) -> None:
 )
 def test_lengths_that_images_tell_badly_do_no_harm(fault: str, rig: str, amount: float | None, seed: int) -> None:
     recording = spoiled(fault, rig, amount, seed)
-    backend = Backend(Config())
-    for _ in backend.replay(iter(recording.measurements)):
-        pass
+    backend = replayed(recording)
     came, found = (
         absolute_error(poses, recording.truth, "se3").translation.rmse
         for poses in (recording.odometry, backend.estimate().trajectory)
